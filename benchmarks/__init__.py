@@ -2,6 +2,7 @@
 
 ``python -m benchmarks.NAME``, from the checkout, measures the delays of other libraries by the same contract
 (``peers``), with others on the same drone (``load``), over a path that loses packets (``network``), of drones whose
-users fail (``swarm``), of more and more proxies and observers (``scale``), and what codecs take of one core
-(``codecs``). ``hosts`` makes several hosts of one machine, ``pages`` puts the figures into the documentation.
+users fail (``swarm``), of more and more proxies and observers (``scale``), video over mobile uplinks
+(``video_path``), and what codecs take of one core (``codecs``). ``hosts`` makes several hosts of one machine, ``pages``
+puts the figures into the documentation.
 """

@@ -1,14 +1,19 @@
-"""The cockpit's overview of many drones: frames in each pane, and what browser, cockpit and simulator cost.
+"""The cockpit's video of many drones: frames and their age in each pane, bytes, and what everything costs.
 
 ``python -m benchmarks.cockpit_fleet --drones 12 --seconds 20`` starts the simulator, a cockpit and headless Chromium on
-this machine, in a directory of sockets of their own. It needs Chromium and ``pip install playwright``. Shares are of
-one core, by the processor time of each process with its children: on a busy machine they still tell what work costs,
-while frames are only as many as the machine had time for. The load before and after is printed.
+this machine, in a directory of sockets of their own. It shows all drones as H.264, then as JPEGs, as to a browser
+without a decoder; then one drone's pane in both. It needs Chromium and ``pip install playwright``.
+
+An age is from a frame's capture until the browser begins the animation frame that shows it, on one clock: the page's
+clock is compared with this process's. Shares are of one core, by the processor time of each process with its children:
+on a busy machine they still tell what work costs, while frames are only as many as the machine had time for. The load
+before and after is printed.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import shutil
 import subprocess
@@ -18,7 +23,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from skyloop.bench.machine import Machine
@@ -26,31 +30,48 @@ from skyloop.cli.sim import OWN_OPTIONS
 from skyloop.cockpit.child import CockpitProcess
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Browser, Page
 
 NAME: Final = "drone"
-WARM_UP_S: Final = 10.0
+WARM_UP_S: Final = 5.0
 SIZE: Final = (1440, 900)
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
-#: Counts what comes over WebSockets.
+#: Counts what comes over WebSockets, and notes when each frame is shown.
 _COUNT: Final = """
 window.received = 0;
+window.shown = [];
 window.WebSocket = class extends WebSocket {
   constructor(...given) {
     super(...given);
     this.addEventListener("message", ({ data }) => (window.received += data.byteLength ?? data.length));
   }
 };
+new MutationObserver((changes) => {
+  const drawn = changes.map(({ target }) => target.dataset.drawn);
+  requestAnimationFrame(() => drawn.forEach((captured) => window.shown.push([captured, performance.now()])));
+}).observe(document, { subtree: true, attributes: true, attributeFilter: ["data-drawn"] });
 """
-_FRAMES: Final = "[...document.querySelectorAll('.tile')].map((tile) => Number(tile.dataset.frames ?? 0))"
+_NO_DECODER: Final = "delete window.VideoDecoder"
+_PANES: Final = "[...document.querySelectorAll('.tile, .camera')].map((pane) => pane.dataset.form ?? '')"
+_TRIES: Final = 30  # of reading the page's clock: the quickest counts
 
 
 class Moment(NamedTuple):
     """What was counted until some time."""
 
     at_s: float
-    frames: list[int]  #: drawn in each pane
     bytes: int  #: that the page received over WebSockets
+    cpu_s: dict[str, float]  #: by part
+
+
+class Watched(NamedTuple):
+    """What a page showed for a while."""
+
+    name: str
+    panes: int
+    seconds: float
+    ages_s: list[float]  #: of all frames that it showed
+    bytes: int
     cpu_s: dict[str, float]  #: by part
 
 
@@ -58,37 +79,76 @@ def main() -> None:
     """Measure, and print the results."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.cockpit_fleet", description=__doc__.splitlines()[0])
     parser.add_argument("--drones", type=int, default=12, help="how many (default: 12)")
-    parser.add_argument("--seconds", type=float, default=20.0, help="to measure for (default: 20)")
+    parser.add_argument("--seconds", type=float, default=20.0, help="to measure each for (default: 20)")
     parser.add_argument("--sim", nargs="*", default=[], help="more options of skyloop sim, e.g. world=empty fps=10")
     given = parser.parse_args()
     machine = Machine.here()
-    with running(given.drones, given.sim) as (page, parts):
-        page.locator(f".tile >> nth={given.drones - 1}").wait_for()
-        page.wait_for_timeout(WARM_UP_S * 1e3)
-        before = moment(page, parts)
-        page.wait_for_timeout(given.seconds * 1e3)
-        after = moment(page, parts)
+    found = []
+    with running(given.drones, given.sim) as (browser, address, parts):
+        for place, panes in (("#/", given.drones), (f"#{NAME}1", 1)):
+            for form, script in (("h264 shared", ""), ("jpeg", _NO_DECODER)):
+                context = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
+                context.add_init_script(_COUNT + script)
+                page = context.new_page()
+                page.goto(f"{address}{place}")
+                while sum(one == form for one in page.evaluate(_PANES)) < panes:
+                    page.wait_for_timeout(200)
+                page.wait_for_timeout(WARM_UP_S * 1e3)
+                name = f"{'overview' if panes > 1 else 'one pane'}, {'H.264' if 'h264' in form else 'JPEG'}"
+                found.append(watch(name, page, panes, parts, given.seconds))
+                context.close()
     print(f"{machine}, {os.getloadavg()[0]:.1f} after")
-    for line in report(before, after):
+    for line in report(found):
         print(line)
 
 
-def report(before: Moment, after: Moment) -> list[str]:
-    """Return what happened between two moments, as lines."""
-    seconds = after.at_s - before.at_s
-    rates = [(new - old) / seconds for old, new in zip(before.frames, after.frames, strict=True)]
-    lines = [
-        f"panes                 {len(rates)}",
-        f"frames a second       {min(rates):.1f} in the slowest pane, median {median(rates):.1f}, all {sum(rates):.0f}",
-        f"bytes a second        {(after.bytes - before.bytes) / seconds / 1e3:.0f} kB to the page",
+def watch(name: str, page: Page, panes: int, parts: dict[str, int], seconds: float) -> Watched:
+    """Watch a page for a while."""
+    offset_s = clock_offset_s(page)
+    page.evaluate("window.shown = []")
+    before = moment(page, parts)
+    page.wait_for_timeout(seconds * 1e3)
+    after = moment(page, parts)
+    shown = page.evaluate("window.shown")
+    ages_s = [at_ms / 1e3 + offset_s - int(captured) / 1e9 for captured, at_ms in shown]
+    cpu_s = {part: after.cpu_s[part] - before.cpu_s[part] for part in after.cpu_s}
+    return Watched(name, panes, after.at_s - before.at_s, ages_s, after.bytes - before.bytes, cpu_s)
+
+
+def clock_offset_s(page: Page) -> float:
+    """Return this machine's monotonic clock minus the page's, from the quickest of some readings."""
+    readings = []
+    for _ in range(_TRIES):
+        before_s = time.monotonic()
+        there_ms = float(page.evaluate("performance.now()"))
+        after_s = time.monotonic()
+        readings.append((after_s - before_s, (before_s + after_s) / 2 - there_ms / 1e3))
+    return min(readings)[1]
+
+
+def report(found: list[Watched]) -> list[str]:
+    """Return what was seen as lines, a column for each page."""
+    rows: list[tuple[str, list[str]]] = [
+        ("", [one.name for one in found]),
+        ("frames/s of a pane", [f"{len(one.ages_s) / one.seconds / one.panes:.1f}" for one in found]),
+        ("age on the screen, median", [f"{1e3 * quantile(one.ages_s, 0.5):.0f} ms" for one in found]),
+        ("age, 95 %", [f"{1e3 * quantile(one.ages_s, 0.95):.0f} ms" for one in found]),
+        ("kB/s of a pane", [f"{one.bytes / one.seconds / one.panes / 1e3:.1f}" for one in found]),
     ]
-    shares = {part: (after.cpu_s[part] - before.cpu_s[part]) / seconds for part in after.cpu_s}
-    return lines + [f"{part:<22}{share:.0%} of a core" for part, share in shares.items()]
+    rows += [
+        (f"{part}, of a core", [f"{one.cpu_s[part] / one.seconds:.0%}" for one in found]) for part in found[0].cpu_s
+    ]
+    return [f"{name:<34}" + "".join(f"{cell:>18}" for cell in cells) for name, cells in rows]
+
+
+def quantile(values: list[float], share: float) -> float:
+    """Return a quantile; not a number if there is no value."""
+    return sorted(values)[min(len(values) - 1, int(share * len(values)))] if values else math.nan
 
 
 @contextmanager
-def running(drones: int, options: list[str]) -> Iterator[tuple[Page, dict[str, int]]]:
-    """The simulator, a cockpit and its page in a browser; and the process of each part."""
+def running(drones: int, options: list[str]) -> Iterator[tuple[Browser, str, dict[str, int]]]:
+    """The simulator, a browser, and the address of a cockpit; and the process of each part."""
     from playwright.sync_api import sync_playwright
 
     chromium = next(
@@ -115,16 +175,13 @@ def running(drones: int, options: list[str]) -> Iterator[tuple[Page, dict[str, i
         opened = playwright.chromium.launch(executable_path=chromium, args=arguments)
         stack.callback(opened.close)
         ours = [pid for pid in set(children_of(os.getpid())) - before if "chrom" in command_of(pid)]
-        page = opened.new_context(viewport={"width": SIZE[0], "height": SIZE[1]}).new_page()
-        page.add_init_script(_COUNT)
-        page.goto(f"{address}#/")
-        yield page, {"browser": min(ours), "cockpit": cockpit.pid, "simulator and proxies": simulator.pid}
+        yield opened, address, {"browser": min(ours), "cockpit": cockpit.pid, "simulator and proxies": simulator.pid}
 
 
 def moment(page: Page, parts: dict[str, int]) -> Moment:
     """Count everything now."""
     cpu_s = {part: sum(map(cpu_of, [pid, *children_of(pid)])) for part, pid in parts.items()}
-    return Moment(time.monotonic(), page.evaluate(_FRAMES), page.evaluate("window.received"), cpu_s)
+    return Moment(time.monotonic(), page.evaluate("window.received"), cpu_s)
 
 
 def children_of(pid: int) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -210,8 +210,46 @@ def warmth(seconds: Seconds = None, minutes: Minutes = None, output: Output = No
     finish("warmth", results, as_rich([warmth.table(results)], str(results.machine)), output)
 
 
+def recordings(
+    flight: Annotated[float, typer.Option(min=1.0, help="How long the recorded flight is [s]")] = 600.0,
+    encode: Annotated[
+        bool, typer.Option("--encode/--no-encode", help="Also the export that encodes each picture")
+    ] = True,
+    output: Output = None,
+) -> None:
+    """Measure how long it takes to open, look at, seek in and export a recording."""
+    from benchmarks import recordings
+
+    with measuring("recordings", output) as progress:
+        results = recordings.measure(flight, encode=encode, progress=lambda share: progress(share, "a recording"))
+    finish("recordings", results, as_rich([recordings.table(results)], str(results.machine)), output)
+
+
+def video_path(
+    traces: Annotated[
+        str | None, typer.Option(help="Uplinks, with commas [default: the recorded ones, or synthetic]")
+    ] = None,
+    contenders: Annotated[str | None, typer.Option(help="Beginnings of names, with commas [default: all]")] = None,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    output: Output = None,
+) -> None:
+    """Measure video over the uplinks of mobile networks, replayed, beside WebRTC. Needs root."""
+    from benchmarks import video_path
+    from benchmarks.hosts.traces import find
+    from benchmarks.video_path_figure import draw
+
+    wanted_s, found = duration_s(seconds, minutes), find(parse_words(traces))
+    chosen = parse_beginnings(contenders, video_path.CONTENDERS)
+    with measuring("video_path", output) as progress:
+        results = video_path.measure(wanted_s, found, chosen, progress)
+    print_skipped(results.skipped)
+    finish("video_path", results, as_rich([video_path.table(results)], str(results.machine)), output, draw)
+
+
 BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
-    function.__name__: function for function in (peers, load, codecs, network, swarm, scale, fleet, learning, warmth)
+    function.__name__: function
+    for function in (peers, load, codecs, network, swarm, scale, fleet, learning, warmth, recordings, video_path)
 }
 
 
@@ -261,3 +299,21 @@ def parse_shares(text: str | None) -> list[float]:
     if not all(0.0 <= share < 1.0 for share in shares):
         raise UsageError(f"--losses is {text!r} and must be shares from 0 to below 1 with commas, such as 0,0.1,0.3")
     return list(dict.fromkeys(shares))
+
+
+def parse_words(text: str | None) -> tuple[str, ...]:
+    """Parse names with commas between them."""
+    return tuple(word.strip() for word in (text or "").split(",") if word.strip())
+
+
+def parse_beginnings(text: str | None, names: Sequence[str]) -> list[str]:
+    """Return the names that begin with one of the words, in upper or lower case; all without a word.
+
+    Raises:
+        UsageError: No name begins so.
+    """
+    words = [word.lower() for word in parse_words(text)]
+    for word in words:
+        if not any(name.lower().startswith(word) for name in names):
+            raise UsageError(f"no contender begins with {word!r}: there are {'; '.join(names)}")
+    return [name for name in names if not words or name.lower().startswith(tuple(words))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from functools import cache
 from typing import Final
 
@@ -22,6 +23,7 @@ from skyloop.messages import Encoding, FrameHeader
 from skyloop.messages.video import VideoRequest
 from skyloop.transport.base import TransportServer
 from skyloop.transport.fabric import FabricServer, FabricSettings
+from skyloop.transport.fabric.settings import LEASE_S
 
 JPEG: Final = VideoOptions(encoding="jpeg", quality=80)
 _JPEGS: Final = 50
@@ -81,7 +83,7 @@ class Pilot(Application):
     looks = False
 
 
-def connect(address: str, access: Access = "pilot") -> Drone:
+def connect(address: str, access: Access = "pilot", *, lease_s: float = LEASE_S) -> Drone:
     """Connect to a drone over the network, trying for a while on a machine that is busy.
 
     Raises:
@@ -89,6 +91,7 @@ def connect(address: str, access: Access = "pilot") -> Drone:
         UnknownNameError: It was not found.
     """
     name, settings = settings_of(address, serves=False)
+    settings = replace(settings, lease_s=lease_s)
     deadline = time.monotonic() + _CONNECTS_WITHIN_S
     while True:
         try:
@@ -116,7 +119,7 @@ def jpeg_us() -> float:
 
     picture = scenery()
     header = FrameHeader("bench", 1, 0, 0, SMALL.width, SMALL.height, Encoding.BGR8, picture.nbytes)
-    pixels, request = picture.reshape(-1), VideoRequest("bench", **JPEG)
+    pixels, request = picture.reshape(-1), VideoRequest("bench", encoding="jpeg", quality=JPEG["quality"])
     encode_frame(header, pixels, request)
     begin_ns = time.process_time_ns()
     for _ in range(_JPEGS):

@@ -6,6 +6,7 @@ import heapq
 import random
 from dataclasses import dataclass
 
+from benchmarks.hosts.traces import Modem, Trace
 from skyloop.clock import nanoseconds
 from skyloop.errors import UsageError
 
@@ -23,6 +24,7 @@ class Impairments:
     jitter_s: float = 0.0  #: at most so much is added to the delay, evenly; what is sent later still comes later
     reorder: float = 0.0  #: share that is held back …
     reorder_s: float = 0.01  #: … for so much longer, so that those behind overtake
+    trace: Trace | None = None  #: what it carries: packets wait for that, and then for all of the above
 
     def __post_init__(self) -> None:
         for name in ("loss", "reorder"):
@@ -34,7 +36,7 @@ class Impairments:
 
     @property
     def longest_s(self) -> float:
-        """The longest time that a packet which arrives was on the way [s]."""
+        """The longest time that a packet which arrives was on the way [s], without a trace."""
         return self.delay_s + self.jitter_s + (self.reorder_s if self.reorder else 0.0)
 
 
@@ -49,6 +51,7 @@ class Way:
     def __init__(self, seed: object, impairments: Impairments) -> None:
         self.impairments = impairments  #: may be changed at any time; holds for packets that come in later
         self.lost = 0
+        self._modem: Modem | None = None
         self._random = random.Random(str(seed))
         self._waiting: list[tuple[int, int, bytes]] = []
         self._number = 0
@@ -62,6 +65,14 @@ class Way:
         if lost:
             self.lost += 1
             return
+        if wrong.trace is not None:
+            if self._modem is None or self._modem.trace is not wrong.trace:
+                self._modem = Modem(wrong.trace)
+            leaves_ns = self._modem.leaves_ns(len(packet), now_ns)
+            if leaves_ns is None:
+                self.lost += 1
+                return
+            now_ns = leaves_ns
         due_ns = max(now_ns + nanoseconds(wrong.delay_s + jitter), self._last_ns)
         self._last_ns = due_ns
         if held:

@@ -40,6 +40,8 @@ export interface Mark {
   camera: string;
   captured_ns: string;
   box: Box;
+  /** Of the picture that it is drawn on [pixels]. */
+  size: [number, number];
   class_name?: string;
 }
 

@@ -172,8 +172,8 @@ export class FollowTool {
     const box = between(toFrame(this.fit, pressed.at), toFrame(this.fit, to));
     const under = Math.hypot(to[0] - pressed.at[0], to[1] - pressed.at[1]) < CLICK_PX ? foundAt(pressed.still.found, toFrame(this.fit, to)) : null;
     this.release();
-    if (under !== null) this.mark(under.captured_ns, under.box, under.name);
-    else if (isLarge(box)) this.mark(pressed.still.captured_ns, box, "");
+    if (under !== null) this.mark(under.captured_ns, under.box, under.name, pressed.still);
+    else if (isLarge(box)) this.mark(pressed.still.captured_ns, box, "", pressed.still);
     else setText(this.hint, t.follow.small);
   }
 
@@ -195,7 +195,7 @@ export class FollowTool {
     } else if (event.code === "Enter" || event.code === "NumpadEnter") {
       const { keyed } = this;
       if (keyed === null) setText(this.hint, t.follow.keys);
-      else if (this.isKept(keyed.captured_ns ?? frame.captured_ns)) this.mark(keyed.captured_ns ?? frame.captured_ns, keyed.box, keyed.name);
+      else if (this.isKept(keyed.captured_ns ?? frame.captured_ns)) this.mark(keyed.captured_ns ?? frame.captured_ns, keyed.box, keyed.name, frame);
       else setText(this.hint, t.follow.wait);
     } else return;
     event.preventDefault();
@@ -214,14 +214,13 @@ export class FollowTool {
     this.keyed = (step > 0 ? beyond[0] : beyond.at(-1)) ?? (step > 0 ? all[0] : all.at(-1)) ?? null;
   }
 
-  private mark(captured_ns: string, box: Box, name: string): void {
-    const { frame } = this.view;
-    if (frame === null) return;
+  /** `size`: of the picture that the box is drawn on, which may have been sent smaller than the frame is. */
+  private mark(captured_ns: string, box: Box, name: string, { width: across, height: down }: Size): void {
     this.state = "marked";
     this.keyed = null;
     const fit = this.fit;
     setHidden(this.layer, true);
-    this.host.mark({ camera: this.view.camera.name, captured_ns, box, ...(name ? { class_name: name } : {}) });
+    this.host.mark({ camera: this.view.camera.name, captured_ns, box, size: [across, down], ...(name ? { class_name: name } : {}) });
     const { clientWidth: width, clientHeight: height } = this.view.element;
     this.panel.open((size) => beside(toView(fit, box), size, { width, height }));
   }

@@ -1,6 +1,7 @@
 // What the cockpit's server sends and receives: docs/cockpit.md. SI units and radians; what is not known is null.
 
 import type { FollowMessage, FollowMode, Mark } from "./follow.js";
+import type { Encoding } from "./h264.js";
 import type { RouteProgress } from "./route.js";
 
 export type Vector = [number, number, number];
@@ -256,6 +257,10 @@ export interface FrameHead {
   seq: number;
   captured_ns: string;
   age_s: number;
+  /** The cockpit's time when it was sent. */
+  now_s: number;
   width: number;
   height: number;
+  /** Of a picture that is no JPEG. */
+  h264?: Encoding;
 }

@@ -9,7 +9,7 @@ export interface Received {
   received_ms: number;
 }
 
-/** Splits a binary message: length of the head (4 bytes, big-endian), head as JSON, JPEG file. */
+/** Splits a binary message: length of the head (4 bytes, big-endian), head as JSON, the picture: a JPEG file, or H.264. */
 export function unpack(data: ArrayBuffer): { head: FrameHead; jpeg: Uint8Array<ArrayBuffer> } {
   const length = new DataView(data).getUint32(0);
   if (4 + length > data.byteLength) throw new RangeError("the head of a frame is cut off");

@@ -1,10 +1,13 @@
 // What the person chooses for this browser.
 
-import { h, setText, unique } from "./dom.js";
+import { h, setHidden, setText, unique } from "./dom.js";
+import { whyJpeg } from "./h264.js";
 import { LANGUAGE_NAMES, t } from "./language/index.js";
 import { Modal } from "./modal.js";
 import { type Name, settings, type Values } from "./settings.js";
 import { STICK_MODES } from "./sticks.js";
+
+const AUTHORITY = "/api/authority";
 
 export class SettingsDialog {
   readonly button: HTMLButtonElement;
@@ -12,6 +15,11 @@ export class SettingsDialog {
 
   constructor() {
     const mode = h("p", { class: "note" });
+    const video = h("p", { class: "note" });
+    void whyJpeg().then((why) => setText(video, t.settings.videoNote(why)));
+    const trust = h("div", { hidden: true }, h("a", { href: AUTHORITY, download: "skyloop-pages.crt" }, t.settings.trust), h("p", { class: "note" }, t.settings.trustNote));
+    // Only a cockpit that made its certificate itself has an authority for it.
+    if (location.protocol === "https:") void fetch(AUTHORITY, { method: "HEAD" }).then(({ ok }) => setHidden(trust, !ok), () => undefined);
     const languages = Object.keys(LANGUAGE_NAMES);
     this.modal = new Modal(t.settings.title, "settings", [
       choice("theme", t.settings.theme, t.settings.themes),
@@ -19,6 +27,7 @@ export class SettingsDialog {
       choice("sound", t.settings.sound, t.settings.sounds),
       choice("mode", t.settings.mode, t.settings.modes, mode),
       choice("photo", t.settings.photo, t.settings.photos),
+      h("fieldset", { class: "choice" }, h("legend", {}, t.settings.video), video, trust),
       languages.length > 1 ? choice("language", t.settings.language, LANGUAGE_NAMES, h("p", { class: "note" }, t.settings.languageNote)) : "",
       h("p", { class: "note" }, t.settings.note),
     ]);

@@ -9,6 +9,7 @@ import { describe } from "./row.js";
 import type { Sink, SmallHead, SmallVideo } from "./smallvideo.js";
 
 const STALE_S = 1;
+const RATE_S = 2;
 /** A picture is a little smaller than its place: that is hardly seen, and costs less. */
 const SHARE = 0.9;
 /** When a tile's width differs by more than this share, another size of picture is asked for. */
@@ -38,6 +39,9 @@ export class Tile implements Sink {
   private shown: { age_s: number; received_ms: number } | null = null;
   private over = false;
   private frames = 0;
+  private bytes = 0;
+  private head: SmallHead | null = null;
+  private rated = { at_ms: 0, frames: 0 };
 
   constructor(
     readonly name: string,
@@ -91,17 +95,38 @@ export class Tile implements Sink {
     this.video.show(this.name, this.camera, width_px, this);
   }
 
-  draw(head: SmallHead, picture: ImageBitmap, received_ms: number): void {
+  draw(head: SmallHead, picture: ImageBitmap | VideoFrame, received_ms: number): void {
     if (this.canvas.width !== head.width) this.canvas.width = head.width;
     if (this.canvas.height !== head.height) this.canvas.height = head.height;
     this.pen?.drawImage(picture, 0, 0);
     this.shown = { age_s: head.age_s, received_ms };
     this.frames += 1;
     this.element.dataset["frames"] = String(this.frames);
+    this.element.dataset["drawn"] = head.captured_ns;
+    this.head = head;
+  }
+
+  count(bytes: number): void {
+    this.bytes += bytes;
+  }
+
+  /** How its pictures come, for who points at it: every second or so. */
+  private showRate(now_ms: number): void {
+    const seconds = (now_ms - this.rated.at_ms) / 1000;
+    if (seconds < RATE_S || this.head === null) return;
+    const { width, height, h264 } = this.head;
+    const fps = ((this.frames - this.rated.frames) / seconds).toFixed(0);
+    const kB_s = (this.bytes / seconds / 1000).toFixed(1);
+    this.rated = { at_ms: now_ms, frames: this.frames };
+    this.bytes = 0;
+    const rate = t.video.rate(this.camera, width, height, fps, h264 ? "H.264" : "JPEG", kB_s);
+    setAttribute(this.canvas, "title", h264 ? `${rate}\n${t.video.encoded(h264.kind, h264.kbit_s)}` : rate);
+    setAttribute(this.element, "data-form", h264 ? `h264 ${h264.kind}` : "jpeg");
   }
 
   /** Show when its picture is old, or none came. */
   age(now_ms: number): void {
+    this.showRate(now_ms);
     const age_s = this.shown && this.shown.age_s + (now_ms - this.shown.received_ms) / 1000;
     const stale = age_s !== null && age_s > STALE_S && !this.over;
     setAttribute(this.element, "data-stale", String(stale));

@@ -2,10 +2,12 @@
 
 import type { CameraControls } from "./cameracontrols.js";
 import { fit, h, setAttribute, setHidden, setText, setTone } from "./dom.js";
+import { ServerClock } from "./clock.js";
 import { contain, draw } from "./drawing.js";
 import { type FollowMessage, REACH_NS, SOURCE } from "./follow.js";
 import { type FollowHost, FollowTool } from "./followtool.js";
 import { duration } from "./format.js";
+import { type Encoding, StreamDecoder, type WhyJpeg, whyJpeg } from "./h264.js";
 import { t } from "./language/index.js";
 import type { Camera, Drawing, FrameHead } from "./model.js";
 import { NewestFrame, type Received, unpack } from "./newest.js";
@@ -16,6 +18,8 @@ const LATE_S = 0.25;
 const STALE_S = 1;
 const RATE_MS = 2000;
 const TELL_MS = 90;
+/** When a picture's width differs by more than this share from what was asked for, another size is. */
+const OTHER = 0.15;
 const NEAR = "300px"; // pictures come before they are scrolled into sight
 
 interface Shown extends FrameHead {
@@ -41,7 +45,13 @@ export class VideoView {
   private socket: LastingSocket | null = null;
   private frames: NewestFrame<ImageBitmap> | null = null;
   private shown: Shown | null = null;
-  private arrivals: number[] = [];
+  private stream: StreamDecoder | null = null;
+  private encoding: Encoding | null = null;
+  /** Why pictures are JPEGs; null while nobody asked the browser. */
+  private why: WhyJpeg | "failed" | null = null;
+  private asked_px: number | null = null;
+  private readonly clock = new ServerClock();
+  private arrivals: { at_ms: number; bytes: number }[] = [];
   private inSight = true;
   private readonly hide = (): void => this.wantedChanged();
   private readonly sight = new IntersectionObserver((entries) => this.look(entries), { rootMargin: NEAR });
@@ -58,6 +68,10 @@ export class VideoView {
     // What nobody sees asks for no pictures: a hidden page, or a place that is scrolled away.
     document.addEventListener("visibilitychange", this.hide);
     this.sight.observe(this.element);
+    void whyJpeg().then((why) => {
+      this.why ??= why;
+      this.ask();
+    });
     this.reopen();
   }
 
@@ -68,6 +82,7 @@ export class VideoView {
     this.tools.close();
     this.socket?.close();
     this.frames?.end();
+    this.stream?.close();
   }
 
   /** Age of what is on the screen now [s]: its age when it was sent, and the time since it came. */
@@ -88,7 +103,8 @@ export class VideoView {
   /** Show age and rate. */
   update(now_ms: number): void {
     const age_s = this.age_s(now_ms);
-    while (this.arrivals[0] !== undefined && this.arrivals[0] < now_ms - RATE_MS) this.arrivals.shift();
+    while (this.arrivals[0] !== undefined && this.arrivals[0].at_ms < now_ms - RATE_MS) this.arrivals.shift();
+    if (this.asked_px !== null && Math.abs(this.width_px() - this.asked_px) > OTHER * this.asked_px) this.ask();
     if (age_s === null || this.shown === null) return;
     const stale = age_s > STALE_S && !this.still;
     setTone(this.ageChip, this.still ? "quiet" : stale ? "bad" : age_s > LATE_S ? "warn" : "ok");
@@ -100,7 +116,11 @@ export class VideoView {
     setHidden(this.nothing, !stale);
     setText(this.nothing, t.video.noNew);
     const { width, height } = this.shown;
-    setText(this.rate, t.video.rate(this.camera.name, width, height, ((this.arrivals.length * 1000) / RATE_MS).toFixed(0)));
+    const bytes = this.arrivals.reduce((sum, one) => sum + one.bytes, 0);
+    const how = this.encoding ? "H.264" : "JPEG";
+    setText(this.rate, t.video.rate(this.camera.name, width, height, ((this.arrivals.length * 1000) / RATE_MS).toFixed(0), how, (bytes / RATE_MS).toFixed(0)));
+    setAttribute(this.rate, "title", this.encoding ? t.video.encoded(this.encoding.kind, this.encoding.kbit_s) : this.why ? t.video.jpeg(this.why) : "");
+    setAttribute(this.element, "data-form", this.encoding ? `h264 ${this.encoding.kind}` : "jpeg");
     setAttribute(this.canvas, "aria-label", t.video.showing(this.camera.name, stale));
   }
 
@@ -139,11 +159,18 @@ export class VideoView {
   private reopen(): void {
     this.socket?.close();
     this.frames?.end();
-    this.socket = null;
+    this.stream?.close();
+    this.socket = this.stream = this.asked_px = null;
     setAttribute(this.element, "data-asks", String(this.isSeen));
     if (!this.isSeen) return;
     const socket = new LastingSocket(`/ws/drones/${encodeURIComponent(this.drone)}/video/${encodeURIComponent(this.camera.name)}`, {
       message: (data) => this.onMessage(data),
+      state: (open) => {
+        this.clock.reset();
+        this.stream?.close();
+        this.stream = null;
+        if (open) this.ask();
+      },
     });
     this.socket = socket;
     this.frames = new NewestFrame(
@@ -158,17 +185,62 @@ export class VideoView {
       const drawing = JSON.parse(data) as Drawing;
       this.drawings.set(drawing.source, drawing);
       this.redraw();
-    } else {
-      this.frames?.put({ ...unpack(data), received_ms: performance.now() });
+    } else this.receive(unpack(data), performance.now());
+  }
+
+  private receive({ head, jpeg: data }: Omit<Received, "received_ms">, came_ms: number): void {
+    this.clock.received(came_ms, head.now_s);
+    // A page that was stopped gets what waited for it: that is older than it was when it was sent.
+    const received_ms = came_ms - (this.clock.age_s(head.now_s, came_ms) ?? 0) * 1000;
+    this.arrivals.push({ at_ms: came_ms, bytes: data.byteLength });
+    if (head.h264) void this.decode({ head, jpeg: data, received_ms }, head.h264);
+    else this.frames?.put({ head, jpeg: data, received_ms });
+  }
+
+  private async decode(received: Received, encoding: Encoding): Promise<void> {
+    const { socket } = this;
+    const { head } = received;
+    this.stream ??= new StreamDecoder(
+      () => this.socket?.send({ key: true }),
+      () => {
+        this.why = "failed";
+        this.ask();
+      },
+    );
+    const picture = await this.stream.decode({ ...head, h264: encoding }, received.jpeg);
+    if (socket !== this.socket) picture?.close();
+    else {
+      if (picture) {
+        this.encoding = encoding;
+        this.show(received, picture);
+        picture.close();
+      }
+      socket?.send({ ack: head.ack });
     }
   }
 
-  private show({ head, received_ms }: Received, picture: ImageBitmap): void {
+  /** Ask for H.264 where it can be decoded, of the size that the picture has on the screen. */
+  private ask(): void {
+    if (this.why === null || !this.socket?.isOpen) return;
+    if (this.why === "") {
+      this.asked_px = this.width_px();
+      this.socket.send({ h264: true, width: this.asked_px });
+    } else if (this.why === "failed") this.socket.send({ h264: false });
+  }
+
+  /** Width of its place [device pixels]; 0: not known, or it is wanted in full. */
+  private width_px(): number {
+    return this.tools.wanted ? 0 : Math.round(this.canvas.clientWidth * (window.devicePixelRatio || 1));
+  }
+
+  private show({ head, received_ms }: Received, picture: ImageBitmap | VideoFrame): void {
     if (this.canvas.width !== head.width) this.canvas.width = head.width;
     if (this.canvas.height !== head.height) this.canvas.height = head.height;
     this.canvas.getContext("2d", { alpha: false })?.drawImage(picture, 0, 0);
+    if (!head.h264) this.encoding = null;
     this.shown = { ...head, captured: BigInt(head.captured_ns), received_ms };
-    this.arrivals.push(received_ms);
+    setAttribute(this.element, "data-drawn", head.captured_ns);
+    if ((this.age_s(performance.now()) ?? 0) > STALE_S) this.update(performance.now());
     this.redraw();
     this.tools.shown();
   }

@@ -9,7 +9,7 @@ import { FIRST_PAUSE_MS, type Handlers, LastingSocket, LONGEST_PAUSE_MS, REFUSED
 import { ServerClock } from "../src/clock.js";
 import { CENTRED } from "../src/sticks.js";
 
-const head = (ack: number): FrameHead => ({ ack, camera: "front", seq: ack, captured_ns: "1", age_s: 0, width: 4, height: 3 });
+const head = (ack: number): FrameHead => ({ ack, camera: "front", seq: ack, captured_ns: "1", age_s: 0, now_s: 0, width: 4, height: 3 });
 const frame = (ack: number) => ({ head: head(ack), jpeg: new Uint8Array([ack]), received_ms: 0 });
 const settle = (): Promise<void> => new Promise((done) => setImmediate(done));
 
@@ -414,7 +414,7 @@ test("what is marked is followed until something else is commanded; a page that 
   const { pilot, sent, receive, live } = flown();
   live();
   pilot.selectTarget("front");
-  pilot.markTarget({ camera: "front", captured_ns: "17", box: [1, 2, 30, 40], class_name: "person" });
+  pilot.markTarget({ camera: "front", captured_ns: "17", box: [1, 2, 30, 40], class_name: "person", size: [640, 480] });
   const follow = sent.findLast((message) => message["do"] === "follow");
   assert.deepEqual([follow?.["camera"], follow?.["captured_ns"], follow?.["box"]], ["front", "17", [1, 2, 30, 40]]);
   receive(held(true));

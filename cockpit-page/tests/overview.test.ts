@@ -59,7 +59,7 @@ test("frames of several cameras in one message; one that is cut off is refused",
   const frames = [{ drone: "a", bytes: 2 }, { drone: "b", bytes: 3 }];
   const { ack, frames: split } = unpackAll(message({ ack: 7, frames }, [1, 2], [3, 4, 5]));
   assert.equal(ack, 7);
-  assert.deepEqual(split.map(({ head, jpeg }) => [head.drone, [...jpeg]]), [["a", [1, 2]], ["b", [3, 4, 5]]]);
+  assert.deepEqual(split.map(({ head, data }) => [head.drone, [...data]]), [["a", [1, 2]], ["b", [3, 4, 5]]]);
   assert.throws(() => unpackAll(message({ ack: 7, frames }, [1, 2], [3, 4])), /cut off/);
   assert.throws(() => unpackAll(new Uint8Array([0, 0, 1, 0, 1]).buffer), /cut off/);
 });

@@ -118,3 +118,17 @@ def test_a_vehicle_that_shows_a_board_calibrates(run: Run, tmp_path: Path, pictu
     ended = run("camera", "calibrate", source, "-o", str(output), "--views", "7", "--seconds", "60")
     assert ended.code == 0, ended.err
     assert load_calibration(output).fx == pytest.approx(PINHOLE.fx, rel=0.02)
+
+
+def test_the_cameras_of_this_machine_are_listed(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    from skyloop.drivers.video import devices
+
+    monkeypatch.setattr(devices, "cameras", list)
+    assert run("camera", "list").out.strip() == "no camera is connected to this machine"
+    (tmp_path / "video0").touch()
+    found = [devices.CameraDevice(tmp_path / "video0", "HD Webcam", True)]
+    monkeypatch.setattr(devices, "cameras", lambda: found)
+    lines = run("camera", "list").out.splitlines()
+    assert lines[0] == f"video://{tmp_path}/video0 (HD Webcam)"
+    assert lines[1].startswith("  can't be opened: ")

@@ -129,6 +129,23 @@ def test_an_iterator_that_gets_nothing_says_so(drone: Drone) -> None:
         next(iter(drone.frames(timeout_s=0.02)))
 
 
+def test_frames_that_are_too_old_are_left_out_and_counted(proxy: ScriptedProxy, drone: Drone) -> None:
+    got: list[int] = []
+    with drone.on_frame(lambda frame: got.append(frame.seq), inline=True, max_age_s=0.0):
+        drone.wait(lambda _: subscribed(proxy, video("front")), WAIT_S)
+        proxy.frame(1)
+        drone.wait(lambda _: drone.stats["video/front"].dropped == 1, WAIT_S)
+    frames = drone.frames(timeout_s=0.1, max_age_s=0.0)
+    feeding = threading.Timer(0.02, proxy.frame, [2])
+    feeding.start()
+    with pytest.raises(NoAnswerError, match="no frame of front"):
+        next(frames)
+    feeding.join()
+    assert not got
+    with pytest.raises(UsageError, match="max_age_s is -1"):
+        next(drone.frames(max_age_s=-1))
+
+
 def test_where_no_frame_comes_because_of_the_vehicle_the_reason_is_told(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.more = {"vehicle_link": "lost", "link_reason": "no camera there", "link_remedy": "plug it in"}
     drone.wait(lambda _: drone.link.vehicle is LinkState.LOST, WAIT_S)

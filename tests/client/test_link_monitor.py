@@ -53,6 +53,16 @@ def test_silence_is_a_lost_link_to_be_restarted(monitor: LinkMonitor, clock: Man
     assert (verdict.state, verdict.restart) == (LinkState.LOST, True)
 
 
+def test_a_network_that_is_silent_now_and_then_is_given_more_time(monitor: LinkMonitor, clock: ManualClock) -> None:
+    monitor.excuse(2.0)
+    flow(monitor, clock, range(10))
+    clock.advance(2.9)
+    assert monitor.verdict(clock()).state is LinkState.DEGRADED
+    monitor.expect(0.0, clock() - 2_900_000_000)
+    clock.advance(0.2)
+    assert monitor.verdict(clock()).restart
+
+
 def test_a_proxy_that_answers_but_sends_no_feedback_is_degraded_not_lost(
     monitor: LinkMonitor, clock: ManualClock
 ) -> None:

@@ -38,6 +38,7 @@ from skyloop.messages import (
     Applied,
     CameraInfo,
     Capabilities,
+    EncodedFrame,
     Encoding,
     Event,
     EventKind,
@@ -50,6 +51,7 @@ from skyloop.messages import (
     Role,
     Value,
     Velocity,
+    VideoRequest,
 )
 from skyloop.proxy.proxy import Proxy
 from skyloop.recording.status import RecorderState, Status
@@ -77,6 +79,38 @@ class Listening:
             self._where.remove(self._function)
 
 
+class FakeStream:
+    """A camera's H.264 in one form, with which a test does what it likes."""
+
+    def __init__(self, request: VideoRequest) -> None:
+        self.request = request
+        self.consumers: list[Any] = []
+        self.reports: list[
+            tuple[int, bool]
+        ] = []  #: what the proxy was told: the newest picture, whether a key is needed
+        self.seq = 100
+
+    def add(self, consumer: Callable[[EncodedFrame], None], dropped: Callable[[], int]) -> None:
+        self.consumers.append(consumer)
+
+    def remove(self, consumer: Callable[[EncodedFrame], None]) -> None:
+        self.consumers.remove(consumer)
+
+    def report(self, seq: int, *, wants_key: bool = False) -> None:
+        self.reports.append((seq, wants_key))
+
+    def encode(self, *, key: bool = False, lost: int = 0, captured_ns: int | None = None) -> EncodedFrame:
+        """The next picture comes, after some that are lost on the way."""
+        self.seq += 1 + lost
+        now = time.monotonic_ns()
+        size = (round(64 * self.request.scale), round(48 * self.request.scale))
+        data = b"\0\0\1key" if key else b"\0\0\1"
+        picture = EncodedFrame(self.request.camera, self.seq, captured_ns or now, now, *size, "h264", key, data)
+        for consumer in list(self.consumers):
+            consumer(picture)
+        return picture
+
+
 class FakeDrone:
     """As much of a drone as the cockpit looks at."""
 
@@ -99,6 +133,8 @@ class FakeDrone:
         self.command_listeners: list[Any] = []
         self.log_listeners: list[Any] = []
         self.requests: list[tuple[str, dict[str, Any]]] = []  #: cameras that were subscribed to, and how
+        self.streams: list[FakeStream] = []  #: as H.264, in the order in which they were first asked for
+        self._core = SimpleNamespace(stream=self._stream)
         self.clock_offset_ns = 0
         self.closed = False
         self._size = width, height
@@ -133,6 +169,14 @@ class FakeDrone:
     def on_frame(self, function: Callable[[Frame], None], camera: str, **how: Any) -> Listening:
         self.requests.append((camera, how))
         return Listening(self.processors[camera], function)
+
+    def _stream(self, camera: str, **how: Any) -> FakeStream:
+        request = VideoRequest(camera, encoding="h264", **how)
+        known = next((stream for stream in self.streams if stream.request == request), None)
+        if known is None:
+            known = FakeStream(request)
+            self.streams.append(known)
+        return known
 
     # What a test does ------------------------------------------------------------------------------------------
 

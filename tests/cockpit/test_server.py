@@ -27,7 +27,7 @@ from websockets.sync.client import connect as open_socket
 from websockets.typing import Origin
 
 from skyloop.client import connect
-from skyloop.cockpit import Access, serve_cockpit
+from skyloop.cockpit import Access, serve_cockpit, with_certificate
 from skyloop.cockpit.__main__ import main
 from skyloop.cockpit.addresses import bind
 from skyloop.cockpit.child import CockpitProcess
@@ -290,6 +290,27 @@ def test_tokens_over_tls(certificates: Path, tokens: Path) -> None:
         request = urllib.request.Request(f"{address}/api/login", body, headers)
         with urllib.request.urlopen(request, timeout=5, context=visitor(certificates, None)) as answer:
             assert "Secure" in answer.headers["Set-Cookie"]
+
+
+def test_https_with_a_certificate_of_its_own(
+    tmp_path: Path, tokens: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    access = with_certificate(Access(token_file=tokens), tmp_path / "keys" / "pages")
+    assert access.page_authority is not None
+    trusting = ssl.create_default_context(cafile=str(access.page_authority))
+    with served(access=access) as address:
+        assert address.startswith("https://")
+        assert ask(address, "/api/session", tls=trusting)["role"] is None
+        with urllib.request.urlopen(f"{address}/api/authority", timeout=5, context=trusting) as answer:
+            assert answer.read() == access.page_authority.read_bytes()
+            assert "attachment" in answer.headers["content-disposition"]
+        with pytest.raises(OSError, match="certificate"):
+            ask(address, "/api/session", tls=ssl.create_default_context())
+    monkeypatch.setattr("skyloop.cockpit.server.own_addresses", lambda: ["8.8.8.8"])
+    with_certificate(Access("0.0.0.0", token_file=tokens), tmp_path / "keys" / "pages")
+    assert "8.8.8.8" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="give one of them"):
+        with_certificate(access, tmp_path / "keys" / "pages")
 
 
 # As a process of its own --------------------------------------------------------------------------------------------

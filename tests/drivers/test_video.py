@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import random
 import sys
-import threading
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,10 +20,9 @@ from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.video.devices import cameras, described
-from skyloop.drivers.video.player import CameraPublisher, LivePlayer
-from skyloop.drivers.video.sources import ContainerSource, DecodedImage, Source
-from skyloop.errors import DriverError, FileFormatError, MissingExtraError, UnknownNameError, UsageError
+from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Hover, LinkState
+from skyloop.pyav import new_decoder
 from skyloop.wire.ardrone.pave import PaveParser
 from tests.recordings import recorded
 
@@ -101,8 +101,44 @@ def test_who_comes_late_gets_pictures_from_the_next_key_on() -> None:
     assert sink.pictures[0].key
 
 
-def test_a_clip_has_no_stream(clip: Path) -> None:
+def test_a_clip_of_another_codec_has_no_stream(clip: Path) -> None:
     assert [camera.stream for camera in make_driver(f"video://{clip}").capabilities().cameras] == [""]
+
+
+def h264_clip(path: Path, b_frames: int) -> Path:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.max_b_frames = b_frames
+        stream.options = {"x264-params": "keyint=8:scenecut=0:b-adapt=0"}
+        for n in range(FRAMES):
+            picture = np.full((48, 64, 3), 40 + 8 * n, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def test_h264_in_a_file_is_handed_on_with_the_times_of_its_frames(tmp_path: Path) -> None:
+    path = h264_clip(tmp_path / "clip.mp4", 0)
+    assert [camera.stream for camera in make_driver(f"video://{path}").capabilities().cameras] == ["h264"]
+    sink = RecordingSink(record=True)
+    with playing(f"video://{path}?speed=20&loop=1", sink):
+        assert sink.wait(lambda: len(sink.pictures) >= 2 * FRAMES, 20.0)
+    pictures = list(sink.pictures)[: 2 * FRAMES]
+    context = new_decoder("h264", "a test")
+    decoded = [image for picture in pictures for image in context.decode(av.Packet(picture.data))]
+    assert len(decoded) == len(pictures)
+    assert [n for n, picture in enumerate(pictures) if picture.key][:4] == [0, 8, 16, 24]
+    assert {(picture.width, picture.height) for picture in pictures} == {(64, 48)}
+    frames = [frame.captured_ns for frame in sink.frames]
+    assert [picture.captured_ns for picture in pictures[:FRAMES]] == frames[:FRAMES]
+
+
+def test_h264_with_b_frames_has_no_stream_and_plays(tmp_path: Path) -> None:
+    path = h264_clip(tmp_path / "clip.mp4", 2)
+    assert [camera.stream for camera in make_driver(f"video://{path}").capabilities().cameras] == [""]
+    sink = play(f"video://{path}?{FAST}")
+    assert sink.frame_counts == {"front": FRAMES}
 
 
 def test_a_torn_start_is_waited_out() -> None:
@@ -208,7 +244,7 @@ def test_numbered_pictures_play_as_well(tmp_path: Path) -> None:
     [
         ("sped=2", "no option of video:// named 'sped'; did you mean 'speed'"),
         ("speed=0", "option speed is '0' and must be a number from 0.01"),
-        ("width=320", "width can be asked of a device only"),
+        ("width=320", "only a device or a stream has width"),
         ("cx=3", "option cx needs fx as well"),
         ("fx=0", "option fx is '0'"),
         ("fx=9&fy=0", "option fy is '0'"),
@@ -344,85 +380,85 @@ def test_a_device_that_is_not_there_is_no_error() -> None:
     sink = RecordingSink()
     with playing("video:///dev/skyloop-no-such-camera?width=320&height=240&fps=15", sink) as driver:
         camera = driver.capabilities().cameras[0]
-        assert (camera.width, camera.height, camera.fps) == (320, 240, 15)
+        assert (camera.width, camera.height, camera.fps, camera.stream) == (320, 240, 15, "")
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)
-    assert [state for state, _ in sink.links] == [LinkState.LOST]
-    assert sink.links[0][1] == f"there is no /dev/skyloop-no-such-camera; {described(cameras())}"
+    assert [state for state, _ in sink.links] == [LinkState.CONNECTING, LinkState.LOST]
+    why = f"there is no such device; {described(cameras())}"
+    assert sink.links[-1][1] == f"/dev/skyloop-no-such-camera: {why}"
+    assert not sink.events
 
 
 def test_a_file_that_is_no_camera_is_told() -> None:
     sink = RecordingSink()
-    with playing("video:///dev/null", sink):
+    with playing("video:///dev/null?exposure=10&gain=3", sink):
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)
-    assert "/dev/null cannot be opened" in sink.links[-1][1]
+    assert "/dev/null: " in sink.links[-1][1]
 
 
-@contextmanager
-def live(open_source: Callable[[], Source], sink: RecordingSink) -> Iterator[None]:
-    stop = threading.Event()
-    player = LivePlayer(CameraPublisher(sink, "front", lambda *_: None, stop), open_source, retry_s=0.01)
-    thread = threading.Thread(target=player.run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join(10)
-    assert not thread.is_alive()
-    assert not sink.problems
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A pipe below /dev that raw pictures are read from, with the options that a camera is asked by."""
+    if not Path("/dev/shm").is_dir():
+        pytest.skip("a file that looks like a device needs /dev/shm")
+    monkeypatch.setattr("skyloop.drivers.live_camera.DEVICE_FORMAT", "rawvideo")
+    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="skyloop-") as folder:
+        yield Path(folder) / "video0"
 
 
-def test_a_device_that_comes_and_goes_is_opened_again() -> None:
-    answers: list[str] = ["nothing there", "nothing there", "5", "5"]
-
-    def open_source() -> Source:
-        answer = answers.pop(0) if answers else "nothing there"
-        if answer == "nothing there":
-            raise DriverError(answer)
-        return ContainerSource(f"testsrc=size=64x48:rate=25:duration={int(answer) / 25}", "lavfi", live=True)
-
+def test_a_device_that_comes_and_goes_is_opened_again_and_asked_for_exposure_and_gain(device: Path) -> None:
     sink = RecordingSink()
-    with live(open_source, sink):
-        assert sink.wait(lambda: len(sink.links) >= 5, 10.0)
-    states = [(state, reason) for state, reason in sink.links[:5]]
-    up, ended = (LinkState.UP, ""), (LinkState.LOST, "the device ended its stream")
-    assert states == [(LinkState.LOST, "nothing there"), up, ended, up, ended]
-    assert sink.frame_counts["front"] == 10
+    asked = f"video://{device}?width=64&height=48&fps=25&exposure=8&gain=auto"
+    with playing(asked, sink):
+        for _ in range(2):
+            wanted = sink.frame_counts["front"] + 10
+            os.mkfifo(device)
+            with device.open("wb", buffering=0) as pipe:
+                begun = monotonic_ns()
+                while sink.frame_counts["front"] < wanted:
+                    pipe.write(bytes(64 * 48 * 3 // 2))
+                    assert monotonic_ns() - begun < 20e9, sink.links
+                    time.sleep(0.02)
+            device.unlink()
+            assert sink.wait(lambda: sink.link_state is LinkState.LOST, 20.0)
+        newest = sink.newest
+    states = [state for state, _ in sink.links]
+    assert states.count(LinkState.UP) == 2
+    assert newest is not None
+    assert newest.native is not None
+    assert int(str(newest.native["camera.received"])) >= 10
+    # A pipe is no device of Video4Linux: each setting that it refuses is told once.
+    assert [event.text.split(":")[0] for event in sink.events] == ["camera"] * 2
+    assert any("exposure" in event.text for event in sink.events)
+    assert any("gain" in event.text for event in sink.events)
 
 
-class StalledCamera:
-    """Twelve pictures at 25 a second, by the stamps, that all come half a second after the first one."""
-
-    width, height, fps, damaged = 64, 48, 25.0, 0
-    stream = ""
-
-    def __init__(self) -> None:
-        self.decoded = 0
-
-    def images(self, late: Callable[[float], bool] | None = None) -> Iterator[DecodedImage]:
-        assert late is not None
-        image = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="bgr24")
-        yield DecodedImage(7.0, image)
-        time.sleep(0.5)
-        for n in range(1, 13):
-            if not late(7.0 + n * 0.04):
-                self.decoded += 1
-                yield DecodedImage(7.0 + n * 0.04, image)
-
-    def close(self) -> None:
-        pass
+@pytest.mark.parametrize(
+    ("uri", "message"),
+    [
+        ("video:///dev/video0?loop=1", "a live camera has no loop and no speed"),
+        ("video:///dev/video0?speed=2", "a live camera has no loop and no speed"),
+        ("video:///tmp/x.mp4?gain=3", "only a device has gain"),
+        ("video://rtp://:5600?format=mjpeg", "only a device has format"),
+        ("video:///dev/video0?format=png", "format of video:// named 'png'"),
+        ("video:///dev/video0?exposure=0", "option exposure is '0'"),
+        ("video:///dev/video0?gain=0.5", "option gain is 0.5 and must be a whole number"),
+        ("video://ftp://here", "must be one of rtsp://…"),
+        ("video://rtsp:///live", "names no host"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(uri: str, message: str) -> None:
+    with pytest.raises((UsageError, UnknownNameError), match=message):
+        make_driver(uri)
 
 
-def test_of_a_late_device_the_newest_pictures_count() -> None:
-    camera, sink = StalledCamera(), RecordingSink()
-    played = threading.Event()
-
-    def open_source() -> Source:
-        if played.is_set():
-            raise DriverError("unplugged")
-        played.set()
-        return camera
-
-    with live(open_source, sink):
-        assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)
-    assert camera.decoded <= 4  # those of the last 100 ms
+def test_what_sends_h264_announces_a_stream() -> None:
+    for uri, stream in {
+        "video://rtsp://user:secret@camera/live": "h264",
+        "video://rtp://:5600": "h264",
+        "video:///dev/video0?format=h264": "h264",
+        "video:///dev/video0?format=mjpeg": "",
+        "video://rtp://:5600?stream=0": "",
+    }.items():
+        capabilities = make_driver(uri).capabilities()
+        assert [camera.stream for camera in capabilities.cameras] == [stream]
+        assert "secret" not in capabilities.description

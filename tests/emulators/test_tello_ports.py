@@ -15,7 +15,7 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
-from skyloop.wire.tello.h264 import parse_sequence, units
+from skyloop.wire.h264 import parse_sequence, units
 from skyloop.wire.tello.state import parse
 from skyloop.wire.tello.video import PIECE, AccessUnit, Assembly
 from tests.drivers.tello.addresses import Addresses

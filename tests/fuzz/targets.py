@@ -90,7 +90,8 @@ def ardrone(data: bytes) -> None:
 
 def tello(data: bytes) -> None:
     """What a Tello sends."""
-    from skyloop.wire.tello import commands, h264, state
+    from skyloop.wire import h264
+    from skyloop.wire.tello import commands, state
     from skyloop.wire.tello.video import Assembly
 
     with suppress(DecodeError):
@@ -99,9 +100,10 @@ def tello(data: bytes) -> None:
     with suppress(DecodeError):
         sequence = h264.parse_sequence(data[: len(data) // 2])
         h264.parse_slice(data[len(data) // 2 :], sequence)
-    pieces = Assembly()
+    pieces, inspector = Assembly(), h264.Inspector()
     for number, piece in enumerate(_parts(data)):
         pieces.feed(piece, number * 1_000_000)
+        inspector.inspect(piece)
 
 
 def mavlink(data: bytes) -> None:

@@ -82,6 +82,13 @@ def test_after_a_fall_of_the_capacity_delay_comes_first_and_the_rate_comes_back(
     assert run.rates[-1] > 1200
 
 
+def test_an_uneven_path_that_carries_enough_is_used() -> None:
+    run = Run(lambda ms: 0 if ms % 300 < 70 else 2500).go(30_000)
+    later = run.rates[150:]
+    assert sum(later) / len(later) > 1000
+    assert run.age_ms(0.95, since_ms=5000) <= 150
+
+
 def test_while_nothing_passes_little_is_sent_and_soon_after_it_goes_on() -> None:
     run = Run(lambda ms: 0 if 10_000 <= ms < 15_000 else 1500).go(20_000)
     stuck = [captured for captured, _ in run.ages_ms if 10_000 <= captured < 15_000]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -11,6 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from skyloop.clock import ManualClock
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.messages import (
     CameraInfo,
@@ -179,9 +182,19 @@ def test_a_form_for_one_follows_what_it_acknowledges(bench: Bench) -> None:
     assert form.skipped >= 12
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a priority for each thread")
+def test_who_encodes_gives_way_to_who_flies(bench: Bench) -> None:
+    shown(bench, watcher(bench), 1)
+    (thread,) = (one for one in threading.enumerate() if one.name == "skyloop-h264-front")
+    assert thread.native_id is not None
+    assert os.getpriority(os.PRIO_PROCESS, thread.native_id) >= 10
+    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) < 10 or os.nice(0) >= 10
+
+
 def test_a_slow_path_gets_smaller_pictures_and_larger_ones_only_after_a_while(bench: Bench) -> None:
     app = watcher(bench, MINE)
     (form,) = bench.proxy.publisher.streams.known
+    form._kbit_s = 5000  # the pictures are larger than the camera said
     rate = form._rate
     assert rate is not None
     rate.acknowledged = lambda *_: None  # type: ignore[method-assign]
@@ -246,7 +259,7 @@ def test_an_encoder_that_fails_is_reported_and_made_anew(
     told = threading.Event()
     made._fail = lambda why: (failed.append(why), told.set())  # type: ignore[assignment, func-returns-value]
     with monkeypatch.context() as broken:
-        broken.setattr(streams, "H264Encoder", lambda *_: (_ for _ in ()).throw(ValueError("no encoder today")))
+        broken.setattr(streams, "H264Encoder", lambda *_, **__: (_ for _ in ()).throw(ValueError("no encoder today")))
         made.put(header(1), np.zeros(64 * 48 * 3, np.uint8))
         assert told.wait(WAIT_S)
     assert "no encoder today" in failed[0]
@@ -306,3 +319,85 @@ def test_topics_that_make_no_sense_are_malformed(bench: Bench, topic: str) -> No
 def test_a_request_says_what_is_wrong_with_it() -> None:
     with pytest.raises(UsageError, match="1 to 32 letters"):
         VideoRequest("front", encoding="h264", subscriber="x" * 33)
+
+
+class OwnStream:
+    """A camera that sends H.264 itself, 15 pictures a second with a key each second, over a path that is played."""
+
+    def __init__(self, kbit_s: int) -> None:
+        self.clock = ManualClock(10**12)
+        self.kbit_s = kbit_s
+        self.seq = 0
+        self.sent: list[EncodedFrame] = []
+        camera = CameraInfo("front", 640, 360, 15.0, stream="h264")
+        request = VideoRequest.parse(MINE)
+        self.form = StreamForm(MINE, request, camera, lambda _: None, lambda _: None, self.clock)
+        assert self.form.takes_own
+        assert self.form._rate is not None
+        self.rate = self.form._rate
+
+    def play(self, seconds: float, *, round_trip_s: float = 0.02, path_kbit_s: float = 1e9) -> list[EncodedFrame]:
+        """Let the vehicle send for some time; return what was handed on of it."""
+        before = len(self.sent)
+        for _ in range(round(seconds * 15)):
+            self.clock.advance(1 / 15)
+            self.seq += 1
+            size = self.kbit_s * 1000 // 8 // 15
+            one = EncodedFrame("front", self.seq, 1, 2, 640, 360, "h264", self.seq % 15 == 0, bytes(size))
+            handed = self.form.own(one, 1)
+            if handed is not None:
+                self.sent.append(handed)
+                self.rate.acknowledged(
+                    handed.seq, self.clock() + round(1e9 * (round_trip_s + size * 8e-3 / path_kbit_s))
+                )
+        return self.sent[before:]
+
+
+def test_the_vehicles_own_pictures_are_handed_on_from_a_key_while_the_path_carries_them() -> None:
+    camera = OwnStream(1000)
+    assert camera.play(3.0) == [], "the rate is not known to be enough"
+    camera.rate.kbit_s = 2000
+    handed = camera.play(3.0)
+    assert handed[0].key
+    assert camera.form.passing
+    assert [one.seq for one in handed] == list(range(handed[0].seq, handed[0].seq + len(handed)))
+    assert {(one.topic, len(one.data)) for one in handed} == {(MINE, 1000 * 1000 // 8 // 15)}
+    assert not camera.form.wants(header(1), 1), "nothing is encoded meanwhile"
+
+
+def test_what_the_path_does_not_carry_is_encoded_again_and_tried_later_and_later() -> None:
+    camera = OwnStream(1000)
+    camera.play(3.0)
+    camera.rate.kbit_s = 2000
+    camera.play(2.0)
+    assert camera.form.passing
+    camera.rate.kbit_s = 300
+    assert camera.play(0.2) == []
+    assert camera.form._anew, "what is encoded now begins with a key picture"
+    camera.rate.kbit_s = 2000
+    assert camera.play(4.0) == []
+    assert camera.play(3.0)
+    camera.rate.kbit_s = 300
+    camera.play(0.2)
+    camera.rate.kbit_s = 2000
+    assert camera.play(8.0) == []
+    assert camera.play(4.0)
+
+
+def test_a_subscriber_that_needs_a_key_gets_one_that_is_encoded_until_the_vehicle_sends_the_next() -> None:
+    camera = OwnStream(1000)
+    camera.play(3.0)
+    camera.rate.kbit_s = 2000
+    camera.play(2.2)
+    camera.form.report(StreamReport(MINE, 0, wants_key=True), camera.clock())
+    assert camera.play(0.1) == []
+    assert camera.form.wants(header(1), 1)
+    assert camera.play(1.5)[0].key
+
+
+def test_only_a_form_that_asks_for_all_pictures_at_full_size_takes_the_vehicles_own() -> None:
+    camera = CameraInfo("front", 640, 360, 30.0, stream="h264")
+    for options in ("subscriber=me&scale=0.5", "max_fps=5&subscriber=me", "kbit_s=500"):
+        topic = f"stream/front?{options}"
+        request = VideoRequest.parse(topic)
+        assert not StreamForm(topic, request, camera, lambda _: None, lambda _: None, time.monotonic_ns).takes_own

@@ -24,7 +24,7 @@ def names(cell: str) -> list[str]:
 def test_the_options_are_those_of_the_function_and_the_command() -> None:
     from typer.main import get_command
 
-    table = rows(section(PAGE, "## How it records").partition("### Data loss")[0])
+    table = rows(section(PAGE, "## How it records").partition("### H.264 passthrough")[0])
     parameters = inspect.signature(skyloop.record).parameters
     listed = [name for row in table for name in names(row[0])]
     assert sorted(names(table[0][3])) == sorted([*CHOICES, "video.CAMERA"])

@@ -32,9 +32,9 @@ from skyloop.messages import CameraInfo, Capabilities, Feedback, LinkState
 from skyloop.proxy.proxy import Proxy
 from skyloop.recording import taps
 from skyloop.recording.options import Options
-from skyloop.recording.review.export import export_mp4
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise
+from skyloop.recording.review.video import export_mp4
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
@@ -228,9 +228,11 @@ def test_looking_at_it(kept: Path, tmp_path: Path, log: Log) -> None:
     assert "CompressedVideo" in ended.out or VIDEO in ended.out
     write_report(Recording.open(kept), "alpha", tmp_path / "report.html", pictures=4)
     assert (tmp_path / "report.html").read_text().count("data:image/jpeg") == 4
-    assert export_mp4(Recording.open(kept), "alpha", "front", tmp_path / "front.mp4") == 240
+    assert export_mp4(Recording.open(kept), "alpha", "front", tmp_path / "front.mp4").frames == 240
     with av.open(str(tmp_path / "front.mp4")) as container:
-        assert sum(1 for _ in container.decode(video=0)) == 240
+        copied = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
+    assert len(copied) == 240
+    assert all(np.array_equal(image, expected) for image, expected in zip(copied, shown(), strict=True))
 
 
 def test_without_pyav_the_rest_of_a_recording_can_be_read(

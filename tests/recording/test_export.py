@@ -17,10 +17,11 @@ import pytest
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.logfile.layout import Channel
 from skyloop.logfile.reader import Recording
-from skyloop.recording.review import export
-from skyloop.recording.review.export import export_csv, export_mp4, export_npz, export_parquet, read
+from skyloop.recording.review import export, video
+from skyloop.recording.review.export import export_csv, export_npz, export_parquet, read
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.tables import Table, tables
+from skyloop.recording.review.video import export_mp4
 from tests.cli.conftest import Ended
 from tests.recording.flights import BEGIN_NS, MS, Plan, write_flight
 
@@ -117,11 +118,17 @@ def jpeg(width: int, height: int) -> bytes:
     return cv2.imencode(".jpg", np.full((height, width, 3), 90, np.uint8))[1].tobytes()
 
 
+def videos(path: Path, target: Path) -> tuple[int, int]:
+    found = export_mp4(Recording.open(path), "alpha", "front", target)
+    assert [(one.path, one.copied) for one in found.videos] == [(target, False)]
+    return found.frames, found.left_out
+
+
 def test_pictures_that_are_damaged_or_of_another_size_are_left_out(tmp_path: Path) -> None:
     """A video has one size, that of its first picture, made even; the others keep their times."""
     odd = {number: jpeg(65, 49) for number in range(1, 21)} | {3: b"no picture", 4: b"\xff\xd8\xff", 6: jpeg(32, 24)}
     path = write_flight(tmp_path / "flight.mcap", Plan(packed=odd.get))
-    assert export_mp4(Recording.open(path), "alpha", "front", tmp_path / "x.mp4") == 17
+    assert videos(path, tmp_path / "x.mp4") == (17, 3)
     with av.open(str(tmp_path / "x.mp4")) as container:
         pictures = list(container.decode(video=0))
     assert {(picture.width, picture.height) for picture in pictures} == {(64, 48)}
@@ -138,11 +145,11 @@ def test_a_camera_of_which_nothing_can_be_decoded(tmp_path: Path) -> None:
 
 def test_without_h264_mpeg4_is_taken(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not every build of FFmpeg has x264."""
-    monkeypatch.setattr(export, "_CODECS", ("no codec of that name", "mpeg4"))
-    assert export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "x.mp4", burn_time=True) == 20
+    monkeypatch.setattr(video, "_CODECS", ("no codec of that name", "mpeg4"))
+    assert export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "x.mp4", burn_time=True).frames == 20
     with av.open(str(tmp_path / "x.mp4")) as container:
         assert container.streams.video[0].codec_context.name == "mpeg4"
-    monkeypatch.setattr(export, "_CODECS", ("no codec of that name",))
+    monkeypatch.setattr(video, "_CODECS", ("no codec of that name",))
     with pytest.raises(MissingExtraError, match="no codec of that name"):
         export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "y.mp4")
 
@@ -161,7 +168,7 @@ def test_burning_times_needs_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     image = np.zeros((48, 64, 3), np.uint8)
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match="vision"):
-        export._burn(image, 1.0)
+        video._burn(image, 1.0)
 
 
 def test_frames_that_are_not_there(tmp_path: Path) -> None:

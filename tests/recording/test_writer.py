@@ -70,11 +70,11 @@ class Bench:
             picture = Picture(FrameRecord(header, number, "jpeg"), bytes(range(256)) * (size // 256 + 1))
             self.backlog.put(Item(0, "video.front", Rank.FRAME, number, picture, size))
 
-    def pictures(self, *numbers: int, size: int = 1000) -> None:
+    def pictures(self, *numbers: int, size: int = 1000, group: int = 10) -> None:
         """Of H.264: each tenth is a key."""
         for number in numbers:
             header = FrameHeader("front", number, number, number, 4, 3, Encoding.BGR8, 36)
-            record = FrameRecord(header, number, "h264", number % 10 == 0)
+            record = FrameRecord(header, number, "h264", number % group == 0)
             self.backlog.put(Item(0, "video.front", Rank.FRAME, number, Picture(record, bytes(size)), size))
 
     def step(self, seconds: float = 1.0) -> None:
@@ -176,6 +176,25 @@ def test_each_file_of_a_rotation_begins_with_a_key_picture(make: Make, tmp_path:
     assert [numbers[0] for numbers in found] == [0, 10, 30]
     assert written(*bench.writer.files) == list(range(6))
     assert bench.backlog.dropped == {}
+
+
+def test_a_rotation_waits_for_the_key_pictures_of_a_camera_that_sends_few(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), rotate_s=2)
+    for second in range(22):  # a key each ten seconds
+        bench.pictures(second)
+        bench.step()
+    bench.writer._end()
+    found = [written(path, topic="/alpha/camera/front/video") for path in bench.writer.files]
+    assert found == [[*range(10)], [*range(10, 20)], [20, 21]]
+    assert bench.backlog.dropped == {}
+
+
+def test_a_rotation_does_not_wait_for_a_key_picture_that_never_comes(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), rotate_s=10)
+    for second in range(26):
+        bench.pictures(second, group=1000)
+        bench.step()
+    assert len(bench.writer.files) == 2
 
 
 def test_a_rotation_does_not_wait_for_a_key_picture_for_ever(make: Make, tmp_path: Path) -> None:

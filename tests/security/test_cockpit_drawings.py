@@ -35,7 +35,8 @@ class Page:
 
 
 def video(page: Page, feed: EventFeed, counts: PageCounts) -> VideoSender:
-    sender = VideoSender(page, SimpleNamespace(camera="front"), feed, counts)  # type: ignore[arg-type]
+    station: Any = SimpleNamespace(event_feed=feed)
+    sender = VideoSender(page, station, SimpleNamespace(camera="front"), counts)  # type: ignore[arg-type]
     sender._sent_ns = 10  # a frame was sent
     return sender
 

@@ -15,9 +15,11 @@ from skyloop.messages import (
     Reply,
     Request,
     RequestAuthority,
+    StreamReport,
     decode,
     encode,
 )
+from skyloop.transport.fabric import layout
 from skyloop.transport.fabric.layout import ASK, COMMAND, ORDER, refusal_reply, way_of
 
 OLGA = Identity("olga", KeyRole.OBSERVER)
@@ -34,6 +36,14 @@ def test_questions_and_orders_go_by_keys_of_their_own(body: AnyRequest, way: str
 def test_a_command_has_its_own_and_garbage_is_left_to_the_proxy() -> None:
     assert way_of(HOVER) == COMMAND
     assert way_of(b"no packet") == ASK
+
+
+def test_what_is_late_of_no_use_is_told_apart() -> None:
+    report = encode(StreamReport("stream/front?kbit_s=500", 3))
+    assert layout.is_report(report)
+    assert way_of(report) == ASK
+    assert not layout.is_report(HOVER)
+    assert not layout.is_report(encode(Request(1, Ping(1))))
 
 
 def test_an_order_without_the_right_to_it_is_answered_with_whose_keys_these_are() -> None:

@@ -261,6 +261,22 @@ def test_the_environment_may_ask(monkeypatch: pytest.MonkeyPatch) -> None:
         environment.choose("10.0.0.5:port")
 
 
+def test_others_wait_for_an_end_as_long_as_it_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lease_ms() -> object:
+        settings = environment.choose(network=True)
+        assert settings is not None
+        return config.make(settings, Part.PROXY)["transport"]["link"]["tx"]["lease"]
+
+    monkeypatch.delenv("SKYLOOP_LEASE_S", raising=False)
+    assert lease_ms() == 700
+    monkeypatch.setenv("SKYLOOP_LEASE_S", "3")
+    assert lease_ms() == 3000
+    for wrong in ("long", "nan", "0.1", "60"):
+        monkeypatch.setenv("SKYLOOP_LEASE_S", wrong)
+        with pytest.raises(UsageError, match=r"must be 0\.7 to 10 seconds"):
+            lease_ms()
+
+
 def test_where_is_looked_is_told_in_words() -> None:
     assert FabricSettings().reach == "multicast"
     assert FabricSettings(connect=("10.0.0.5",), multicast=False).reach == "10.0.0.5"

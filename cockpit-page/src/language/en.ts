@@ -21,6 +21,15 @@ export const en = {
     and: (one: string, other: string) => `${one}, ${other}`,
     photo: "Photos",
     photos: { shown: "With the overlay, if it is shown", plain: "Without overlay" },
+    video: "Video",
+    videoNote: (why: "" | "insecure" | "browser") =>
+      ({
+        "": "As H.264 where the drone gives it, otherwise as JPEG.",
+        insecure: "As JPEG: browsers decode H.264, which is sharper and needs less of the network, only over https or on the cockpit's own machine. Start the cockpit with skyloop cockpit --https, and open its https address.",
+        browser: "As JPEG: this browser decodes no H.264.",
+      })[why],
+    trust: "Certificate of this cockpit's authority",
+    trustNote: "The browser warns of this address until it trusts the certificate: download it, and import it as an authority in the settings of the browser, or of the phone (Security, CA certificate). It can vouch for nothing but private networks.",
     language: "Language",
     languageNote: "Used when the page is loaded again.",
   },
@@ -70,7 +79,20 @@ export const en = {
     age: (age: string) => `${age} old`,
     milliseconds: (count: string) => `${count} ms`,
     noNew: "No new picture",
-    rate: (camera: string, width: number, height: number, fps: string) => `${camera} · ${width} × ${height} · ${fps} fps`,
+    rate: (camera: string, width: number, height: number, fps: string, how: string, kB_s: string) => `${camera} · ${width} × ${height} · ${fps} fps · ${how} ${kB_s} kB/s`,
+    encoded: (kind: "vehicle" | "shared" | "own", kbit_s: number | null) =>
+      ({
+        vehicle: "H.264 as the vehicle encodes it",
+        shared: `H.264 at ${kbit_s ?? 0} kbit/s, encoded once for all who watch`,
+        own: "H.264 for this page alone, which is slow: as much as its connection carries",
+      })[kind],
+    jpeg: (why: "" | "insecure" | "browser" | "failed") =>
+      ({
+        "": "JPEG: no H.264 comes from this drone",
+        insecure: "JPEG: browsers decode H.264 only over https, or on the cockpit's own machine. Settings tell how.",
+        browser: "JPEG: this browser decodes no H.264",
+        failed: "JPEG: this browser could not decode the H.264 of this drone",
+      })[why],
     cameras: "Cameras",
     overlay: "Overlay",
     noCamera: "No camera",

@@ -379,6 +379,7 @@ class Drone:
         channel = self.sync._core.channel(camera, **how)
         notifier = LoopNotifier()
         came = notifier.came
+        max_age_s = how.get("max_age_s")
         mailbox: Mailbox[Arrival] = Mailbox(notifier=notifier)
         with self.sync._core.closing(mailbox), channel.into(mailbox):
             while not self.sync.closed:
@@ -391,9 +392,9 @@ class Drone:
                 if arrival is None:
                     continue
                 if arrival.header.encoding is Encoding.JPEG:
-                    frame = await in_thread(lambda arrival=arrival: channel.picture(arrival))  # type: ignore[misc]
+                    frame = await in_thread(lambda arrival=arrival: channel.picture(arrival, max_age_s))  # type: ignore[misc]
                 else:
-                    frame = channel.picture(arrival)
+                    frame = channel.picture(arrival, max_age_s)
                 if frame is not None:
                     yield frame
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from skyloop.bench.contract import Image, Received
 from skyloop.bench.schedule import FEEDBACK, VIDEO
-from skyloop.bench.vehicle import CAMERA, BenchVehicle, stamped
+from skyloop.bench.vehicle import CAMERA, USUAL_CAMERA, BenchVehicle, stamped
 from skyloop.bench.waypoints import Setpoint
 from skyloop.client import Drone, Frame, connect
 from skyloop.client.channels import VideoOptions
@@ -29,9 +29,11 @@ def proxy_name(address: str) -> str:
 class Vehicle:
     """The vehicle's end; see :class:`skyloop.bench.contract.VehicleEnd`."""
 
+    camera = USUAL_CAMERA
+
     def __init__(self, address: str, received: Received) -> None:
         name, server = self._server(address)
-        self._vehicle = BenchVehicle(received)
+        self._vehicle = BenchVehicle(received, self.camera)
         self._proxy = Proxy(self._vehicle, server, name=name)
         keep_warm(self._proxy)
         self._proxy.start()

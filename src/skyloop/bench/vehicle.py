@@ -21,6 +21,7 @@ from skyloop.messages import (
 from skyloop.messages.typical import typical_feedback
 
 CAMERA: Final = "bench"
+USUAL_CAMERA: Final = CameraInfo(CAMERA, 320, 240, 15.0)
 _WRAPS_NS: Final = 1 << 40  # 18 minutes
 _UNIT_M_S: Final = 2.0**-46
 
@@ -45,17 +46,19 @@ class BenchVehicle(Driver):
 
     Args:
         received: Called with each new set-point, on the thread that applies it.
+        camera: Its camera.
     """
 
     shared = False
 
-    def __init__(self, received: Received) -> None:
+    def __init__(self, received: Received, camera: CameraInfo = USUAL_CAMERA) -> None:
         super().__init__(parse_uri("bench://"))
+        self._camera = camera
         self._received = received
         self._last_up = 0.0
 
     def capabilities(self) -> Capabilities:
-        return Capabilities("bench", frozenset(ACTION_NAMES.values()), (CameraInfo(CAMERA, 320, 240, 15.0),))
+        return Capabilities("bench", frozenset(ACTION_NAMES.values()), (self._camera,))
 
     def _open(self, sink: Sink) -> None:
         sink.link(LinkState.UP)

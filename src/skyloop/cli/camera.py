@@ -1,4 +1,4 @@
-"""``skyloop camera``: prints boards, and calibrates cameras by them."""
+"""``skyloop camera``: prints boards, calibrates cameras by them, and lists those of this machine."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ Dictionary = Annotated[str, typer.Option(metavar="NAME", help="Of a ChArUco boar
 
 @camera.callback()
 def _camera() -> None:
-    """Print a board, and calibrate a camera by pictures of it.
+    """Print a board, calibrate a camera by pictures of it, and list the cameras of this machine.
 
     skyloop camera COMMAND --help shows more about each.
     """
@@ -129,6 +129,18 @@ def calibrate(
     found, rejected = fit(collector.views, *collector.size, model=model.value, camera=camera or "")
     found.save(output)
     _report(found, rejected, output)
+
+
+@camera.command("list", short_help="List the cameras of this machine", epilog=f"{_EXAMPLE}list")
+def list_cameras() -> None:
+    """List the cameras of this machine: their addresses, formats, sizes, rates, exposure and gain."""
+    from skyloop.drivers.video.devices import cameras, described, listed
+
+    found = cameras()
+    if not found:
+        typer.echo(described(found))
+    for device in found:
+        typer.echo("\n".join(listed(device)))
 
 
 class _Search:

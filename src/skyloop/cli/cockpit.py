@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from skyloop.cli.completion import drone_names
-from skyloop.cli.naming import DronesOption, KeysOption, NetworkOption, drones, join_network
+from skyloop.cli.naming import DronesOption, KeysOption, NetworkOption, drones, join_network, keys_directory
 from skyloop.cli.network import MetricsOption
 from skyloop.messages import Role
 
@@ -36,6 +36,12 @@ def cockpit(
     token_file: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Who may come in: lines of ROLE TOKEN [NAME]")
     ] = None,
+    https: Annotated[
+        bool,
+        typer.Option(
+            "--https", help="With a certificate that is made for this machine; browsers need it to decode H.264"
+        ),
+    ] = False,
     tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="The page's certificate, PEM")] = None,
     tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="Its key, PEM")] = None,
     client_ca: Annotated[
@@ -65,9 +71,11 @@ def cockpit(
     It is open to programs of the same user on this machine only, unless tokens or certificates let others in.
     """
     from skyloop.client.connect import network_settings
-    from skyloop.cockpit import Access, serve_cockpit
+    from skyloop.cockpit import Access, serve_cockpit, with_certificate
 
     access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()), pair)
+    if https:
+        access = with_certificate(access, keys_directory() / "pages")
     join_network(network, keys)
     serve_cockpit(
         drones(names, drone, needed=False),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
+from skyloop.cli.naming import keys_directory
 from skyloop.cli.text import columns
 from skyloop.files import expand
 
@@ -122,11 +123,7 @@ def _state(entry: Entry, now: datetime) -> str:
 
 
 def _place(directory: Path | None) -> Path:
-    if directory is not None:
-        return expand(directory)
-    import platformdirs
-
-    return platformdirs.user_config_path("skyloop", appauthor=False) / "keys"
+    return keys_directory() if directory is None else expand(directory)
 
 
 def _day(when: datetime) -> str:

@@ -132,9 +132,17 @@ def export(
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="NAME", help="For mp4 (default: the first)")] = None,
     burn_time: Annotated[bool, typer.Option("--burn-time", help="For mp4: write the time into the frames")] = False,
+    encode: Annotated[
+        bool, typer.Option("--encode", help="For mp4: encode H.264 too, which is else copied as it was recorded")
+    ] = False,
 ) -> None:
-    """Write the samples as tables, or a camera's frames as a video with their own times."""
+    """Write the samples as tables, or a camera's frames as a video with their own times.
+
+    H.264 is copied as it was recorded, in seconds, unless the time is written into the frames.
+    """
+    from skyloop.cli import log_tables
     from skyloop.recording.review import export as ways
+    from skyloop.recording.review.video import export_mp4
 
     recording = _open(file)
     name = recording.drone(drone).name
@@ -142,19 +150,20 @@ def export(
         _refuse({"--channel": bool(channel)}, to)
         chosen = camera or _first_camera(recording, name)
         target = output or file.with_name(f"{file.stem}-{chosen}.mp4")
-        with _progress(f"encoding {chosen}") as progress:
-            count = ways.export_mp4(recording, name, chosen, target, burn_time=burn_time, progress=progress)
-        _print(f"{target}: {count} frames of {chosen}")
+        with _progress(f"exporting {chosen}") as progress:
+            found = export_mp4(recording, name, chosen, target, burn_time=burn_time, encode=encode, progress=progress)
+        for line in log_tables.exported(found, chosen):
+            _print(line)
         return
-    _refuse({"--camera": camera is not None, "--burn-time": burn_time}, to)
+    _refuse({"--camera": camera is not None, "--burn-time": burn_time, "--encode": encode}, to)
     with _progress("reading") as progress:
-        found = ways.read(recording, name, _channels(channel), progress)
+        tables = ways.read(recording, name, _channels(channel), progress)
     if to is Form.NPZ:
-        written = ways.export_npz(found, output or file.with_suffix(".npz"))
+        written = ways.export_npz(tables, output or file.with_suffix(".npz"))
     else:
         write = ways.export_csv if to is Form.CSV else ways.export_parquet
-        written = write(found, output or file.with_name(f"{file.stem}-{to.value}"))
-    rows = ", ".join(f"{len(table)} × {title}" for title, table in found.items())
+        written = write(tables, output or file.with_name(f"{file.stem}-{to.value}"))
+    rows = ", ".join(f"{len(table)} × {title}" for title, table in tables.items())
     _print(f"{written[0] if len(written) == 1 else written[0].parent}: {rows}")
 
 

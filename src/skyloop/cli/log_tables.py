@@ -18,6 +18,7 @@ from skyloop.logfile.reader import Recording
 from skyloop.recording.review.compare import Comparison
 from skyloop.recording.review.recover import Recovered
 from skyloop.recording.review.summary import Delay, Row, Summary
+from skyloop.recording.review.video import Videos
 
 
 def info(recording: Recording, summary: Summary) -> Iterator[RenderableType]:
@@ -111,6 +112,17 @@ def _losses(summary: Summary) -> Iterator[str]:
 def recovered_json(file: Path, saved: Recovered | None) -> str:
     """Return all that ``skyloop log recover --json`` prints: ``saved`` is null for a recording that is whole."""
     return msgspec.json.encode({"file": str(file), "saved": saved}, enc_hook=str).decode()
+
+
+def exported(found: Videos, camera: str) -> Iterator[str]:
+    """Yield a line for each video that was exported, and one for what is missing in them."""
+    for video in found.videos:
+        since = f", from {video.begin_s:.3f} s on" if video is not found.videos[0] else ""
+        how = "as it was recorded" if video.copied else "encoded"
+        yield f"{video.path}: {video.frames} frames of {camera}{since}, {video.width}×{video.height}, {how}"
+    if found.left_out:
+        why = "of another size" if not found.videos[0].copied else "without the frames that they build on"
+        yield f"{found.left_out} frames are left out: damaged, or {why}"
 
 
 def comparison_json(found: Comparison) -> str:

@@ -55,6 +55,13 @@ KeysOption = Annotated[
 ]
 
 
+def keys_directory() -> Path:
+    """Return the folder of this user's lab."""
+    import platformdirs
+
+    return platformdirs.user_config_path("skyloop", appauthor=False) / "keys"
+
+
 def one_drone(name: str | None, drone: str | None, default: str | None = None) -> str:
     """Return the drone that a command is about.
 

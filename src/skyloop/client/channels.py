@@ -148,6 +148,7 @@ class VideoChannel(Channel[Arrival]):
         self.notifier = scheduler.notifier()  #: notified with each frame
         self.counter = ChannelCounter()
         self.undecodable = 0
+        self.too_old = 0  #: frames that a consumer got and, by its ``max_age_s``, did not want
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
         self.filter = FrameFilter(self.request)  #: chooses the plain frames that this request asks for
         self._read: Arrival | None = None  # what next_frame() gave last
@@ -165,8 +166,16 @@ class VideoChannel(Channel[Arrival]):
         self._read = arrival = self.newest
         return None if arrival is None else self.picture(arrival)
 
-    def picture(self, arrival: Arrival) -> Frame | None:
-        """Decode the frame; None, and counted, if its pixels can't be decoded."""
+    def picture(self, arrival: Arrival, max_age_s: float | None = None) -> Frame | None:
+        """Decode the frame; None, and counted, if its pixels can't be decoded, or it is too old.
+
+        Args:
+            arrival: The frame.
+            max_age_s: Oldest age since the capture that is accepted [s]; None: any.
+        """
+        if max_age_s is not None and arrival.age_s > max_age_s:
+            self.too_old += 1
+            return None
         try:
             return arrival.frame()
         except DecodeError:
@@ -208,7 +217,7 @@ class VideoChannel(Channel[Arrival]):
 
     def stats(self, now_ns: int) -> ChannelStats:
         """Return the statistics at ``now_ns``."""
-        return self.counter.stats(now_ns, dropped=self.dropped, malformed=self.undecodable)
+        return self.counter.stats(now_ns, dropped=self.dropped + self.too_old, malformed=self.undecodable)
 
     def _period_s(self, fps: float) -> float:
         """Expected time between two frames of this request [s]; 0 if unknown."""
@@ -227,6 +236,7 @@ class VideoOptions(TypedDict, total=False):
     scale: float
     part: tuple[int, int]
     kbit_s: int
+    max_age_s: float
 
 
 def usual(camera: str) -> VideoRequest:

@@ -131,7 +131,7 @@ class DroneCore:
         self.closed = False
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
-        self._subscriber = secrets.token_hex(8)  # names the streams whose rate follows the path to here
+        self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
         self._on_exit = on_exit
         self._on_close = on_close
         self._to_close: list[Closable] = []  # what ends with the drone
@@ -341,6 +341,7 @@ class DroneCore:
         scale: float = 1.0,
         part: tuple[int, int] | None = None,
         kbit_s: int | None = None,
+        max_age_s: float | None = None,
     ) -> VideoChannel:
         """Return the channel of a camera whose frames come as requested; see :meth:`Drone.frames` for the options.
 
@@ -352,6 +353,7 @@ class DroneCore:
             scale: Factor for width and height, above 0 and up to 1.
             part: (k, n): only every n-th frame, from k; None: all.
             kbit_s: Of H.264 [kbit/s]; None: what the path carries.
+            max_age_s: Only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
 
         Raises:
             UnknownNameError: If the vehicle has no camera of this name.
@@ -361,6 +363,7 @@ class DroneCore:
             ClosedError: If the drone was closed.
         """
         self.check_open()
+        checked_age(max_age_s)
         channels = self.state.channels
         if not channels:
             raise UnsupportedError("this vehicle has no camera")
@@ -379,7 +382,7 @@ class DroneCore:
             scale=scale,
             part=part,
             kbit_s=kbit_s,
-            subscriber=self._subscriber if encoding == "h264" and kbit_s is None else "",
+            subscriber=self.subscriber if encoding == "h264" and kbit_s is None else "",
         )
         return channel if request == channel.request else self.state.video(channel.camera, request)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -675,7 +674,8 @@ class Drone:
                 to 1. ``part``: (k, n), only every n-th frame, for n workers with k from 0 that share them.
                 ``encoding``: how frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80),
                 ``"h264"`` (of ``kbit_s`` kilobits a second; by default as much as the path carries, with smaller and
-                fewer pictures where that is little) or ``"raw"``; on one host all travel raw.
+                fewer pictures where that is little) or ``"raw"``; on one host all travel raw. ``max_age_s``: what is
+                older since its capture when its turn comes is left out, and counted as dropped.
 
         Raises:
             NoAnswerError: If no frame comes within ``timeout_s``.
@@ -687,13 +687,15 @@ class Drone:
         channel = self._core.channel(camera, **how)
         mailbox: Mailbox[Arrival] = Mailbox(notifier=self._core.sample_notifier())
         self._core.check_may_wait()
+        max_age_s, deadline = how.get("max_age_s"), time.monotonic() + timeout_s
         with self._core.closing(mailbox), channel.into(mailbox):
             while not self._core.closed:
-                arrival = mailbox.wait(timeout_s)
+                arrival = mailbox.wait(max(0.0, deadline - time.monotonic()))
                 if arrival is not None:
-                    frame = channel.picture(arrival)
+                    frame = channel.picture(arrival, max_age_s)
                     if frame is not None:
                         yield frame
+                        deadline = time.monotonic() + timeout_s
                 elif not mailbox.closed:
                     raise self._core.no_frame(channel.camera.name, timeout_s)
 
@@ -842,8 +844,10 @@ class Drone:
         self._check_listener(function)
         channel = self._core.channel(camera, **how)
 
+        max_age_s = how.get("max_age_s")
+
         def call(arrival: Arrival) -> None:
-            frame = channel.picture(arrival)
+            frame = channel.picture(arrival, max_age_s)
             if frame is not None:
                 function(frame)
 
@@ -890,7 +894,7 @@ class Drone:
         self._check_listener(function)
         info = self._core.channel(camera).camera
         as_it_came = bool(info.stream) and kbit_s is None and max_fps is None and scale == 1.0
-        subscriber = "" if as_it_came or kbit_s is not None else secrets.token_hex(8)
+        subscriber = "" if as_it_came or kbit_s is not None else f"{self._core.subscriber}-encoded"
         stream = self._core.stream(info.name, kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
         chain = Chain()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from skyloop.clock import nanoseconds
@@ -62,6 +62,11 @@ class LinkMonitor:
         self._last_seq: int | None = None
         self._past: deque[_Counts] = deque([(now_ns, 0, 0)])
         self._past_malformed: deque[tuple[int, int]] = deque([(now_ns, 0)])
+
+    def excuse(self, silence_s: float) -> None:
+        """Take a link for lost only after so much longer a silence: of a network that is silent now and then [s]."""
+        self._limits = replace(self._limits, silent_s=self._limits.silent_s + silence_s)
+        self._silent_ns += nanoseconds(silence_s)
 
     def expect(self, period_s: float, now_ns: int) -> None:
         """Judge from now on by the time that may pass between two samples of feedback.

@@ -226,6 +226,7 @@ class ProxySession:
         """Connect; raises what the dialer raises."""
         self._end = dialer(self)
         self._same_clock = self._end.same_clock
+        self.monitor.excuse(self._end.excused_s)
 
     def welcomed(self, welcome: Welcome, sent_ns: int) -> None:
         """Take the answer to Hello as the first measure of the offset between the clocks.

@@ -6,7 +6,8 @@ observes; a page that takes control gets a pilot's connection of its own for as 
 - ``server`` runs it, ``listening`` takes connections, as many as ``admission`` has places for; ``app`` and ``api`` have
   the routes; ``security`` decides which requests are answered, ``access`` who asks and what that person may do;
 - ``discovery`` finds proxies, ``fleet`` keeps a ``station`` for each drone, with what all its pages share: ``feeds``
-  and ``camera_feed`` bring what the client delivers onto the event loop, ``broadcast`` makes messages at a steady rate,
+  and ``camera_feed`` bring what the client delivers onto the event loop, ``encoded_feed`` H.264 as it comes, of which
+  ``page_stream`` chooses what a page gets; ``broadcast`` makes messages at a steady rate,
   ``telemetry`` and ``values`` are the view model; ``stream`` sends, one object per open socket;
 - ``control`` flies for a page that took control, by ``commands``, through a ``pilot_connection`` of its own, and
   ``takeover`` is asking for control before it is taken; ``fleet_control`` lands and stops all drones;
@@ -15,6 +16,6 @@ observes; a page that takes control gets a pilot's connection of its own for as 
 - ``static`` is the page itself, built; nothing is fetched from elsewhere.
 """
 
-from skyloop.cockpit.server import Access, serve_cockpit
+from skyloop.cockpit.server import Access, serve_cockpit, with_certificate
 
-__all__ = ["Access", "serve_cockpit"]
+__all__ = ["Access", "serve_cockpit", "with_certificate"]

@@ -40,6 +40,7 @@ class Api:
         counts: What pages were sent.
         scheme: ``http`` or ``https``.
         admission: The connections.
+        authority: Certificate of the authority that certified this server, PEM; None where it made none.
     """
 
     def __init__(
@@ -49,7 +50,9 @@ class Api:
         counts: PageCounts,
         scheme: str,
         admission: Admission,
+        authority: bytes | None = None,
     ) -> None:
+        self._authority = authority
         self._admission = admission
         self._asking = asyncio.Semaphore(MAX_ASKING)
         self._fleet = fleet
@@ -63,6 +66,7 @@ class Api:
             Route("/api/session", self.session),
             Route("/api/login", self.login, methods=["POST"]),
             Route("/api/logout", self.logout, methods=["POST"]),
+            Route("/api/authority", self.authority),
             Route("/api/drones", self.drones),
             Route("/api/drones/{name}/parameters", self.parameters),
             Route("/api/statistics", self.statistics),
@@ -116,6 +120,15 @@ class Api:
         if isinstance(self._gate, TokenGate):
             self._gate.end(request.scope)
             answer.delete_cookie(self._gate.cookie, httponly=True, samesite="strict")
+        return answer
+
+    @answered
+    async def authority(self, _: Request) -> Response:
+        """Answer with the certificate that browsers are to trust, as a file."""
+        if self._authority is None:
+            raise BadRequest(404, "this cockpit made no certificate: start it with --https")
+        answer = Response(self._authority, media_type="application/x-x509-ca-cert")
+        answer.headers["content-disposition"] = 'attachment; filename="skyloop-pages.crt"'
         return answer
 
     # Drones ----------------------------------------------------------------------------------------------------

@@ -126,7 +126,7 @@ class Cockpit:
         if feed is None:
             await socket.close(UNKNOWN, "no such camera")
             return
-        await VideoSender(socket, feed, station.event_feed, self.counts).run()
+        await VideoSender(socket, station, feed, self.counts).run()
 
     async def control(self, socket: WebSocket) -> None:
         """Accept a pilot's commands to one drone."""
@@ -159,6 +159,7 @@ def create_app(
     admission: Admission | None = None,
     world: WorldGeometry | None = None,
     follower: FollowerFactory = TargetFollower,
+    page_authority: bytes | None = None,
 ) -> Starlette:
     """Make the cockpit's application.
 
@@ -171,9 +172,10 @@ def create_app(
         admission: Counts the connections.
         world: What stands around drones that don't know it themselves.
         follower: Makes what tracks a target that a page marks, and flies after it.
+        page_authority: Certificate of the authority that certified this server, PEM, for browsers that are to trust it.
     """
     cockpit = Cockpit(fleet, recordings, static, follower)
-    api = Api(fleet, gate, cockpit.counts, names.scheme, admission or Admission())
+    api = Api(fleet, gate, cockpit.counts, names.scheme, admission or Admission(), page_authority)
     return Starlette(
         routes=[
             Route("/", cockpit.page),

@@ -12,6 +12,7 @@ from skyloop.messages.config import Reason
 
 Priority = Annotated[int, msgspec.Meta(ge=HIGHEST_PRIORITY, le=LOWEST_PRIORITY)]
 CameraName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+Pixels = Annotated[float, msgspec.Meta(gt=0)]
 Word = Annotated[str, msgspec.Meta(max_length=64)]
 
 LATE_S: Final = 0.5  #: a command that may be older is refused: the person no longer expects it to happen
@@ -126,10 +127,11 @@ class FollowTarget(Command, frozen=True, tag="follow"):
 
     camera: CameraName
     captured_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}$")]  #: of the frame that it was drawn on [ns]
-    box: tuple[float, float, float, float]  #: x, y of its upper left corner, width and height [pixels of the frame]
+    box: tuple[float, float, float, float]  #: x, y of its upper left corner, width and height [pixels]
     mode: Word | None = None  #: None: track it, and fly nothing before there is one
     class_name: Word | None = None  #: of a detection that was chosen
     distance_m: float | None = None  #: to keep; None: the follower's own
+    size: tuple[Pixels, Pixels] | None = None  #: of the picture that it was drawn on; None: the frame's
 
 
 class SetFollowMode(Command, frozen=True, tag="follow_mode"):

@@ -22,7 +22,7 @@ from skyloop.control.chase_law import FollowMode
 from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, LinkError, RefusedError, SkyloopError, UnknownNameError
-from skyloop.messages import CameraInfo, Hover, Value
+from skyloop.messages import CameraInfo, FrameHeader, Hover, Value
 from skyloop.vision.opencv import opencv
 from skyloop.vision.tracking import Box, checked_box
 
@@ -151,7 +151,7 @@ class FollowSession:
         if keeper is None or keeper.camera != camera.name:
             raise RefusedError(f"no frames of {camera.name} are kept: choose the camera first (follow_select)")
         first = keeper.find(int(command.captured_ns))
-        box = checked_box(command.box, (first.header.height, first.header.width))
+        box = checked_box(in_frame(command, first.header), (first.header.height, first.header.width))
         self.end("another target was marked")
         self._keeper = None  # it is the tracker's now
         self._camera, self._mode, self._pilot = camera.name, command.mode or "", pilot
@@ -330,6 +330,20 @@ class FollowSession:
             if camera.name == name:
                 return camera
         raise UnknownNameError("camera", name, [camera.name for camera in cameras])
+
+
+def in_frame(command: FollowTarget, header: FrameHeader) -> Box:
+    """Return the box of a command in pixels of the frame, where the page was sent the picture in another size.
+
+    Args:
+        command: The page's.
+        header: Of the frame that it was drawn on.
+    """
+    x, y, width, height = command.box
+    if command.size is None:
+        return command.box
+    across, down = header.width / command.size[0], header.height / command.size[1]
+    return x * across, y * down, width * across, height * down
 
 
 def _check_mode(mode: str) -> None:

@@ -32,7 +32,7 @@ _FOREIGN: Final = 1008  # close code: another page
 _LATER: Final = 1013  # close code: no place now
 
 #: Answered without a role: the page itself, and what is needed to get one.
-_PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login|/api/logout")
+_PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login|/api/logout|/api/authority")
 _CONTROL: Final = re.compile(r"/ws/(drones/[^/]+/)?control")
 _READING: Final = ("GET", "HEAD")
 _ADDRESS: Final = re.compile(r"(\[[0-9a-f:.]+\]|[0-9.]+)(?::(\d{1,5}))?")

@@ -11,12 +11,12 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skyloop.clock import Clock, monotonic_ns
-from skyloop.cockpit.addresses import bind, host_names, reachable
+from skyloop.cockpit.addresses import bind, host_names, own_addresses, reachable
 from skyloop.cockpit.admission import Admission, Connection
 from skyloop.cockpit.listening import Listener, ProtocolFactory, limit_messages, places_here
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
@@ -48,7 +48,8 @@ class Access:
     certificate and key, for TLS. ``client_ca``: PEM file of the authority that signed the certificates of those who
     may come in; their OU is the role. ``role``: of everybody, where neither tokens nor certificates decide it.
     ``hostnames``: names by which browsers reach this machine, where they don't use its address. ``pair``: lets in, as
-    ``role``, whoever opens the address in the QR code that is shown, which each time works once.
+    ``role``, whoever opens the address in the QR code that is shown, which each time works once. ``page_authority``:
+    PEM file of the authority that signed ``tls_cert``, offered to browsers that are to trust it.
 
     Raises:
         UsageError: The options contradict one another.
@@ -62,10 +63,15 @@ class Access:
     role: Role = Role.PILOT
     hostnames: tuple[str, ...] = ()
     pair: bool = False
+    page_authority: Path | None = None
 
     def __post_init__(self) -> None:
         if (self.tls_cert is None) != (self.tls_key is None):
             raise UsageError("TLS needs both a certificate and its key: --tls-cert FILE and --tls-key FILE")
+        if self.page_authority is not None and self.tls_cert is None:
+            raise UsageError(
+                "an authority for the page needs the page's certificate: give --tls-cert and --tls-key too"
+            )
         if self.client_ca is not None and self.tls_cert is None:
             raise UsageError("certificates of clients need TLS: give --tls-cert and --tls-key too")
         if self.client_ca is not None and self.token_file is not None:
@@ -146,6 +152,36 @@ def serve_cockpit(
             finder.close()
     finally:
         listening.close()
+
+
+def with_certificate(access: Access, directory: Path) -> Access:
+    """Return the same access over https, with a certificate for this machine that is made or renewed where needed.
+
+    Args:
+        access: Without a certificate.
+        directory: Where certificates and their authority are kept (:mod:`skyloop.keys.pages`).
+
+    Raises:
+        UsageError: There is a certificate already, the address can't be certified, or a file can't be used.
+        MissingExtraError: The extra ``network`` is not installed.
+    """
+    from skyloop.cockpit.security import bind_address
+    from skyloop.keys.pages import page_certificate
+
+    if access.tls_cert is not None:
+        raise UsageError("--https makes a certificate, and --tls-cert names one: give one of them")
+    address, loopback = bind_address(access.host)
+    own = (
+        ["localhost", "127.0.0.1"] if loopback else [*reachable(address), *own_addresses(), *host_names(), "127.0.0.1"]
+    )
+    made = page_certificate(directory, own, access.hostnames)
+    if made.left_out:
+        print(
+            f"cockpit: its certificate is not for {', '.join(made.left_out)}, which is not private: for browsers that "
+            "use it give --tls-cert and --tls-key",
+            file=sys.stderr,
+        )
+    return replace(access, tls_cert=made.certificate, tls_key=made.key, page_authority=made.authority)
 
 
 def _finder(names: Sequence[str], network: FabricSettings | None) -> Finder:
@@ -249,7 +285,10 @@ def _serve(
     hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
     admission = Admission(places_here())
     fleet = Fleet(finder, kept=names)
-    app = create_app(fleet, Recordings(recordings), hosts, gate, admission=admission, world=world)
+    authority = None if access.page_authority is None else access.page_authority.read_bytes()
+    app = create_app(
+        fleet, Recordings(recordings), hosts, gate, admission=admission, world=world, page_authority=authority
+    )
     server = quiet_server(app)
     seen_at = reachable(address)[0]
     page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
     from skyloop.client.channels import Listener
 
-FPS: Final = 8.0  #: frames of each camera in a second, at most
+FPS: Final = 12.0  #: frames of each camera in a second, at most
 WIDTHS: Final = (160, 240, 320, 480)  #: of frames [pixels]; what a page wishes is rounded up to one of them
 QUALITY: Final = 70  #: of the JPEG files
 

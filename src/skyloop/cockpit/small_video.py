@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -16,14 +16,20 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import monotonic_ns, seconds
+from skyloop.cockpit.broadcast import Wake
 from skyloop.cockpit.camera_feed import pack
-from skyloop.cockpit.small_feed import FPS, SmallFeed, rounded_width
+from skyloop.cockpit.page_stream import PageStream
+from skyloop.cockpit.small_feed import FPS, SmallFeed, SmallFrame, rounded_width
+from skyloop.cockpit.stream import encoding_values
 from skyloop.errors import SkyloopError
+from skyloop.messages import EncodedFrame
 
 if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
     from skyloop.cockpit.stream import PageCounts
 
+SEND_HZ: Final = 25.0  #: messages in a second, at most
+GATHER_S: Final = 0.005  #: a picture waits so long for those of other cameras, which often come together
 MAX_SHOWN: Final = 64  #: cameras that one page can show at a time
 _BAD_MESSAGE: Final = 1008
 
@@ -36,11 +42,17 @@ class _Place(msgspec.Struct, frozen=True):
 
 
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
-    """What a page sends: a camera that it shows from now on (``width`` pixels wide), or no longer; or what it drew."""
+    """What a page sends.
+
+    A camera that it shows from now on (``width`` pixels wide, ``h264`` if it decodes that), or no longer; one whose
+    pictures it can't decode up to the next ``key``; or what it drew.
+    """
 
     show: _Place | None = None
     hide: _Place | None = None
     width: int = 0
+    h264: bool = False
+    key: _Place | None = None
     ack: int | None = None
 
 
@@ -49,14 +61,47 @@ class _Shown:
     """A camera that one page shows."""
 
     width: int
+    h264: bool
     station: Station | None = None
+    stream: PageStream | None = None
     feed: SmallFeed | None = None
-    sent: int = 0  #: serial of the last frame sent
+    sent: int = 0  #: serial of the last JPEG sent
 
-    def release(self) -> None:
+    def connect(self, station: Station | None, camera: str, wake: Wake) -> None:
+        """Subscribe to the camera, and again after the drone came back or was replaced.
+
+        To JPEGs only while the page is shown nothing else.
+        """
+        if station is not self.station:
+            self.release()
+            self.station = station
+        if station is None:
+            return
+        if self.h264 and self.stream is None:
+            info = next((info for info in station.drone.capabilities.cameras if info.name == camera), None)
+            if info is not None:
+                self.stream = PageStream(station, info, self.width, FPS, wake)
+        if self.stream is not None and self.stream.shows:
+            self.release_feed()
+        elif self.feed is None:
+            feed = station.small_video(camera, rounded_width(self.width))
+            if feed is not None:
+                with suppress(SkyloopError):  # it is going away
+                    feed.subscribe()
+                    self.feed, self.sent = feed, 0
+
+    def release_feed(self) -> None:
+        """Unsubscribe from JPEGs."""
         if self.feed is not None:
             self.feed.unsubscribe()
-        self.station, self.feed, self.sent = None, None, 0
+            self.feed = None
+
+    def release(self) -> None:
+        """Unsubscribe from the camera."""
+        self.release_feed()
+        if self.stream is not None:
+            self.stream.close()
+        self.station = self.stream = None
 
 
 class SmallVideoSender:
@@ -79,15 +124,20 @@ class SmallVideoSender:
         self._number = 0  # of the last message
         self._waiting = 0  # for the acknowledgement of so many frames
         self._problem = ""
+        self._wake = asyncio.Event()
 
     async def run(self) -> None:
         """Send until the page is gone."""
         receiver = asyncio.create_task(self._receive())
+        receiver.add_done_callback(lambda _: self._wake.set())
+        due_s = time.monotonic()
         try:
-            due_s = time.monotonic()
             while not receiver.done():
-                due_s = max(due_s + 1.0 / FPS, time.monotonic())
-                await asyncio.wait([receiver], timeout=due_s - time.monotonic())
+                with suppress(TimeoutError):  # JPEGs wake nobody
+                    await asyncio.wait_for(self._wake.wait(), 1.0 / SEND_HZ)
+                self._wake.clear()
+                await asyncio.sleep(max(due_s - time.monotonic(), GATHER_S))
+                due_s = time.monotonic() + 1.0 / SEND_HZ
                 if not receiver.done() and not self._waiting:
                     await self._send()
             if self._problem:
@@ -102,45 +152,40 @@ class SmallVideoSender:
 
     async def _send(self) -> None:
         heads: list[dict[str, Any]] = []
-        jpegs: list[bytes] = []
+        datas: list[bytes] = []
         for place, shown in self._shown.items():
-            self._connect(place, shown)
-            frame = None if shown.feed is None else shown.feed.newest
-            if frame is None or frame.serial == shown.sent or shown.station is None:
-                continue
-            self._counts.frames_skipped += max(0, frame.serial - shown.sent - 1) if shown.sent else 0
-            shown.sent = frame.serial
-            now_ns = monotonic_ns() + shown.station.drone.clock_offset_ns
-            heads.append(
-                {
-                    "drone": place.drone,
-                    "camera": place.camera,
-                    "seq": frame.seq,
-                    "age_s": seconds(now_ns - frame.captured_ns),
-                    "width": frame.width,
-                    "height": frame.height,
-                    "bytes": len(frame.jpeg),
-                }
-            )
-            jpegs.append(frame.jpeg)
+            shown.connect(self._stations.get(place.drone), place.camera, self._wake.set)
+            for values, data in self._pictures(shown):
+                heads.append({"drone": place.drone, "camera": place.camera, **values, "bytes": len(data)})
+                datas.append(data)
         if not heads:
             return
         self._number += 1
         self._waiting = len(heads)
-        await self._socket.send_bytes(pack({"ack": self._number, "frames": heads}, *jpegs))
+        head = {"ack": self._number, "now_s": seconds(monotonic_ns()), "frames": heads}
+        await self._socket.send_bytes(pack(head, *datas))
         self._counts.frames_sent += len(heads)
 
-    def _connect(self, place: _Place, shown: _Shown) -> None:
-        """Subscribe to the camera, and again after the drone came back or was replaced."""
-        station = self._stations.get(place.drone)
-        if station is shown.station and shown.feed is not None:
+    def _pictures(self, shown: _Shown) -> Iterator[tuple[dict[str, Any], bytes]]:
+        """Yield what is to be sent of a camera, with its data; several of H.264, which build on one another."""
+        stream, feed, station = shown.stream, shown.feed, shown.station
+        if station is None:
             return
-        shown.release()
-        feed = None if station is None else station.small_video(place.camera, shown.width)
-        if feed is not None:
-            with suppress(SkyloopError):  # it is going away
-                feed.subscribe()
-                shown.station, shown.feed = station, feed
+        if stream is not None:
+            before = stream.skipped
+            for one in stream.take():
+                picture = one.picture
+                stream.sent(self._number + 1, one)
+                yield _values(picture, one.age_s) | {"h264": encoding_values(one)}, picture.data
+            self._counts.frames_skipped += stream.skipped - before
+            if stream.shows:
+                return
+        frame = None if feed is None else feed.newest
+        if frame is not None and frame.serial != shown.sent:
+            self._counts.frames_skipped += max(0, frame.serial - shown.sent - 1) if shown.sent else 0
+            shown.sent = frame.serial
+            now_ns = monotonic_ns() + station.drone.clock_offset_ns
+            yield _values(frame, seconds(now_ns - frame.captured_ns)), frame.jpeg
 
     async def _receive(self) -> None:
         """Handle what the page sends until it is gone, or sends what makes no sense."""
@@ -159,12 +204,30 @@ class SmallVideoSender:
         if message.ack is not None and message.ack == self._number and self._waiting:
             self._counts.frames_acknowledged += self._waiting
             self._waiting = 0
+            self._wake.set()
+            for shown in self._shown.values():
+                if shown.stream is not None:
+                    shown.stream.acknowledged(message.ack)
+        if message.key is not None and (shows := self._shown.get(message.key)) is not None and shows.stream is not None:
+            shows.stream.restart()
         for place in (message.show, message.hide):
-            shown = None if place is None else self._shown.pop(place, None)
-            if shown is not None:
-                shown.release()
+            hidden = None if place is None else self._shown.pop(place, None)
+            if hidden is not None:
+                hidden.release()
         if message.show is not None:
             if len(self._shown) >= MAX_SHOWN:
                 return f"at most {MAX_SHOWN} cameras are shown at a time"
-            self._shown[message.show] = _Shown(rounded_width(message.width))
+            self._shown[message.show] = _Shown(message.width, message.h264)
         return ""
+
+
+def _values(picture: SmallFrame | EncodedFrame, age_s: float) -> dict[str, Any]:
+    """Return what a page is told of a picture."""
+    captured = str(picture.captured_ns)  # too large for JavaScript's numbers
+    return {
+        "seq": picture.seq,
+        "captured_ns": captured,
+        "age_s": age_s,
+        "width": picture.width,
+        "height": picture.height,
+    }

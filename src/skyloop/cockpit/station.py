@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
@@ -10,6 +11,7 @@ from skyloop.clock import monotonic_ns, seconds
 from skyloop.cockpit.broadcast import ROW_HZ, Cancellable, PeriodicBroadcast
 from skyloop.cockpit.camera_feed import CameraFeed
 from skyloop.cockpit.discovery import Found
+from skyloop.cockpit.encoded_feed import EncodedFeed, Form
 from skyloop.cockpit.feeds import EventFeed, LogFeed
 from skyloop.cockpit.routes import CheckedRoutes
 from skyloop.cockpit.small_feed import SmallFeed
@@ -45,6 +47,7 @@ class Station:
         self.log_feed = LogFeed(drone)
         self.cameras: dict[str, CameraFeed] = {}
         self.small: dict[tuple[str, int], SmallFeed] = {}  #: by camera and width [pixels]
+        self.streams: dict[tuple[str, Form], EncodedFeed] = {}  #: as H.264, by camera and form
         self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by the name of the application that does
         self.routes = CheckedRoutes()
         self.pilots: set[PilotConnection] = set()  #: pilots' connections of pages
@@ -55,6 +58,8 @@ class Station:
         self._whole: Cancellable | None = None  # a consumer of all feedback, while a page shows it
         self._stopper: asyncio.Task[PilotConnection] | None = None
         self._may_stop = 0
+        self._names: list[str] = []  # of streams for one page each, that are not in use
+        self._named = 0
 
     @property
     def flies(self) -> bool:
@@ -67,9 +72,9 @@ class Station:
         return self.broadcast.wanted or any(feed.wanted for feed in self.feeds)
 
     @property
-    def feeds(self) -> list[CameraFeed | SmallFeed]:
-        """The feeds of all cameras, in all sizes."""
-        return [*self.cameras.values(), *self.small.values()]
+    def feeds(self) -> list[CameraFeed | SmallFeed | EncodedFeed]:
+        """The feeds of all cameras, in all sizes and forms."""
+        return [*self.cameras.values(), *self.small.values(), *self.streams.values()]
 
     def camera(self, name: str) -> CameraFeed | None:
         """Return the feed of a camera; None if the vehicle has none of that name."""
@@ -83,6 +88,27 @@ class Station:
         if (name, width) not in self.small and camera is not None:
             self.small[name, width] = SmallFeed(self.drone, camera, width)
         return self.small.get((name, width))
+
+    def encoded(self, name: str, form: Form) -> EncodedFeed:
+        """Return the feed of a camera's H.264 in one form; :meth:`forget` it when no page wants it."""
+        if (name, form) not in self.streams:
+            self.streams[name, form] = EncodedFeed(self.drone, name, form)
+        return self.streams[name, form]
+
+    def forget(self, feed: EncodedFeed) -> None:
+        """Forget a feed that no page wants any more."""
+        self.streams.pop((feed.camera, feed.form), None)
+
+    def own_name(self) -> str:
+        """Return a subscriber's name for a stream to one page; :meth:`free_name` gives it to another one."""
+        if not self._names:
+            self._named += 1
+            self._names.append(f"{secrets.token_hex(6)}-{self._named}")
+        return self._names.pop()
+
+    def free_name(self, name: str) -> None:
+        """Take back a name of :meth:`own_name`."""
+        self._names.append(name)
 
     def feedback(self) -> Feedback:
         """Return the newest feedback, which is sent slowly while no page shows more of the drone than its row.

@@ -1,6 +1,7 @@
 """What is sent to pages: one object per open socket. A page that does not keep up gets less, never anything older.
 
-Video: one frame is on its way at a time; the page acknowledges it when it has drawn it, and only then gets the newest.
+Video: one JPEG is on its way at a time; the page acknowledges it when it has drawn it, and only then gets the newest.
+Of H.264, whose pictures build on one another, a few are; a page that leaves out one goes on with a key picture.
 Telemetry: the newest state about twenty times a second, as far as the socket takes it; made once for all pages.
 """
 
@@ -15,9 +16,10 @@ from typing import Any, Final
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from skyloop.clock import monotonic_ns, seconds
 from skyloop.cockpit.broadcast import PeriodicBroadcast
 from skyloop.cockpit.camera_feed import CameraFeed, pack
-from skyloop.cockpit.feeds import EventFeed
+from skyloop.cockpit.page_stream import PageStream, Sent
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json
 
@@ -26,6 +28,7 @@ MAX_WAITING: Final = 256  #: answers to a page that does not read; what comes on
 MAX_COUNTED = 256  #: sources of drawings that are named in the counts
 
 _BAD_MESSAGE = 1008
+_LOOK_S: Final = 0.2
 UNKNOWN = 4404  #: close code: no such drone or camera
 
 
@@ -41,36 +44,43 @@ class PageCounts:
 
 
 class VideoSender:
-    """Sends one camera to one page until the page goes away.
+    """Sends one camera to one page until the page goes away: as JPEGs, or as H.264 to a page that decodes it.
 
     Args:
         socket: Accepted already.
+        station: The drone.
         feed: The camera.
-        event_feed: The drone's, for drawings.
         counts: Of all pages.
     """
 
-    def __init__(self, socket: WebSocket, feed: CameraFeed, event_feed: EventFeed, counts: PageCounts) -> None:
+    def __init__(self, socket: WebSocket, station: Station, feed: CameraFeed, counts: PageCounts) -> None:
         self._socket = socket
+        self._station = station
         self._feed = feed
-        self._event_feed = event_feed
+        self._event_feed = station.event_feed
         self._counts = counts
         self._wake = asyncio.Event()
-        self._sent = 0  # serial of the last frame sent; not the frame, which would keep its memory from the proxy
-        self._sent_ns = 0  # and its capture
-        self._waiting = False  # for its acknowledgement
+        self._stream: PageStream | None = None  # for a page that decodes H.264
+        self._as_jpeg = False  # JPEGs are subscribed to
+        self._number = 0  # of the last message
+        self._sent = 0  # serial of the last JPEG sent; not the frame, which would keep its memory from the proxy
+        self._sent_ns = 0  # capture of the picture sent last
+        self._waiting = 0  # number of the JPEG whose acknowledgement is waited for
         self._drawn: dict[str, int] = {}  # capture of the newest drawing sent, by source; what was sent last is last
 
     async def run(self) -> None:
         """Send until the page is gone."""
-        self._feed.subscribe(self._wake.set)
         self._event_feed.subscribe(self._wake.set)
         receiver = asyncio.create_task(self._receive())
         receiver.add_done_callback(lambda _: self._wake.set())
         try:
             while not receiver.done():
-                await self._wake.wait()
+                self._choose()
+                with suppress(TimeoutError):
+                    # Without pictures, too, it must be seen that none come, or that the page takes none.
+                    await asyncio.wait_for(self._wake.wait(), None if self._stream is None else _LOOK_S)
                 self._wake.clear()
+                await self._send_pictures()
                 await self._send_frame()
                 await self._send_drawings()
             if not receiver.result():
@@ -78,10 +88,22 @@ class VideoSender:
         except WebSocketDisconnect:
             pass  # while sending: the page went away
         finally:
-            self._feed.unsubscribe(self._wake.set)
+            if self._as_jpeg:
+                self._feed.unsubscribe(self._wake.set)
+            if self._stream is not None:
+                self._stream.close()
             self._event_feed.unsubscribe(self._wake.set)
             receiver.cancel()
             await asyncio.gather(receiver, return_exceptions=True)
+
+    def _choose(self) -> None:
+        """Subscribe to JPEGs while the page is shown nothing else."""
+        as_jpeg = self._stream is None or not self._stream.shows
+        if as_jpeg != self._as_jpeg:
+            self._as_jpeg = as_jpeg
+            self._waiting = 0
+            (self._feed.subscribe if as_jpeg else self._feed.unsubscribe)(self._wake.set)
+            self._wake.set()
 
     async def _receive(self) -> bool:
         """Receive acknowledgements until the page is gone (True) or sends something else (False)."""
@@ -89,31 +111,84 @@ class VideoSender:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
                 return True
-            number = _acknowledged(message.get("text") or "")
-            if number is None:
+            said = _said(message.get("text") or "")
+            if said is None:
                 return False
-            if self._waiting and number == self._sent:
-                self._waiting = False
-                self._counts.frames_acknowledged += 1
-                self._wake.set()
+            if said.h264 is not None:
+                self._take_form(said.h264, said.width)
+            if said.ack is not None:
+                self._acknowledged(said.ack)
+            if said.key and self._stream is not None:
+                self._stream.restart()
+            self._wake.set()
+
+    def _take_form(self, h264: bool, width: int) -> None:
+        if not h264:
+            if self._stream is not None:
+                self._stream.close()
+            self._stream = None
+        elif self._stream is not None:
+            self._stream.resize(width)
+        else:
+            info = next(
+                (one for one in self._station.drone.capabilities.cameras if one.name == self._feed.camera), None
+            )
+            if info is not None:
+                self._stream = PageStream(self._station, info, width, None, self._wake.set)
+
+    def _acknowledged(self, number: int) -> None:
+        if self._waiting and number == self._waiting:
+            self._waiting = 0
+            self._counts.frames_acknowledged += 1
+        elif self._stream is not None and number <= self._number:
+            self._counts.frames_acknowledged += self._stream.acknowledged(number)
+
+    async def _send_pictures(self) -> None:
+        stream = self._stream
+        if stream is None:
+            return
+        before = stream.skipped
+        for one in stream.take():
+            picture = one.picture
+            self._number += 1
+            stream.sent(self._number, one)
+            self._sent_ns = picture.captured_ns
+            head = {
+                "ack": self._number,
+                "camera": picture.camera,
+                "seq": picture.seq,
+                "captured_ns": str(picture.captured_ns),
+                "age_s": one.age_s,
+                "now_s": seconds(monotonic_ns()),
+                "width": picture.width,
+                "height": picture.height,
+                "h264": encoding_values(one),
+            }
+            await self._socket.send_bytes(pack(head, picture.data))
+            self._counts.frames_sent += 1
+        self._counts.frames_skipped += stream.skipped - before
 
     async def _send_frame(self) -> None:
         picture = self._feed.newest
+        if self._stream is not None and self._stream.shows:
+            return
         if self._waiting or picture is None or picture.serial == self._sent:
             return
         skipped = picture.serial - self._sent - 1 if self._sent else 0
         jpeg = await self._feed.jpeg(picture)
         frame = picture.frame
+        self._number += 1
         head = {
-            "ack": picture.serial,
+            "ack": self._number,
             "camera": frame.camera,
             "seq": frame.seq,
             "captured_ns": str(frame.captured_ns),
             "age_s": frame.age_s,
+            "now_s": seconds(monotonic_ns()),
             "width": frame.shape[1],
             "height": frame.shape[0],
         }
-        self._waiting, self._sent, self._sent_ns = True, picture.serial, frame.captured_ns
+        self._waiting, self._sent, self._sent_ns = self._number, picture.serial, frame.captured_ns
         await self._socket.send_bytes(pack(head, jpeg))
         self._counts.frames_sent += 1
         self._counts.frames_skipped += skipped
@@ -251,15 +326,24 @@ class PageSocket:
                 await self._socket.send_text(encode_json(await self._outbox.get()).decode())
 
 
-class _Ack(msgspec.Struct):
-    """What a page sends when it has drawn a frame."""
+class _FromPage(msgspec.Struct):
+    """What a page sends: what it has drawn, which pictures it takes, or that it can't decode what comes."""
 
-    ack: int
+    ack: int | None = None
+    h264: bool | None = None
+    width: int = 0
+    key: bool = False
 
 
-def _acknowledged(text: str) -> int | None:
-    """Return the number acknowledged; None if it is something else."""
+def _said(text: str) -> _FromPage | None:
+    """Return what a page says; None if it is something else."""
     try:
-        return msgspec.json.decode(text, type=_Ack).ack
+        said = msgspec.json.decode(text, type=_FromPage)
     except msgspec.DecodeError:
         return None
+    return said if said.ack is not None or said.h264 is not None or said.key else None
+
+
+def encoding_values(one: Sent) -> dict[str, Any]:
+    """Return how a picture is encoded as JSON values for a page."""
+    return {"key": one.picture.key, "kind": one.form.kind, "kbit_s": one.form.kbit_s}

@@ -209,6 +209,11 @@ class TelemetryView:
         # On another thread: for the command delay the drone asks the proxy, and waits for its answer.
         try:
             stats = await asyncio.to_thread(lambda: self._station.drone.stats)
+            for feed in self._station.streams.values():  # what a page shows as H.264 does not come as frames
+                name, youngest_s = f"video/{feed.camera}", feed.age_s
+                known = stats.get(name)
+                if youngest_s is not None and (known is None or known.age_s is None or youngest_s < known.age_s):
+                    stats = {**stats, name: feed.stats()}
             self._channels = {name: channel_values(one) for name, one in stats.items()}
         except LinkError:
             pass  # closed meanwhile

@@ -171,6 +171,8 @@ class LiveVideo:
         show: Called with each picture on the decoding thread; must return quickly.
         on_event: Called with each event and its text on either thread; must return quickly.
         wants: Whether anybody wants pictures. Called on the reading thread.
+        wants_checked: Whether frames are to be decoded though nobody wants pictures, as the decoder hands on what is
+            whole. Called on the reading thread.
         came: Called with every whole frame as it arrived, on the reading thread.
         clock: Monotonic, ns.
         name: Of the reading thread, and the beginning of the decoding one's.
@@ -185,6 +187,7 @@ class LiveVideo:
         show: Callable[[Picture], None],
         on_event: Callable[[VideoEvent, str], None],
         wants: Callable[[], bool] = lambda: True,
+        wants_checked: Callable[[], bool] = lambda: False,
         came: Callable[[Coded], None] | None = None,
         clock: Clock = monotonic_ns,
         name: str = "video",
@@ -196,6 +199,7 @@ class LiveVideo:
         self._show = show
         self._on_event = on_event
         self._wants = wants
+        self._wants_checked = wants_checked
         self._frame_came = came
         self._clock = clock
         self._name = name
@@ -203,6 +207,7 @@ class LiveVideo:
         self._came = threading.Condition()  # guards the backlog and the counts of the reading thread
         self._backlog = Backlog()
         self._wanted = False  # when the last frame came
+        self._shows = False  # pictures are wanted, not only checked frames
         self._received = self._connections = self._broken = self._lost_bytes = 0
         self._stream: Stream | None = None
         self._shown = self._refused = 0
@@ -295,15 +300,16 @@ class LiveVideo:
                     self._emit(VideoEvent.STREAMING, self._place)
                     with self._came:
                         self._connections += 1
-                wanted = bool(frames) and self._wants()
+                shows = bool(frames) and self._wants()
+                wanted = shows or (bool(frames) and self._wants_checked())
                 with self._came:
                     for frame in frames:
                         self._backlog.put(frame, wanted=wanted)
                     if frames:
                         self._received += len(frames)
-                        self._wanted = wanted
+                        self._wanted, self._shows = wanted, shows
                         self._came.notify()
-                if self._frame_came is not None:
+                if self._frame_came is not None and not self._stop.is_set():
                     for frame in frames:
                         self._frame_came(frame)
         finally:
@@ -349,7 +355,10 @@ class LiveVideo:
         """Wait for a frame while pictures are wanted. Return it and whether to show it; None after :meth:`stop`."""
         with self._came:
             self._came.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
-            return None if self._stop.is_set() else self._backlog.take(self._clock())
+            if self._stop.is_set():
+                return None
+            coded, newest = self._backlog.take(self._clock())
+            return coded, newest and self._shows
 
     def _emit(self, event: VideoEvent, text: str) -> None:
         if not self._stop.is_set():

@@ -7,7 +7,9 @@ to (extended key usage), so that with the key of a pilot or an observer nobody c
 
 from __future__ import annotations
 
+import ipaddress
 import secrets
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -30,6 +32,13 @@ Certificate = x509.Certificate
 
 #: Certificates count from a day ago, for machines whose clocks are behind.
 BACKDATED: Final = timedelta(days=1)
+#: What an authority for pages may certify: private networks (RFC 1918, 4193, 3927, 6598) and this machine …
+PAGE_NETWORKS: Final = (
+    *("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16", "100.64.0.0/10", "127.0.0.0/8"),
+    *("fc00::/7", "fe80::/10", "::1/128"),
+)
+#: … and names that the Internet does not have (RFC 6762, 8375; .internal is reserved by ICANN).
+PAGE_NAMES: Final = ("localhost", "local", "lan", "internal", "home.arpa")
 _URN: Final = "urn:skyloop:"
 _CURVE: Final = ec.SECP256R1()
 _SIGNED: Final = ec.ECDSA(hashes.SHA256())
@@ -125,6 +134,74 @@ def issue(
         .add_extension(x509.SubjectAlternativeName([urn]), critical=False)
         .sign(authority.key, hashes.SHA256())
     )
+
+
+def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
+    """Make an authority for cockpits' pages, which browsers are to trust: not the lab's, and for nothing else.
+
+    What it issues counts for private addresses, names of local networks, and the given ones: a browser that trusts it
+    trusts it with no other site (name constraints, RFC 5280, 4.2.1.10).
+
+    Args:
+        names: More names that it may certify, with all below them.
+        days: How long it is valid.
+        now: The time in UTC.
+    """
+    key = new_key()
+    name = _name(f"Skyloop pages {secrets.token_hex(4)}")
+    permitted: list[x509.GeneralName] = [x509.IPAddress(ipaddress.ip_network(network)) for network in PAGE_NETWORKS]
+    permitted += [x509.DNSName(each) for each in dict.fromkeys([*PAGE_NAMES, *names])]
+    certificate = (
+        _builder(name, name, key, now, now + timedelta(days=days))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(authority=True), critical=True)
+        .add_extension(x509.NameConstraints(permitted, None), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    return Authority(certificate, key)
+
+
+def issue_page(
+    authority: Authority, names: Sequence[str], key: PrivateKey, until: datetime, now: datetime
+) -> x509.Certificate:
+    """Make a certificate for a cockpit's page.
+
+    Args:
+        authority: For pages; needs its key.
+        names: IP addresses and host names by which browsers reach it, at least one.
+        key: The page's key.
+        until: When it expires, in UTC; no later than the authority's certificate does.
+        now: The time in UTC.
+    """
+    assert authority.key is not None
+    issuer = authority.certificate
+    end = min(until, issuer.not_valid_after_utc)
+    return (
+        _builder(_name("Skyloop cockpit"), issuer.subject, key, now, end)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(authority=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=True)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_public(issuer)), critical=False)
+        .add_extension(x509.SubjectAlternativeName([_general_name(each) for each in names]), critical=False)
+        .sign(authority.key, hashes.SHA256())
+    )
+
+
+def page_names(certificate: x509.Certificate) -> list[str]:
+    """Return the addresses and names that a page's certificate is for."""
+    found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    return [*map(str, found.get_values_for_type(x509.IPAddress)), *found.get_values_for_type(x509.DNSName)]
+
+
+def may_certify(authority: Authority, name: str) -> bool:
+    """Return whether an authority for pages may certify an address or a name."""
+    permitted = authority.certificate.extensions.get_extension_for_class(x509.NameConstraints).value.permitted_subtrees
+    wanted = _general_name(name)
+    if isinstance(wanted, x509.DNSName):
+        domains = [one.value for one in permitted or () if isinstance(one, x509.DNSName)]
+        return any(wanted.value == domain or wanted.value.endswith(f".{domain}") for domain in domains)
+    networks = [ipaddress.ip_network(str(one.value)) for one in permitted or () if isinstance(one, x509.IPAddress)]
+    return any(ipaddress.ip_address(str(wanted.value)) in network for network in networks)
 
 
 def read_certificate(content: bytes, path: Path) -> x509.Certificate:
@@ -288,6 +365,13 @@ def check_time(certificate: x509.Certificate, what: str, now: datetime) -> None:
             f"{what} is valid from {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC on, and this machine's clock "
             f"says {now:%Y-%m-%d %H:%M}: set the clock"
         )
+
+
+def _general_name(name: str) -> x509.IPAddress | x509.DNSName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        return x509.DNSName(name.lower())
 
 
 def _public(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:

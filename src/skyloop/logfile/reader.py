@@ -15,6 +15,7 @@ from typing import IO, Any, TypeGuard
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, UnknownNameError
 from skyloop.logfile.h264 import Groups
+from skyloop.logfile.index import indexed
 from skyloop.logfile.layout import (
     META_CLOCK,
     META_END,
@@ -74,7 +75,7 @@ class Series:
 
 @dataclass(slots=True)
 class Recording:
-    """An MCAP file that Skyloop recorded. Opening scans it once; each iteration reads it again.
+    """An MCAP file that Skyloop recorded. Opening reads its index, or scans it without one; each iteration reads it.
 
     A file that was cut off is read as far as it goes, and ``cut`` holds where it ends. What can't be read in its middle
     is left out, and ``damaged`` holds where.
@@ -99,7 +100,7 @@ class Recording:
             UsageError: The file does not exist or can't be read.
             FileFormatError: It is no MCAP file, or was not recorded by Skyloop.
         """
-        found = scan(path)
+        found = indexed(path) or scan(path)
         texts = {record.name: record.metadata for record in found.metadata}
         if META_RECORDING not in texts or META_CLOCK not in texts:
             raise FileFormatError(_foreign(found))

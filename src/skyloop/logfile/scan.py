@@ -1,4 +1,4 @@
-"""The structure of an MCAP file, found without its index, so that one that was cut off reads like a complete one.
+"""The structure of an MCAP file, found without its index, as of one that was cut off, and the reading of its parts.
 
 The format is that of https://mcap.dev/spec: records of an opcode, a length and that many bytes, most of them chunks,
 which hold messages. Reading stops at a record within which the file ends; of a chunk that was cut off, the part that is
@@ -11,7 +11,7 @@ import itertools
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, Final
@@ -36,15 +36,14 @@ try:
     from mcap.data_stream import ReadDataStream
     from mcap.exceptions import McapError
     from mcap.opcode import Opcode
-    from mcap.records import Attachment, Channel, Message, Metadata, Schema
+    from mcap.records import Attachment, AttachmentIndex, Channel, Message, Metadata, MetadataIndex, Schema
 except ImportError as error:
     raise MissingExtraError("reading a recording", "record", cause=str(error)) from error
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-_FRAME: Final = struct.Struct("<BQ")  #: opcode and length of a record
-_CHUNK: Final = struct.Struct(
-    "<QQQII"
-)  #: first and last time, size and CRC when unpacked, length of compression's name
+FRAME: Final = struct.Struct("<BQ")  #: opcode and length of a record
+#: Of a chunk: first and last time, size and CRC when unpacked, length of compression's name.
+CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MESSAGE: Final = struct.Struct("<HIQQ")  #: channel, sequence, log time, publish time
 _LONGEST: Final = 1 << 32  #: a longer record is damage
 MAX_NAME: Final = 16
@@ -55,9 +54,14 @@ Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, Ove
 Record = Schema | Channel | Message
 
 __all__ = [
+    "AttachmentIndex",
     "Channel",
     "Message",
+    "Metadata",
+    "MetadataIndex",
+    "Opcode",
     "Piece",
+    "ReadDataStream",
     "Record",
     "Scan",
     "Schema",
@@ -79,7 +83,7 @@ class Piece:
     start_ns: int = 0  #: log time of its first and last message; 0 if not known
     end_ns: int = 0
     compression: str | None = None  #: of a chunk, ``""`` for none; None: a run of messages
-    crc: int = 0
+    crc: int | None = 0  #: 0: it has none; None: it is still to be read from the chunk's head
     unpacked: int = 0  #: bytes of a chunk's records, as it announces
     cut: bool = False  #: the file ends within it
 
@@ -154,13 +158,13 @@ def open_file(path: Path) -> IO[bytes]:
 def note(found: Scan, record: Record) -> None:
     """Store a schema or channel, unless there are too many already."""
     if isinstance(record, Channel):
-        if record.id in found.channels or _room(found, len(record.topic) + len(str(record.metadata))):
+        if record.id in found.channels or has_room(found, len(record.topic) + len(str(record.metadata))):
             found.channels[record.id] = record
-    elif isinstance(record, Schema) and (record.id in found.schemas or _room(found, len(record.data))):
+    elif isinstance(record, Schema) and (record.id in found.schemas or has_room(found, len(record.data))):
         found.schemas[record.id] = record
 
 
-def _room(found: Scan, size: int) -> bool:
+def has_room(found: Scan, size: int) -> bool:
     """Whether so much more can be kept in memory; if not, that is noted as damage."""
     found.head += size
     if found.head > MAX_HEAD:
@@ -179,6 +183,8 @@ def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | No
     try:
         if piece.size > MAX_CHUNK:
             raise ValueError(f"a part of {piece.size} bytes, and at most {MAX_CHUNK} are read at once")
+        if piece.crc is None:
+            piece = _with_crc(file, piece)
         file.seek(piece.offset)
         data = file.read(piece.size)
         most = len(data)  # records: each takes a byte at least, however well it is packed
@@ -188,6 +194,28 @@ def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | No
     except Damage as error:
         if damaged is not None and not piece.cut:
             damaged(f"at byte {piece.offset}: {error or type(error).__name__}")
+
+
+def chunk_head_size(compression: str) -> int:
+    """Return how many bytes of a chunk's record come before its data."""
+    return FRAME.size + CHUNK_HEAD.size + len(compression) + 8
+
+
+def _with_crc(file: IO[bytes], piece: Piece) -> Piece:
+    """Read the checksum of a chunk that is known from the index.
+
+    Raises:
+        ValueError: There is no such chunk.
+    """
+    size = chunk_head_size(piece.compression or "")
+    file.seek(piece.offset - size)
+    head = file.read(size)
+    if FRAME.unpack_from(head) != (Opcode.CHUNK, size - FRAME.size + piece.size):
+        raise ValueError("there is no chunk where the file's index says so")
+    _, _, unpacked, crc, _ = CHUNK_HEAD.unpack_from(head, FRAME.size)
+    if unpacked != piece.unpacked:
+        raise ValueError("a chunk's size is another than in the file's index")
+    return replace(piece, crc=crc)
 
 
 def _check_magic(found: Scan, head: bytes) -> None:
@@ -213,21 +241,21 @@ class _Scanner:
             if number >= MAX_RECORDS or len(found.pieces) >= MAX_PIECES:
                 found.cut = f"it is read up to byte {self._offset} only: it has too many records"
                 break
-            frame = file.read(_FRAME.size)
-            if len(frame) < _FRAME.size:
+            frame = file.read(FRAME.size)
+            if len(frame) < FRAME.size:
                 found.cut = "it has no end: its writer was stopped" if not frame else "it ends within a record"
                 break
-            opcode, length = _FRAME.unpack(frame)
+            opcode, length = FRAME.unpack(frame)
             if length > _LONGEST or opcode == 0:
                 found.cut = f"what stands at byte {self._offset} is no record: the file is damaged from there on"
                 break
-            end = self._offset + _FRAME.size + length
+            end = self._offset + FRAME.size + length
             if opcode != Opcode.MESSAGE or self._run_size() + length > _RUN:
                 self._end_run()
             if end > found.size:
                 found.cut = f"it ends within a record, {end - found.size} bytes short"
                 if opcode == Opcode.CHUNK:
-                    self._chunk(found.size - self._offset - _FRAME.size, cut=True)
+                    self._chunk(found.size - self._offset - FRAME.size, cut=True)
                 break
             if opcode == Opcode.FOOTER:
                 return
@@ -243,7 +271,7 @@ class _Scanner:
             if self._run_start is None:
                 self._run_start = self._offset
         elif opcode == Opcode.ATTACHMENT:
-            self._found.attachments.append((self._offset + _FRAME.size, length))
+            self._found.attachments.append((self._offset + FRAME.size, length))
         elif opcode in _KEPT:
             try:
                 self._keep(_KEPT[opcode], length)
@@ -256,19 +284,19 @@ class _Scanner:
         record = read(ReadDataStream(BytesIO(self._file.read(length))))
         if not isinstance(record, Metadata):
             note(self._found, record)
-        elif _room(self._found, length):
+        elif has_room(self._found, length):
             self._found.metadata.append(record)
 
     def _chunk(self, length: int, *, cut: bool) -> None:
-        head = self._file.read(_CHUNK.size)
-        if len(head) < _CHUNK.size:
+        head = self._file.read(CHUNK_HEAD.size)
+        if len(head) < CHUNK_HEAD.size:
             return
-        start_ns, end_ns, unpacked, crc, name_length = _CHUNK.unpack(head)
+        start_ns, end_ns, unpacked, crc, name_length = CHUNK_HEAD.unpack(head)
         if not start_ns <= end_ns <= MAX_TIME_NS:
             start_ns = end_ns = 0
         name = self._file.read(min(name_length, MAX_NAME))
-        offset = self._offset + _FRAME.size + _CHUNK.size + name_length + 8
-        size = length - _CHUNK.size - name_length - 8
+        offset = self._offset + FRAME.size + CHUNK_HEAD.size + name_length + 8
+        size = length - CHUNK_HEAD.size - name_length - 8
         if size > 0:
             compression = name.decode("ascii", "replace")
             self._found.pieces.append(Piece(offset, size, start_ns, end_ns, compression, crc, unpacked, cut))
@@ -334,12 +362,12 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
     """
     at, size = 0, len(data)
     for number in itertools.count():
-        if at + _FRAME.size > size:
+        if at + FRAME.size > size:
             return
         if number >= most:
             raise ValueError(f"more than {most} records packed into as many bytes: the others are left out")
-        opcode, length = _FRAME.unpack_from(data, at)
-        begin = at + _FRAME.size
+        opcode, length = FRAME.unpack_from(data, at)
+        begin = at + FRAME.size
         at = begin + length
         if at > size:
             return

@@ -304,13 +304,13 @@ class VehiclePublisher:
             intrinsics = self._nominal_intrinsics(camera, width, height)
         sample = EncodedFrame(camera, seq, captured_ns, self._clock(), width, height, H264, key, data, intrinsics)
         try:
-            self.streams.publish(sample)
+            self.streams.own(sample)
         except (ValueError, TypeError, OverflowError) as error:
             self._fail("stream", f"an encoded frame of {camera} can't be published: {error}")
 
     def wants_stream(self, camera: str) -> bool:
         """Whether anybody takes this camera's pictures as they come."""
-        return self._subscribers(stream(camera)) > 0
+        return self._subscribers(stream(camera)) > 0 or self.streams.wants_own(camera)
 
     def _nominal_intrinsics(self, camera: str, width: int, height: int) -> Intrinsics | None:
         info = self._cameras.get(camera)

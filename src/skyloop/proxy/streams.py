@@ -1,16 +1,22 @@
 """H.264 of cameras as subscribers asked for it: each form is encoded once, on a thread of its own, however many watch.
 
 A form of a rate is one for all who ask for it. A form with a subscriber's name is for that one alone, and its rate and
-size follow what the path to it carries, by what it acknowledges (:mod:`skyloop.proxy.core.stream_rate`).
+size follow what the path to it carries, by what it acknowledges (:mod:`skyloop.proxy.core.stream_rate`). Where the
+vehicle itself sends H.264, such a form hands that on as it came while the path carries it, and is encoded only where it
+does not.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,8 +40,17 @@ IDLE_S: Final = 1.0  #: a form without a subscriber for so long ends its thread
 GOOD_BITS: Final = 0.2  #: for a pixel of a picture: more is not worth its bytes
 _FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
+_NICENESS: Final = 10  # of the threads that encode: pilots' commands come first
 _FPS: Final = 30.0  # of a camera that doesn't say
 _BETTER_NS: Final = nanoseconds(3.0)  # a larger picture only after so long: each change costs a key picture
+#: How the rate of the vehicle's own pictures may be to what the path carries, for them to be handed on, and to go on.
+_BEGIN_SHARE: Final = 0.9
+_KEEP_SHARE: Final = 1.25
+#: After they were too much for the path, they are tried again so much later, and each time twice as late.
+_TRY_AGAIN_NS: Final = nanoseconds(5.0)
+_TRY_AT_MOST_NS: Final = nanoseconds(80.0)
+_OWN_KBIT_S: Final = 12_000  # the most that is tried for them [kbit/s]
+_MEASURE_NS: Final = nanoseconds(1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +92,12 @@ class StreamForm:
         self._clock = clock
         good = round(camera.width * camera.height * request.scale**2 * self._fps * GOOD_BITS / 1000)
         self._kbit_s = request.kbit_s or min(max(good, 100), MAX_KBIT_S)
-        self._rate = StreamRate(self._kbit_s, clock()) if request.subscriber else None
+        own = bool(camera.stream) and request.scale == 1.0 and request.max_fps is None
+        most_kbit_s = max(self._kbit_s, _OWN_KBIT_S) if own else self._kbit_s
+        self._rate = StreamRate(most_kbit_s, clock()) if request.subscriber else None
+        #: Whether the vehicle's own pictures may be handed on.
+        self.takes_own = own and self._rate is not None
+        self.passing = False  #: whether they are, now
         self._limiter = RateLimiter(request.max_fps)
         self._scale, self._better_ns = request.scale, clock()
         self._changed = threading.Condition()  # guards all of the following, and the rate
@@ -88,6 +108,10 @@ class StreamForm:
         self._thread: threading.Thread | None = None
         self._ended = False
         self._encoder: H264Encoder | None = None
+        self._anew = False  # the encoder is to be begun anew
+        self._own_kbit_s = 0.0  # of the vehicle's own pictures; 0: not known yet
+        self._own_bytes, self._own_since_ns = 0, 0
+        self._try_ns, self._again_ns = 0, _TRY_AGAIN_NS
         self._seq = clock() // 1_000_000  # a form that is made anew goes on with higher numbers
 
     def wants(self, header: FrameHeader, subscribers: int) -> bool:
@@ -100,7 +124,7 @@ class StreamForm:
         with self._changed:
             self._wants_key = self._wants_key or subscribers > self._subscribers
             self._subscribers = subscribers
-            if not subscribers:
+            if not subscribers or self.passing:
                 return False
             if self._rate is not None and not self._rate.may_send(self._clock()):
                 self.skipped += 1
@@ -132,6 +156,42 @@ class StreamForm:
             if self._rate is not None and report.seq <= self._seq:
                 self._rate.acknowledged(report.seq, now_ns)
 
+    def own(self, picture: EncodedFrame, subscribers: int) -> EncodedFrame | None:
+        """Take a picture that the vehicle encoded; return it as it is to be published, None if it is not.
+
+        Args:
+            picture: Whole.
+            subscribers: How many the form has now.
+        """
+        rate, now_ns = self._rate, self._clock()
+        with self._changed:
+            self._measure(len(picture.data), now_ns)
+            if rate is None or not subscribers or not self._own_kbit_s:
+                self.passing = False
+                return None
+            fits = rate.may_send(now_ns)
+            if self.passing and (self._wants_key or not fits or self._own_kbit_s > _KEEP_SHARE * rate.kbit_s):
+                if not self._wants_key:  # it was too much
+                    self._try_ns = now_ns + self._again_ns
+                    self._again_ns = min(2 * self._again_ns, _TRY_AT_MOST_NS)
+                self.passing, self._wants_key, self._anew = False, True, True
+            begins = picture.key and fits and now_ns >= self._try_ns
+            if not self.passing and begins and self._own_kbit_s <= _BEGIN_SHARE * rate.kbit_s:
+                self.passing, self._wants_key = True, False
+            if not self.passing:
+                return None
+            self._seq += 1
+            rate.sent(self._seq, len(picture.data), now_ns)
+            return msgspec.structs.replace(picture, seq=self._seq, topic=self.topic)
+
+    def _measure(self, size: int, now_ns: int) -> None:
+        self._own_bytes += size
+        passed_ns = now_ns - self._own_since_ns
+        if passed_ns >= _MEASURE_NS:
+            if passed_ns < 2 * _MEASURE_NS:
+                self._own_kbit_s = self._own_bytes * 8e6 / passed_ns
+            self._own_bytes, self._own_since_ns = 0, now_ns
+
     def end(self) -> None:
         """End the thread, and wait for the picture that it is at."""
         with self._changed:
@@ -142,6 +202,7 @@ class StreamForm:
             thread.join()
 
     def _run(self) -> None:
+        _give_way()
         while (picture := self._next()) is not None:
             try:
                 self._encode(picture)
@@ -163,9 +224,13 @@ class StreamForm:
     def _encode(self, picture: _Picture) -> None:
         kbit_s = self._follow_path(picture.header)
         header = resized_header(picture.header, *_even(picture.header, self._scale))
-        encoder = self._encoder
-        if encoder is None or (encoder.width, encoder.height) != (header.width, header.height):
-            encoder = self._encoder = H264Encoder(header.width, header.height, self._fps, kbit_s)
+        with self._changed:
+            encoder = None if self._anew else self._encoder
+            self._anew = False
+        size = (header.width, header.height)
+        if encoder is None or (encoder.width, encoder.height) != size or not encoder.carries(kbit_s):
+            varies = self._rate is not None
+            encoder = self._encoder = H264Encoder(*size, self._fps, kbit_s, varies=varies)
         elif abs(kbit_s - encoder.kbit_s) > 0.02 * encoder.kbit_s:
             encoder.set_rate(kbit_s)
         now_ns = self._clock()
@@ -177,12 +242,13 @@ class StreamForm:
         if len(data) > MAX_ENCODED:
             raise UsageError(f"it has {len(data)} bytes, at most {MAX_ENCODED} are sent")
         with self._changed:
+            if self.passing:
+                return  # the vehicle's own pictures have taken over meanwhile
             self._seq += 1
             if is_key:
                 self._wants_key, self._key_ns = False, now_ns
             if self._rate is not None:
                 self._rate.sent(self._seq, len(data), self._clock())
-        size = (header.width, header.height)
         times = (header.captured_ns, header.published_ns)
         self._publish(
             EncodedFrame(header.camera, self._seq, *times, *size, H264, is_key, data, header.intrinsics, self.topic)
@@ -194,7 +260,7 @@ class StreamForm:
             return self._kbit_s
         now_ns = self._clock()
         with self._changed:
-            kbit_s = round(self._rate.kbit_s)
+            kbit_s = min(round(self._rate.kbit_s), self._kbit_s)
             pixels_1_s = header.width * header.height * self._fps * self.request.scale**2
             scale, share = picture_form(kbit_s, pixels_1_s)
             scale *= self.request.scale
@@ -252,7 +318,13 @@ class Streams:
 
     def wanted(self, camera: str) -> bool:
         """Whether anybody watches an encoded form of this camera."""
-        return any(form.request.camera == camera and self._subscribers(form.topic) for form in self._forms.known)
+        forms = self._forms.known
+        return any(one.request.camera == camera and not one.passing and self._subscribers(one.topic) for one in forms)
+
+    def wants_own(self, camera: str) -> bool:
+        """Whether a form may hand on the vehicle's own pictures of this camera."""
+        forms = self._forms.known
+        return any(one.request.camera == camera and one.takes_own and self._subscribers(one.topic) for one in forms)
 
     def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
         """Have a frame encoded in the forms that want it. It is copied once if any does."""
@@ -267,6 +339,15 @@ class Streams:
         copy = pixels.reshape(-1).copy()  # other threads run meanwhile, as they would not with tobytes()
         for form in wanted:
             form.put(header, copy)
+
+    def own(self, picture: EncodedFrame) -> None:
+        """Publish a picture that the vehicle encoded, in the form in which it came, too."""
+        self.publish(picture)
+        for form in self._forms.known:
+            if form.takes_own and form.request.camera == picture.camera:
+                sent = form.own(picture, self._subscribers(form.topic))
+                if sent is not None:
+                    self.publish(sent)
 
     def report(self, report: StreamReport) -> str:
         """Take in a subscriber's report; return why it makes no sense, empty if it does."""
@@ -289,6 +370,13 @@ class Streams:
         """End all threads."""
         for form in self._forms.known:
             form.end()
+
+
+def _give_way() -> None:
+    """Let the calling thread work only while none that flies wants the processor. Linux has a priority for each."""
+    if sys.platform == "linux":
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
 
 
 def _even(header: FrameHeader, scale: float) -> tuple[int, int]:

@@ -27,7 +27,9 @@ from skyloop.recording.translation import Picture, Translator
 BEAT_S: Final = 0.05  #: period of polling the backlog, so that receiving threads need not wake the writer
 _COMMIT_NS: Final = nanoseconds(0.5)  #: samples older than this are in the file, unless the disk is too slow
 _REOPEN: Final = 4 * MB  #: bytes that must be free before a new file is opened on a disk that was full
-_KEY_WAIT_NS: Final = nanoseconds(2.0)  #: how long a full file is continued, to end before a key frame
+#: How long a full file is continued, to end before a key frame: cameras that are no drone's send one each 10 s or so.
+_KEY_WAIT_NS: Final = nanoseconds(15.0)
+_SILENCE_NS: Final = nanoseconds(2.0)  #: without H.264 for so long, a full file waits for no key frame
 _LOOK_NS: Final = nanoseconds(1.0)  #: period of checking the disk, and of retrying a file that can't be written
 
 Tell = Callable[[str, Severity], None]
@@ -111,6 +113,7 @@ class FileWriter:
         self._opened_ns = self._commit_due_ns = self._look_due_ns = 0
         self._due_ns = 0  # since when a new file is due
         self._chains: dict[tuple[int, str], Chain] = {}  # H.264 of this file, by drone and channel
+        self._encoded_ns = 0  # when the last frame of H.264 was written
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-recorder", daemon=True)
 
@@ -258,7 +261,10 @@ class FileWriter:
             return True
         record = item.sample.record
         chain = self._chains.setdefault((item.drone, item.channel), Chain())
-        return chain.follows(record.header.seq, key=record.key)
+        follows = chain.follows(record.header.seq, key=record.key)
+        if follows:
+            self._encoded_ns = self._now_ns
+        return follows
 
     def _commit(self) -> None:
         assert self._file is not None
@@ -279,7 +285,8 @@ class FileWriter:
         if not self._rotation_due():
             return
         self._due_ns = self._due_ns or self._now_ns
-        if not self._chains or self._now_ns - self._due_ns >= _KEY_WAIT_NS:
+        silent = self._now_ns - self._encoded_ns >= _SILENCE_NS
+        if not self._chains or silent or self._now_ns - self._due_ns >= _KEY_WAIT_NS:
             self._rotate()
 
     def _rotate(self) -> None:

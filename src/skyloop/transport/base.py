@@ -342,6 +342,11 @@ class TransportClient(ABC):
         return False
 
     @property
+    def excused_s(self) -> float:
+        """For how much longer than usual the other end may be silent before the link counts as lost [s]."""
+        return 0.0
+
+    @property
     @abstractmethod
     def address(self) -> str:
         """What this end is connected to, for people."""

@@ -43,7 +43,27 @@ def payloads_of(unit: bytes, most: int) -> Iterator[bytes]:
         yield bytes((indicator, first << 7 | last << 6 | kind)) + body[start : start + step]
 
 
-class MavlinkSession:
+class RtpPacker:
+    """Packs pictures as RTP with payloads of at most ``most`` bytes, numbered."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._sequence = 0
+
+    def packets(self, picture: bytes, stamp_s: float) -> list[bytes]:
+        """One picture in Annex B form. The marker stands on its last packet, RFC 6184, 5.1."""
+        payloads = [payload for unit in units_of(picture) for payload in payloads_of(unit, self._most)]
+        stamp = round(stamp_s * CLOCK_HZ) & 0xFFFFFFFF
+        made = []
+        for n, payload in enumerate(payloads):
+            marker = (n == len(payloads) - 1) << 7
+            header = struct.pack("!BBHII", 0x80, marker | PAYLOAD_TYPE, self._sequence & 0xFFFF, stamp, _SSRC)
+            self._sequence += 1
+            made.append(header + payload)
+        return made
+
+
+class RtspSession:
     """One client's connection."""
 
     def __init__(self, server: RtspServer, connection: socket.socket) -> None:
@@ -51,7 +71,7 @@ class MavlinkSession:
         self._connection = connection
         self._lock = threading.Lock()  # replies and pictures share the connection
         self._udp: socket.socket | None = None
-        self._sequence = 0
+        self._packer = RtpPacker(server.most)
         self.playing = False
         connection.settimeout(_SEND_S)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -76,16 +96,9 @@ class MavlinkSession:
                 if not self._answer(request.decode("latin-1")):
                     return
 
-    def send(self, stamp: int, units: list[bytes], most: int) -> None:
-        """One picture. The marker stands on its last packet, RFC 6184, 5.1."""
-        payloads = [payload for unit in units for payload in payloads_of(unit, most)]
-        for n, payload in enumerate(payloads):
-            marker = (n == len(payloads) - 1) << 7
-            header = struct.pack(
-                "!BBHII", 0x80, marker | PAYLOAD_TYPE, self._sequence & 0xFFFF, stamp & 0xFFFFFFFF, _SSRC
-            )
-            self._sequence += 1
-            self._send_packet(header + payload)
+    def send(self, picture: bytes, stamp_s: float) -> None:
+        for packet in self._packer.packets(picture, stamp_s):
+            self._send_packet(packet)
 
     def close(self, *, abruptly: bool = False) -> None:
         self.playing = False
@@ -173,7 +186,7 @@ class RtspServer:
         self.requests: list[str] = []
         self._user = user
         self._parameters = [unit for unit in units_of(parameters) if unit[0] & 31 in (_SPS, _PPS)]
-        self._sessions: list[MavlinkSession] = []
+        self._sessions: list[RtspSession] = []
         self._changed = threading.Condition()
         self._listener: socket.socket | None = None
         self.port = 0
@@ -228,7 +241,7 @@ class RtspServer:
         with self._changed:
             playing = [session for session in self._sessions if session.playing]
         for session in playing:
-            session.send(round(stamp_s * CLOCK_HZ), units_of(picture), self.most)
+            session.send(picture, stamp_s)
 
     def wait_for_player(self, timeout_s: float) -> bool:
         with self._changed:
@@ -239,7 +252,7 @@ class RtspServer:
     def knows(self, authorization: str) -> bool:
         return not self._user or authorization == f"Basic {base64.b64encode(self._user.encode()).decode()}"
 
-    def plays(self, session: MavlinkSession) -> None:
+    def plays(self, session: RtspSession) -> None:
         with self._changed:
             session.playing = True
             self._changed.notify_all()
@@ -250,7 +263,7 @@ class RtspServer:
                 connection, _ = listener.accept()
             except OSError:
                 return
-            session = MavlinkSession(self, connection)
+            session = RtspSession(self, connection)
             with self._changed:
                 if self._listener is None:
                     session.close()
@@ -260,7 +273,7 @@ class RtspServer:
             self._threads.append(thread)
             thread.start()
 
-    def _serve(self, session: MavlinkSession) -> None:
+    def _serve(self, session: RtspSession) -> None:
         with suppress(OSError):
             session.serve()
         with self._changed:

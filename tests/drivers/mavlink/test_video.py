@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from skyloop.clock import monotonic_ns
+from skyloop.drivers import live_camera as camera
 from skyloop.drivers.mavlink import MavlinkDriver
-from skyloop.drivers.mavlink import video as camera
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.mavlink import Kind, Ports, video

@@ -18,11 +18,11 @@ def test_all_options() -> None:
     made = options_of(
         parse_uri(
             "tello://tello.local?local=192.168.1.101&interface=wlan1&port=9000&state_port=8891&video_port=11112"
-            "&video=0&pads=1&velocity_axes=body"
+            "&video=0&concealed=2&pads=1&velocity_axes=body"
         )
     )
     assert made == TelloOptions(
-        "tello.local", "192.168.1.101", "wlan1", 9000, 8891, 11112, False, True, VelocityAxes.BODY
+        "tello.local", "192.168.1.101", "wlan1", 9000, 8891, 11112, False, 2, True, VelocityAxes.BODY
     )
     assert made.own_ports
     assert not TelloOptions("d").own_ports
@@ -41,6 +41,7 @@ def test_all_options() -> None:
         ("tello://d?state_port=80", "from 1025 to 65535"),
         ("tello://d?state_port=9000&video_port=9000", "can't both come to port 9000"),
         ("tello://d?cx=10", "needs fx"),
+        ("tello://d?concealed=31", "from 0 to 30"),
     ],
 )
 def test_what_makes_no_sense_is_refused(address: str, said: str) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.drivers.backlog import Coded
-from skyloop.drivers.tello.video import MOST_DAMAGED, TelloVideo, cameras_of, intrinsics_for
+from skyloop.drivers.tello.video import TelloVideo, cameras_of, intrinsics_for
 from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.tello.emulator import GROUP, TelloPacker
 from skyloop.emulators.tello.settings import FRONT
@@ -58,14 +58,19 @@ def units(stream: list[bytes], lost: set[tuple[int, int]] | None = None) -> list
     return got
 
 
-def shown(stream: list[bytes], lost: set[tuple[int, int]] | None = None) -> dict[int, Pixels]:
-    video = TelloVideo()
+def shown(stream: list[bytes], lost: set[tuple[int, int]] | None = None, concealed: int = 2) -> dict[int, Pixels]:
+    video = TelloVideo(concealed)
     pictures = {}
     for number, unit in units(stream, lost):
         decoded = video.decode(Coded(unit, unit.is_key, number, number, 0), show=True)
         if decoded is not None:
             pictures[number] = decoded[1]
     return pictures
+
+
+@functools.cache
+def _shown_whole() -> dict[int, Pixels]:
+    return shown(list(_encoded()))
 
 
 def differ(one: Pixels, other: Pixels) -> float:
@@ -97,6 +102,13 @@ def test_a_picture_that_is_missing_leaves_others_that_are_nearly_right(stream: l
     assert np.array_equal(damaged[GROUP], whole[GROUP])  # the next key mends it
 
 
+def test_unless_it_is_allowed_nothing_damaged_is_shown(stream: list[bytes]) -> None:
+    whole = shown(stream)
+    damaged = shown(stream, {(10, 0), (2 * GROUP + 3, 0)}, concealed=0)
+    assert sorted(damaged) == [*range(10), *range(GROUP, 2 * GROUP + 3)]
+    assert all(np.array_equal(pixels, whole[number]) for number, pixels in damaged.items())
+
+
 def test_after_a_damaged_key_nothing_is_shown_up_to_the_next(stream: list[bytes]) -> None:
     assert len(pieces(stream[GROUP])) > 2
     assert sorted(shown(stream, {(GROUP, 1)})) == [*range(GROUP), *range(2 * GROUP, COUNT)]
@@ -108,7 +120,6 @@ def test_nothing_is_shown_before_a_whole_key(stream: list[bytes]) -> None:
 
 def test_after_too_much_damage_nothing_is_shown_up_to_the_next_key(stream: list[bytes]) -> None:
     gone = [5, 8, 11]
-    assert len(gone) == MOST_DAMAGED + 1
     lost = {(number, at) for number in gone for at in range(len(pieces(stream[number])))}
     pictures = shown(stream, lost)
     assert max(number for number in pictures if number < GROUP) == 10
@@ -127,6 +138,38 @@ def test_a_restart_waits_for_a_key(stream: list[bytes]) -> None:
     assert video.decode(Coded(all_units[GROUP][1], True, 0, 0, 1), show=True) is not None
 
 
+def handed_on(stream: list[bytes], lost: set[tuple[int, int]] | None = None, left_out: int | None = None) -> list[int]:
+    """The numbers of the pictures that count as whole; ``left_out`` never reaches the decoder."""
+    whole: list[int] = []
+    video = TelloVideo(2, lambda coded: whole.append(coded.captured_ns))
+    for number, unit in units(stream, lost):
+        if number != left_out:
+            video.decode(Coded(unit, unit.is_key, number, number, 0), show=False)
+    return whole
+
+
+def test_every_picture_is_whole_without_loss_and_has_its_size(stream: list[bytes]) -> None:
+    assert handed_on(stream) == list(range(COUNT))
+    assert {(unit.width, unit.height) for _, unit in units(stream)} == {(320, 240)}
+    assert [unit.number for _, unit in units(stream)] == list(range(COUNT))
+
+
+def test_a_patched_picture_and_what_builds_on_it_are_not_whole(stream: list[bytes]) -> None:
+    assert handed_on(stream, {(10, 0)}) == [*range(10), *range(GROUP, COUNT)]
+    assert handed_on(stream, {(GROUP, 1)}) == [*range(GROUP), *range(2 * GROUP, COUNT)]
+    assert handed_on(stream, left_out=10) == [*range(10), *range(GROUP, COUNT)]
+
+
+def test_it_waits_until_a_key_can_be_shown(stream: list[bytes]) -> None:
+    video = TelloVideo()
+    assert video.waits
+    for number, unit in units(stream)[:2]:
+        video.decode(Coded(unit, unit.is_key, number, number, 0), show=False)
+        assert not video.waits
+    video.restart()
+    assert video.waits
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32), st.floats(0.0, 0.7))
 def test_any_loss_is_survived(seed: int, share: float) -> None:
@@ -138,6 +181,9 @@ def test_any_loss_is_survived(seed: int, share: float) -> None:
         for at in range(len(pieces(picture)))
         if chance.random() < share
     }
+    whole = _shown_whole()
+    for number, picture in shown(stream, lost, concealed=0).items():
+        assert np.array_equal(picture, whole[number])
     for picture in shown(stream, lost).values():
         assert picture.shape == (240, 320, 3)
 

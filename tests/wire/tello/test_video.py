@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.wire.tello.h264 import START, Slice, parse_sequence, parse_slice, units
+from skyloop.wire.h264 import START, Slice, parse_sequence, parse_slice, units
 from skyloop.wire.tello.video import MAX_PICTURE, PIECE, AccessUnit, Assembly, pieces
 
 #: Of a real Tello.
@@ -19,7 +19,7 @@ PPS = bytes.fromhex("68ee3880")
 
 def picture(number: int, size: int, *, key: bool = False) -> bytes:
     """The beginning of a slice with this frame number, and filling that is no start code."""
-    bits = f"1{'00110' if not key else '00111'}1{number % 256:08b}1"  # first macroblock 0, type, parameter set 0
+    bits = f"1{'00110' if not key else '0001000'}1{number % 256:08b}1"  # first macroblock 0, type, parameter set 0
     bits += "1" * (-len(bits) % 8)
     head = bytes([0x65 if key else 0x61]) + int(bits, 2).to_bytes(len(bits) // 8, "big")
     unit = (START + SPS + START + PPS if key else b"") + START + head

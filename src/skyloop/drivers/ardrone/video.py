@@ -23,12 +23,14 @@ from skyloop.drivers.base import Sink
 from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.live_video import Decoded, Decoder, LiveVideo, Picture, Stream, VideoEvent
+from skyloop.drivers.stream_relay import StreamRelay
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, Intrinsics
-from skyloop.messages.encoded import H264, Chain
+from skyloop.messages.encoded import H264
 from skyloop.wire.ardrone.pave import Codec, FrameType, PaveFrame, PaveParser
 from skyloop.wire.ardrone.uvlc import UvlcDecoder, UvlcPicture, is_intra, is_p264
+from skyloop.wire.h264 import Unit
 
 # Cameras -------------------------------------------------------------------------------------------------------------
 
@@ -381,9 +383,9 @@ def _codec_name(codec: int) -> str:
 
 
 class EncodedStream:
-    """Hands H.264 on while somebody wants it, beginning with a key picture, and after damage with the next one.
+    """Hands H.264 on while somebody wants it; see :class:`StreamRelay`. Used by the thread that reads.
 
-    Whether pictures are decoded as well makes no difference. Used by the thread that reads.
+    A frame came over TCP, so it is whole, and need not be decoded to know that.
 
     Args:
         sink: The proxy's.
@@ -395,33 +397,23 @@ class EncodedStream:
         self, sink: Sink, camera: Callable[[], str], intrinsics: Callable[[int, int], Intrinsics | None]
     ) -> None:
         """Store the arguments."""
-        self._sink = sink
         self._camera = camera
-        self._intrinsics = intrinsics
-        self._chain = Chain()
-        self._source: tuple[str, int] | None = None  # camera and connection of the picture before
+        self._relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
 
     def take(self, coded: Coded) -> None:
         """Hand on a frame that arrived whole, if it is H.264, wanted, and decodable after the last one."""
         frame = coded.data
-        camera = self._camera()
-        if not isinstance(frame, PaveFrame) or frame.codec != Codec.MPEG4_AVC or not self._sink.wants_stream(camera):
-            self._source = None
+        if not isinstance(frame, PaveFrame) or frame.codec != Codec.MPEG4_AVC:
+            self._relay.restart()
             return
-        source = camera, coded.connection
-        if frame.after_damage or source != self._source:
-            self._chain.restart()
-        self._source = source
-        if self._chain.follows(frame.number, key=frame.is_key) and frame.type != FrameType.HEADERS:
-            self._sink.stream(
-                camera,
-                frame.payload,
-                coded.captured_ns,
-                width=frame.width,
-                height=frame.height,
-                key=frame.is_key,
-                intrinsics=self._intrinsics(frame.width, frame.height),
-            )
+        self._relay.take(
+            self._camera(),
+            Unit(frame.payload, frame.is_key, frame.after_damage, frame.width, frame.height),
+            coded.captured_ns,
+            number=frame.number,
+            connection=coded.connection,
+            picture=frame.type != FrameType.HEADERS,
+        )
 
 
 # The receiver --------------------------------------------------------------------------------------------------------

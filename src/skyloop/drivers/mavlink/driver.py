@@ -6,6 +6,7 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, ExternalPose, Sink
+from skyloop.drivers.live_camera import LiveCamera
 from skyloop.drivers.mavlink.link import MavlinkLink
 from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import options_of
@@ -18,7 +19,7 @@ from skyloop.drivers.mavlink.parameters import (
     writable_parameter,
 )
 from skyloop.drivers.mavlink.protocol import MavlinkSession
-from skyloop.drivers.mavlink.video import CameraReceiver, camera_info, check_source
+from skyloop.drivers.mavlink.video import camera_info, camera_receiver, source
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
@@ -48,9 +49,9 @@ class MavlinkDriver(Driver):
         super().__init__(uri)
         self.options = options_of(uri)
         if self.options.camera is not None:
-            check_source(uri, self.options.camera)
+            source(uri, self.options.camera)  # raises if it is none
         self._link: MavlinkLink | None = None
-        self._camera: CameraReceiver | None = None
+        self._camera: LiveCamera | None = None
         self._limits = dict(self.options.limits)
 
     def capabilities(self) -> Capabilities:
@@ -67,7 +68,7 @@ class MavlinkDriver(Driver):
 
     def _open(self, sink: Sink) -> None:
         if self.options.camera is not None:
-            self._camera = CameraReceiver(self.uri, self.options.camera, sink)
+            self._camera = camera_receiver(self.uri, self.options.camera, sink)
             self._camera.start()
         session = MavlinkSession(self.options, monotonic_ns(), extra=self._camera_telemetry)
         session.limit(self._limits)
@@ -82,7 +83,7 @@ class MavlinkDriver(Driver):
         self._link = self._camera = None
 
     def _camera_telemetry(self) -> dict[str, Value]:
-        return {} if self._camera is None else self._camera.telemetry
+        return {} if self._camera is None else self._camera.telemetry()
 
     # Flying ----------------------------------------------------------------------------------------------------
 

@@ -67,7 +67,7 @@ _HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 KNOWN: Final = {
     *("sysid", "peer", "own_sysid", "rate", "parameters", "signing_key", "origin", "pose"),
     *(limit.option for limit in OWN_LIMITS),
-    *("camera", "camera_name", "camera_width", "camera_height", "camera_fps", "camera_facing"),
+    *("camera", "camera_name", "camera_width", "camera_height", "camera_fps", "camera_facing", "camera_stream"),
     *INTRINSICS_OPTIONS,
 }
 
@@ -116,6 +116,7 @@ class CameraOptions:
     height: int
     fps: float
     facing: str  #: one of :data:`FACINGS`
+    stream: bool = True  #: whether H.264 of a camera on the network is announced, to be handed on as it comes
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,6 +254,7 @@ def _camera(uri: VehicleUri) -> CameraOptions | None:
         height=uri.whole("camera_height", 480, minimum=1, maximum=16384),
         fps=uri.number("camera_fps", 30.0, minimum=0.1, maximum=1000.0),
         facing=facing,
+        stream=uri.flag("camera_stream", default=True),
     )
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 from skyloop.clock import monotonic_ns
+from skyloop.drivers.backlog import Coded
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.live_video import LiveVideo, Picture, VideoEvent
+from skyloop.drivers.stream_relay import StreamRelay
 from skyloop.drivers.tello.link import TelloLink
 from skyloop.drivers.tello.options import options_of
 from skyloop.drivers.tello.parameters import DroneSettings
@@ -15,8 +17,10 @@ from skyloop.drivers.tello.video import TelloVideo, VideoStream, cameras_of, int
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
-from skyloop.messages import AnyAction, Capabilities, Parameter, Refusal, Value
+from skyloop.messages import AnyAction, Capabilities, Intrinsics, Parameter, Refusal, Value
 from skyloop.messages.checkup import Diagnostic
+from skyloop.wire.h264 import Unit
+from skyloop.wire.tello.video import AccessUnit
 
 ACTIONS: Final = frozenset(
     {"idle", "takeoff", "hover", "land", "velocity", "attitude", "emergency_stop", "reset_emergency"}
@@ -113,21 +117,40 @@ class TelloDriver(Driver):
     def _start_video(self, sink: Sink, link: TelloLink, settings: DroneSettings) -> None:
         def show(picture: Picture) -> None:
             camera = settings.camera
-            picture.show(sink, camera, intrinsics_for(self._cameras[0], camera, picture.width))
+            picture.show(sink, camera, intrinsics(camera, picture.width, picture.height))
 
         def publish_video_event(event: VideoEvent, text: str) -> None:
             event.publish(sink, "video", text)
 
-        def came(_coded: object) -> None:
-            self._video_ns = monotonic_ns()
+        def intrinsics(camera: str, width: int, _height: int) -> Intrinsics | None:
+            return intrinsics_for(self._cameras[0], camera, width)
+
+        relay = StreamRelay(sink, intrinsics)
+
+        def hand_on(coded: Coded) -> None:
+            unit = coded.data
+            assert isinstance(unit, AccessUnit)
+            whole = Unit(unit.data, unit.is_key, unit.after_gap, unit.width, unit.height)
+            relay.take(settings.camera, whole, coded.captured_ns, number=unit.number, connection=coded.connection)
+
+        def wants_stream() -> bool:
+            return sink.wants_stream(settings.camera)
+
+        decoder = TelloVideo(self.options.concealed, hand_on)
+
+        def came(coded: Coded) -> None:
+            # Video of which nothing can be shown, for too long, is asked for as one that does not come.
+            if coded.is_key or not (decoder.waits and (sink.wants(settings.camera) or wants_stream())):
+                self._video_ns = monotonic_ns()
 
         self._video = LiveVideo(
             f"port {self.options.video_port}",
             connect=lambda number: VideoStream(self.options, lambda: link.addresses, number, monotonic_ns),
-            make_decoder=TelloVideo,
+            make_decoder=lambda: decoder,
             show=show,
             on_event=publish_video_event,
             wants=lambda: sink.wants(settings.camera),
+            wants_checked=wants_stream,
             came=came,
             name="tello-video",
         )

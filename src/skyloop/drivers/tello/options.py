@@ -16,9 +16,10 @@ from skyloop.wire.tello.commands import PORT, STATE_PORT, VIDEO_PORT
 
 _HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:@-]{1,15}\Z")
+MOST_CONCEALED: Final = 30  #: pictures from one key to the next
 _LEAST_PORT: Final = 1025  # that the Tello's command takes
 KNOWN: Final = {
-    *("local", "interface", "port", "state_port", "video_port", "video", "pads", "velocity_axes"),
+    *("local", "interface", "port", "state_port", "video_port", "video", "concealed", "pads", "velocity_axes"),
     *INTRINSICS_OPTIONS,
 }
 
@@ -42,6 +43,7 @@ class TelloOptions:
     state_port: int = STATE_PORT
     video_port: int = VIDEO_PORT
     video: bool = True
+    concealed: int = 0  #: damaged pictures that a shown one may build on
     pads: bool = False  #: look for mission pads from the beginning
     velocity_axes: VelocityAxes = VelocityAxes.START
 
@@ -76,6 +78,7 @@ def options_of(uri: VehicleUri) -> TelloOptions:
         state_port=uri.whole("state_port", STATE_PORT, minimum=_LEAST_PORT, maximum=65535),
         video_port=uri.whole("video_port", VIDEO_PORT, minimum=_LEAST_PORT, maximum=65535),
         video=uri.flag("video", default=True),
+        concealed=uri.whole("concealed", 0, maximum=MOST_CONCEALED),
         pads=uri.flag("pads", default=False),
         velocity_axes=VelocityAxes(axes),
     )

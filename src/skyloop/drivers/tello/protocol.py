@@ -137,7 +137,7 @@ FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is 
 ENTER_NS: Final = nanoseconds(0.5)  #: between two ``command`` while no state comes
 ALIVE_NS: Final = nanoseconds(4.0)  #: between questions that keep the drone from landing by itself after 15 s
 DEAF: Final = 2  #: questions in a row without an answer: our commands are not received
-VIDEO_NS: Final = nanoseconds(2.0)  #: without video for so long it is asked for
+VIDEO_NS: Final = nanoseconds(2.0)  #: without video that can be shown for so long it is asked for
 ALIVE: Final = "wifi?"
 DEFAULT_HOST: Final = "192.168.10.1"  #: of a Tello that opens a network of its own
 _TELLOS_NETWORK: Final = "192.168.10."
@@ -152,7 +152,7 @@ class TelloSession(VehicleSession):
         options: Of the vehicle's address.
         now_ns: The time of opening.
         extra: Gives telemetry of others for feedback's ``native``.
-        video_ns: When video came last, 0 for never.
+        video_ns: When video came last that can be shown, or a key picture; 0 for never.
     """
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)

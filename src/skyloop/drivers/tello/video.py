@@ -1,4 +1,4 @@
-"""The drone's video: its cameras, datagrams to pictures, and a decoder that patches up a little damage.
+"""The drone's video: its cameras, datagrams to pictures, and a decoder that shows what is whole.
 
 Intrinsics: a calibration of one such drone as published with tello_ros, for pictures of 960×720; another drone's differ
 by some per cent. Nothing is known of the lens of the camera that looks down.
@@ -22,6 +22,7 @@ from skyloop.drivers.tello.options import TelloOptions
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_link import MAX_DATAGRAM
 from skyloop.messages import CameraInfo, Intrinsics
+from skyloop.messages.encoded import H264
 from skyloop.pyav import new_decoder, require_pyav
 from skyloop.wire.tello.video import AccessUnit, Assembly
 
@@ -46,8 +47,9 @@ _CAMERAS: Final = (
         intrinsics=_CALIBRATION,
         rotation=(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
         position_m=(0.05, 0.0, 0.0),
+        stream=H264,
     ),
-    CameraInfo(BOTTOM, 320, 240, 30.0, rotation=(0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)),
+    CameraInfo(BOTTOM, 320, 240, 30.0, rotation=(0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0), stream=H264),
 )
 
 
@@ -160,10 +162,6 @@ class VideoStream:
 
 # Decoder -------------------------------------------------------------------------------------------------------------
 
-#: How many damaged pictures a shown one may build on. With a tenth of the datagrams of a simulated flight lost,
-#: encoded with 0.3 Mbit/s, a marker was found in 81 % of the pictures that are shown with 1 here, in 73 % with 2, in
-#: 67 % with 3.
-MOST_DAMAGED: Final = 2
 MOST_UNITS: Final = 120  #: kept to be decoded again; key pictures of the drone are 30 apart
 _PURPOSE: Final = "the video of a Tello"
 
@@ -171,16 +169,23 @@ _PURPOSE: Final = "the video of a Tello"
 class TelloVideo:
     """Decodes one stream.
 
-    A decoder that refuses any damage works from a whole key picture on. At the first damage another one takes over,
-    which fills what is missing with what stood there before; it decodes again what came since the key. After more than
-    :data:`MOST_DAMAGED` damaged pictures, or a damaged key, nothing is shown up to the next whole key.
+    A decoder that refuses any damage works from a whole key picture on. At the first damage another one takes over, if
+    that is allowed, which fills what is missing with what stood there before; it decodes again what came since the key.
+    After more damaged pictures than allowed, or a damaged key, nothing is shown up to the next whole key.
+
+    Args:
+        concealed: How many damaged pictures a shown one may build on.
+        on_whole: Called with each picture that shows no damage and builds on none. On the decoding thread.
 
     Raises:
         MissingExtraError: PyAV is not installed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, concealed: int = 0, on_whole: Callable[[Coded], None] = lambda _: None) -> None:
         require_pyav(_PURPOSE)
+        self._concealed = concealed
+        self._on_whole = on_whole
+        self._came: int | None = None  # number of the picture before
         self.waited = 0
         self.damaged = 0
         self._strict: VideoCodecContext | None = None
@@ -193,19 +198,30 @@ class TelloVideo:
         """Wait for the next key picture."""
         self._strict = self._patching = None
 
+    @property
+    def waits(self) -> bool:
+        """Whether nothing can be shown up to the next whole key."""
+        return self._strict is None and self._patching is None
+
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
         """See :class:`skyloop.drivers.live_video.Decoder`."""
         unit = coded.data
         if not isinstance(unit, AccessUnit):
             raise TypeError("a picture of a Tello is wanted")
+        came, self._came = self._came, unit.number
+        left_out = came is not None and unit.number != came + 1
         if unit.is_key:
             image = self._decode_key(unit.data)
-        elif self._strict is None and self._patching is None:
+        elif self.waits:
             self.waited += 1
             return None
         else:
-            image = self._decode_next(unit)
-        if image is None or not show:
+            image = self._decode_next(unit, gap=unit.after_gap or left_out)
+        if image is None:
+            return None
+        if self._strict is not None:
+            self._on_whole(coded)
+        if not show:
             return None
         self._number += 1
         return Decoded(self._number, np.ascontiguousarray(image.to_ndarray(format="bgr24"), dtype=np.uint8))
@@ -220,13 +236,13 @@ class TelloVideo:
         self._strict, self._patching, self._units, self._damage = fresh, None, [data], 0
         return image
 
-    def _decode_next(self, unit: AccessUnit) -> av.VideoFrame | None:
-        if self._strict is not None and len(self._units) < MOST_UNITS and unit.whole and not unit.after_gap:
+    def _decode_next(self, unit: AccessUnit, *, gap: bool) -> av.VideoFrame | None:
+        if self._strict is not None and len(self._units) < MOST_UNITS and unit.whole and not gap:
             image = self._decode(self._strict, unit.data)
             if image is not None:
                 self._units.append(unit.data)
                 return image
-        noted = self._strict is not None or unit.after_gap or not unit.whole
+        noted = self._strict is not None or gap or not unit.whole
         if noted:
             self._note_damage()
         if self._patching is None:
@@ -240,7 +256,7 @@ class TelloVideo:
         """Patch from here on, or wait for a key if there is too much damage."""
         self.damaged += 1
         self._damage += 1
-        if self._damage > MOST_DAMAGED:
+        if self._damage > self._concealed:
             self._strict = self._patching = None
         elif self._strict is not None:
             self._strict, self._patching = None, new_decoder("h264", _PURPOSE, patch=True)
@@ -256,4 +272,6 @@ class TelloVideo:
             images = context.decode(av.Packet(data))
         except (av.error.FFmpegError, ValueError):
             return None
-        return images[-1] if images else None
+        # CABAC may end a damaged picture early without an error: FFmpeg fills the rest then, and says so.
+        concealed = images and images[-1].is_corrupt and context is not self._patching
+        return images[-1] if images and not concealed else None

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from skyloop.drivers.video.v4l2 import Ioctl, opened
+
 _CLASS: Final = Path("/sys/class/video4linux")
 _DEVICES: Final = Path("/dev")
 
@@ -51,6 +53,22 @@ def described(found: list[CameraDevice]) -> str:
     if not found:
         return "no camera is connected to this machine"
     return f"cameras of this machine: {', '.join(map(str, found))}"
+
+
+def listed(camera: CameraDevice, ioctl: Ioctl | None = None) -> list[str]:
+    """Return what a camera offers, in lines for people: its address, then formats, sizes, rates, exposure and gain.
+
+    Args:
+        camera: Of this machine.
+        ioctl: The kernel's call, as for :class:`V4l2Device`.
+    """
+    try:
+        with opened(str(camera.path), ioctl) as device:
+            told = [*map(str, device.formats()), *device.settings()]
+            lines = told if device.captures() else ["gives no pictures"]
+    except OSError as error:
+        lines = [f"can't be opened: {error.strerror or error}"]
+    return [str(camera), *(f"  {line}" for line in lines)]
 
 
 def _text(path: Path) -> str:

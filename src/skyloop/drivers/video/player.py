@@ -1,4 +1,4 @@
-"""Plays a source into a sink: recordings by their own stamps, devices as fast as they come."""
+"""Plays a recording into a sink, by its own stamps."""
 
 from __future__ import annotations
 
@@ -11,18 +11,15 @@ from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.stream_relay import CheckedRelay, StreamRelay
 from skyloop.drivers.video.sources import DecodedImage, Source
 from skyloop.errors import SkyloopError
 from skyloop.messages import EventKind, Feedback, Intrinsics, LinkState, Severity, Value
-from skyloop.wire.ardrone.pave import PaveFrame
 
 FEEDBACK_NS: Final = 50_000_000
 POLL_S: Final = 0.02
-RETRY_S: Final = 1.0
 BEHIND_NS: Final = 250_000_000  #: further behind than this, a schedule restarts instead of rushing to catch up
 GAP_S: Final = 2.0  #: a longer step between two stamps, or one backwards, is a cut in the recording
-LATE_NS: Final = 100_000_000  #: a live picture older than this is skipped for a newer one
 
 
 class FilePacer:
@@ -78,7 +75,8 @@ class CameraPublisher:
         self.stop = stop
         self._position_s = 0.0
         self._feedback_ns = 0
-        self._streaming = False  # pictures are handed on as they came
+        relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
+        self._relay = CheckedRelay(relay, sink, camera, "recording")
 
     @property
     def wanted(self) -> bool:
@@ -88,7 +86,7 @@ class CameraPublisher:
     @property
     def wanted_encoded(self) -> bool:
         """Whether somebody wants the images as they were encoded."""
-        return self.sink.wants_stream(self._camera)
+        return self._relay.wanted
 
     def wait_until(self, due_ns: int) -> bool:
         """Wait, and publish feedback meanwhile. Return False if the driver is being closed."""
@@ -113,49 +111,34 @@ class CameraPublisher:
         }
         self.sink.feedback(Feedback(captured_ns=now_ns, native=native))
 
-    def show(self, image: DecodedImage, due_ns: int | None, captured_ns: int) -> bool:
-        """Convert an image now and publish it when it is due.
+    def show(self, image: DecodedImage, due_ns: int) -> bool:
+        """Convert an image now and publish it when it is due, as captured then.
 
         Args:
             image: The image.
-            due_ns: When to publish it; None: at once.
-            captured_ns: Its capture time.
+            due_ns: When to publish it.
 
         Returns:
             False if the driver is being closed.
         """
         pixels = _bgr(image) if self.wanted else None
-        if due_ns is not None and not self.wait_until(due_ns):
+        if not self.wait_until(due_ns):
             return False
         self.shown += 1
         self._position_s = image.stamp_s
         if image.coded is not None:
-            self._publish_encoded(image.coded, captured_ns)
+            self._relay.take(image.coded, image.reason, due_ns, number=image.number, connection=self.loops)
         if pixels is not None:
             height, width = pixels.shape[:2]
             self.sink.frame(
                 self._camera,
                 pixels,
-                captured_ns,
+                due_ns,
                 width=width,
                 height=height,
                 intrinsics=self._intrinsics(width, height),
             )
         return not self.stop.is_set()
-
-    def _publish_encoded(self, coded: PaveFrame, captured_ns: int) -> None:
-        """Publish an image as it was encoded. Each builds on the one decoded before it, or is a key."""
-        self._streaming = self.wanted_encoded and (self._streaming or coded.is_key)
-        if self._streaming:
-            self.sink.stream(
-                self._camera,
-                coded.payload,
-                captured_ns,
-                width=coded.width,
-                height=coded.height,
-                key=coded.is_key,
-                intrinsics=self._intrinsics(coded.width, coded.height),
-            )
 
 
 class FilePlayer:
@@ -209,7 +192,7 @@ class FilePlayer:
         before = publisher.shown
         for image in source.images():
             due_ns = pacer.due_ns(image.stamp_s, monotonic_ns())
-            if not publisher.show(image, due_ns, due_ns):
+            if not publisher.show(image, due_ns):
                 return False
         if not publisher.wait_until(monotonic_ns() + nanoseconds(1.0 / source.fps / self._speed)):
             return False
@@ -224,61 +207,6 @@ class FilePlayer:
         if not self._loop:
             publisher.sink.link(LinkState.CLOSED, f"end of the recording after {publisher.shown} frames")
         return self._loop
-
-
-class LivePlayer:
-    """Shows a device's newest image, and tries for ever to open a device that is not there.
-
-    Args:
-        publisher: Publishes the images.
-        open_source: Opens the device.
-        retry_s: Between attempts.
-    """
-
-    def __init__(self, publisher: CameraPublisher, open_source: Callable[[], Source], retry_s: float = RETRY_S) -> None:
-        self._publisher = publisher
-        self._open = open_source
-        self._retry_s = retry_s
-
-    def run(self) -> None:
-        """Play until the driver is closed."""
-        publisher = self._publisher
-        reported = ""
-        while not publisher.stop.is_set():
-            try:
-                source = self._open()
-            except SkyloopError as error:
-                reason = str(error)
-            else:
-                reported = ""
-                try:
-                    if not publisher.stop.is_set():  # opening may take longer than the driver was open
-                        publisher.sink.link(LinkState.UP)
-                        self._play(source)
-                    reason = "the device ended its stream"
-                except SkyloopError as error:
-                    reason = str(error)
-                finally:
-                    source.close()
-            if publisher.stop.is_set():
-                return
-            if reason != reported:
-                publisher.sink.link(LinkState.LOST, reason)
-                reported = reason
-            publisher.stop.wait(self._retry_s)
-
-    def _play(self, source: Source) -> None:
-        clock = LiveClock()
-
-        def late(stamp_s: float) -> bool:
-            now_ns = monotonic_ns()
-            return now_ns - clock.captured_ns(stamp_s, now_ns) > LATE_NS
-
-        for image in source.images(late):
-            now_ns = monotonic_ns()
-            self._publisher.publish_state(now_ns)
-            if not self._publisher.show(image, None, clock.captured_ns(image.stamp_s, now_ns)):
-                return
 
 
 def _bgr(image: DecodedImage) -> NDArray[np.uint8]:

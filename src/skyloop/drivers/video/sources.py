@@ -1,4 +1,4 @@
-"""Where a video vehicle's pictures come from: files and devices that PyAV opens, and files of PaVE streams.
+"""Where a recording's pictures come from: files that PyAV opens, and files of PaVE streams.
 
 All open at construction, and raise :class:`skyloop.errors.UsageError` or :class:`FileFormatError` that name the file.
 """
@@ -6,15 +6,17 @@ All open at construction, and raise :class:`skyloop.errors.UsageError` or :class
 from __future__ import annotations
 
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
+from skyloop.drivers.live_container import Units
 from skyloop.drivers.pave_decoder import PaveDecoder, av, limit_memory
-from skyloop.errors import DriverError, FileFormatError, UsageError
+from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages.encoded import H264
 from skyloop.wire.ardrone.pave import Codec, PaveFrame, PaveParser
+from skyloop.wire.h264 import Unit
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -32,14 +34,13 @@ class DecodedImage:
 
     stamp_s: float
     frame: av.VideoFrame
-    coded: PaveFrame | None = None  #: what it was decoded from, if that is handed on as it came
-
-
-Late = Callable[[float], bool]
+    coded: Unit | None = None  #: what it was decoded from, if that is handed on as it came
+    number: int = 0  #: of what it was decoded from, in the stream
+    reason: str = ""  #: why what it was decoded from is not handed on, of a stream that is
 
 
 class Source(Protocol):
-    """One pass over a recording or a device's stream."""
+    """One pass over a recording."""
 
     width: int
     height: int
@@ -47,16 +48,8 @@ class Source(Protocol):
     damaged: int  #: pieces that could not be decoded so far
     stream: str  #: codec in which pictures can be had as they come, ``h264``, or empty
 
-    def images(self, late: Late | None = None) -> Iterator[DecodedImage]:
-        """Yield the pictures in order, until the stream ends.
-
-        Args:
-            late: Whether a picture of this stamp is too old to be shown. It is not decoded then, if no other picture
-                depends on it.
-
-        Raises:
-            DriverError: A device failed.
-        """
+    def images(self) -> Iterator[DecodedImage]:
+        """Yield the pictures in order, until the recording ends."""
 
     def close(self) -> None: ...
 
@@ -90,36 +83,19 @@ def open_file(path: Path) -> Source:
     return ContainerSource(str(path))
 
 
-def open_device(path: Path, options: dict[str, str]) -> Source:
-    """Open a camera of this machine (Video4Linux).
-
-    Args:
-        path: Such as ``/dev/video0``.
-        options: FFmpeg's, such as ``video_size``.
-
-    Raises:
-        DriverError: It is not there, or busy.
-    """
-    return ContainerSource(str(path), "v4l2", options, live=True)
-
-
 class ContainerSource:
-    """Anything that PyAV opens.
+    """A file, or files, that PyAV opens.
 
     Raises:
-        FileFormatError: A file can't be opened, or holds no video.
-        DriverError: A device can't be opened.
+        FileFormatError: It can't be opened, or holds no video.
     """
 
-    def __init__(
-        self, name: str, format_name: str | None = None, options: dict[str, str] | None = None, *, live: bool = False
-    ) -> None:
+    def __init__(self, name: str) -> None:
         self._name = name
-        self._live = live
         self.damaged = 0
         self.stream = ""
         try:
-            self._container: InputContainer = av.open(name, format=format_name, options=options or {})
+            self._container: InputContainer = av.open(name)
         except (FFmpegError, OSError, ValueError) as error:
             raise self._error("cannot be opened", error) from error
         videos = self._container.streams.video
@@ -128,21 +104,23 @@ class ContainerSource:
             raise FileFormatError(f"{name} holds no video stream")
         self._stream = videos[0]
         limit_memory(self._stream.codec_context)
-        if not live:
-            self._stream.thread_type = "AUTO"
+        self._stream.thread_type = "AUTO"
         self.width, self.height = self._stream.codec_context.width, self._stream.codec_context.height
         self.fps = float(self._stream.average_rate or self._stream.guessed_rate or DEFAULT_FPS)
         if not (self.width and self.height):
             self._container.close()
             raise FileFormatError(f"{name}: its frame size is missing: it is damaged or cut off")
+        self._units = Units(self._stream, self._stream.codec_context)
+        if not self._units.reason and not self._stream.codec_context.has_b_frames:
+            self.stream = H264
 
-    def images(self, late: Late | None = None) -> Iterator[DecodedImage]:
+    def images(self) -> Iterator[DecodedImage]:
         """See :meth:`Source.images`."""
-        independent = self._stream.codec_context.codec.intra_only
         stamp_s = -1.0 / self.fps
-        for packet in self._packets():
-            if late and independent and packet.pts is not None and late(float(packet.pts * packet.time_base)):
-                continue
+        coded: dict[int | None, tuple[int, Unit | None]] = {}  # by the stamp: decoders hold pictures back
+        for number, packet in enumerate(self._packets()):
+            if self.stream and packet.size:
+                coded[packet.pts] = number, self._units.of(packet)
             try:
                 images = packet.decode()
             except (FFmpegError, ValueError):  # a damaged packet; the decoder goes on with the next one
@@ -153,24 +131,21 @@ class ContainerSource:
                     self.damaged += 1
                     continue
                 stamp_s = image.time if image.time is not None else stamp_s + 1.0 / self.fps
-                yield DecodedImage(stamp_s, image)
+                at, unit = coded.pop(image.pts, (0, None))
+                yield DecodedImage(stamp_s, image, unit, at, self._units.reason if self.stream else "")
 
     def _packets(self) -> Iterator[av.Packet[av.VideoStream]]:
         try:
             yield from self._container.demux(self._stream)
-        except (FFmpegError, OSError, ValueError) as error:
-            if self._live:
-                raise self._error("stopped", error) from error
+        except (FFmpegError, OSError, ValueError):
             self.damaged += 1  # a file that was cut off: what came so far was good
 
     def close(self) -> None:
-        """Close the file or device."""
+        """Close the file."""
         self._container.close()
 
     def _error(self, what: str, error: Exception) -> Exception:
         cause = getattr(error, "strerror", None) or str(error)
-        if self._live:
-            return DriverError(f"{self._name} {what}: {cause}")
         return FileFormatError(f"{self._name} {what} as a video: {cause}")
 
 
@@ -198,16 +173,17 @@ class PaveSource:
         self.width, self.height, self.fps = first.width, first.height, DEFAULT_FPS
         self.stream = H264 if first.codec == Codec.MPEG4_AVC else ""
 
-    def images(self, late: Late | None = None) -> Iterator[DecodedImage]:  # noqa: ARG002  every frame needs the one before
+    def images(self) -> Iterator[DecodedImage]:
         """See :meth:`Source.images`. Every picture is decoded: each needs the one before."""
         decoder = PaveDecoder()
         for frame in self._parser_frames():
             image = decoder.decode(frame)
             self.damaged = decoder.damaged + self._parser.broken_frames
             if image is not None:
-                yield DecodedImage(
-                    frame.timestamp_ms / 1000.0, image, frame if frame.codec == Codec.MPEG4_AVC else None
-                )
+                unit = None
+                if frame.codec == Codec.MPEG4_AVC:
+                    unit = Unit(frame.payload, frame.is_key, frame.after_damage, frame.width, frame.height)
+                yield DecodedImage(frame.timestamp_ms / 1000.0, image, unit, frame.number)
 
     def close(self) -> None:
         """Close the file."""

@@ -22,6 +22,7 @@ LONG_WAIT_S: Final = 0.06  #: … and above which it falls
 MOST_WAIT_S: Final = 0.08  #: as much is under way, beside what the shortest round trip holds
 GROWTH_1_S: Final = 0.5  #: of the rate, each second …
 SEARCH_1_S: Final = 2.0  #: … and from the start, or an outage, up to the first long wait
+STANDING_S: Final = 0.1  #: the shortest wait within so long is judged: only a queue that stays is ours
 LOST_S: Final = 1.0  #: what is not acknowledged for so long is taken for lost
 SHORTEST_S: Final = 10.0  #: how long a shortest round trip counts
 _MEAN_S: Final = 0.5  # time over which the delivery is averaged
@@ -57,6 +58,7 @@ class StreamRate:
         self._capacity_kbit_s = self.kbit_s  # as delivered, averaged
         self._shortest: deque[tuple[int, int]] = deque()  # round trips [ns] and when, each longer than those before it
         self._changed_ns = now_ns
+        self._waits: deque[tuple[float, int]] = deque()  # [s], and when
 
     def may_send(self, now_ns: int) -> bool:
         """Return whether another picture may be begun now."""
@@ -106,7 +108,11 @@ class StreamRate:
         self._delivered_ns = now_ns
         trip_ns = now_ns - newest.sent_ns
         self._add_trip(trip_ns, now_ns)
-        self.wait_s = seconds(trip_ns - self._least_ns())
+        waits = self._waits
+        waits.append((seconds(trip_ns - self._least_ns()), now_ns))
+        while now_ns - waits[0][1] > nanoseconds(STANDING_S):
+            waits.popleft()
+        self.wait_s = min(wait_s for wait_s, _ in waits)
         passed_s = max(seconds(now_ns - newest.delivered_ns), 0.001)
         delivered_kbit_s = (self._delivered - newest.delivered) * 8e-3 / passed_s
         step_s = min(seconds(now_ns - self._changed_ns), 0.2)
@@ -118,6 +124,7 @@ class StreamRate:
             self._capacity_kbit_s = max(self._capacity_kbit_s, delivered_kbit_s, self.kbit_s)
         if self.wait_s > LONG_WAIT_S:
             self.kbit_s = min(self.kbit_s, 0.85 * self._capacity_kbit_s)
+            waits.clear()  # and look again
             self._growth_1_s = GROWTH_1_S
         elif self.wait_s < GOOD_WAIT_S:
             self.kbit_s *= 1.0 + self._growth_1_s * step_s

@@ -27,7 +27,7 @@ from skyloop.transport.fabric.discovery import proxy_reached, renew
 from skyloop.transport.fabric.joining import ProxyWatch, join
 from skyloop.transport.fabric.sealing import contents
 from skyloop.transport.fabric.session import Session, acquire, load, release, retire, undeclare
-from skyloop.transport.fabric.settings import FabricSettings
+from skyloop.transport.fabric.settings import LEASE_S, FabricSettings
 from skyloop.transport.fabric.subscription import Subscription
 
 if TYPE_CHECKING:
@@ -136,6 +136,8 @@ class FabricClient(TransportClient):
         self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # with what was declared for each
         self._command: zenoh.Publisher | None = None
         self._command_key = layout.upward(layout.COMMAND, name, self._who, self._id)
+        self._report: zenoh.Publisher | None = None
+        self._report_key = layout.upward(layout.ASK, name, self._who, self._id)
         self._ring = session.settings.ring
         self._pause_s = None if self._ring is None else KEYS_S
         self._keys_s = 0.0  # when the keys are checked next
@@ -197,6 +199,8 @@ class FabricClient(TransportClient):
                 return answer is not None
             if way == layout.COMMAND:
                 return self._send_command(packet)
+            if layout.is_report(packet):
+                return self._send_report(packet)
             return self._keep(way, packet)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
@@ -237,23 +241,39 @@ class FabricClient(TransportClient):
         return True
 
     @property
+    def excused_s(self) -> float:
+        return self._session.settings.lease_s - LEASE_S
+
+    @property
     def address(self) -> str:
         return self._address
 
     def _send_command(self, packet: bytes) -> bool:
-        z = load()
         if self._command is None:
-            self._command = self._session.zenoh.declare_publisher(
-                self._command_key,
-                congestion_control=z.CongestionControl.DROP,
-                priority=z.Priority.REAL_TIME,
-                reliability=z.Reliability.BEST_EFFORT,
-                express=True,
-            )
-        payload, attachment = self._admission.sealer.seal(self._command_key, _UNNUMBERED, packet)
+            self._command = self._best_effort(self._command_key, load().Priority.REAL_TIME)
+        return self._send_once(self._command, self._command_key, packet)
+
+    def _send_report(self, packet: bytes) -> bool:
+        if self._report is None:
+            self._report = self._best_effort(self._report_key, load().Priority.DATA_HIGH)
+        return self._send_once(self._report, self._report_key, packet)
+
+    def _best_effort(self, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
+        z = load()
+        return self._session.zenoh.declare_publisher(
+            key,
+            congestion_control=z.CongestionControl.DROP,
+            priority=priority,
+            reliability=z.Reliability.BEST_EFFORT,
+            express=True,
+        )
+
+    def _send_once(self, publisher: zenoh.Publisher, key: str, packet: bytes) -> bool:
+        """Send a packet that may be lost, and that nothing waits for."""
+        payload, attachment = self._admission.sealer.seal(key, _UNNUMBERED, packet)
         try:
-            self._command.put(payload, attachment=attachment)
-        except z.ZError:
+            publisher.put(payload, attachment=attachment)
+        except load().ZError:
             return False
         return True
 
@@ -394,8 +414,7 @@ class FabricClient(TransportClient):
         for _, declared in self._subscriptions.values():
             held += declared
         self._subscriptions = {}
-        if self._command is not None:
-            held.append(self._command)
+        held += [publisher for publisher in (self._command, self._report) if publisher is not None]
         undeclare(held)
 
     # --- the receiving thread ---

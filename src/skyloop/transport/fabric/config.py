@@ -12,8 +12,6 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.transport.fabric.settings import FabricSettings
 
 DEFAULT_PORT: Final = 7447  #: Zenoh's
-#: Without a sign of life for this long a peer is gone.
-LEASE_MS: Final = 700
 #: An address that does not answer for so long is given up, and the next one of the same peer is tried.
 OPEN_MS: Final = 800
 MAX_MESSAGE: Final = 1 << 27  #: bytes of one frame that are taken from others
@@ -37,9 +35,6 @@ KEEP_ALIVES: Final = 8
 #: Messages that wait to be sent, by priority (Zenoh's most). Its default is 2, and what comes then is dropped within a
 #: millisecond: ten drones of one process report the same event in the same moment.
 _QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
-#: A neighbour that takes none of Zenoh's own declarations for so long is cut off [µs]; one of Zenoh's few receiving
-#: threads waits for it meanwhile. All else is dropped when a link is congested.
-BLOCKED_US: Final = LEASE_MS * 1000
 #: Whatever a neighbour asks for: who does not read holds up nobody, neither here nor through a router. An answer is
 #: sent as its question came.
 _NOBODY_WAITS: Final = {
@@ -66,6 +61,10 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
     """
     endpoints = list(listen) or endpoints_of(settings.listen, settings)
     connect = endpoints_of(settings.connect, settings)
+    lease_ms = round(settings.lease_s * 1000)
+    # A neighbour that takes none of Zenoh's own declarations for as long is cut off; one of Zenoh's few receiving
+    # threads waits for it meanwhile. All else is dropped when a link is congested.
+    blocked_us = lease_ms * 1000
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
     found: dict[str, Any] = {
         "mode": "router" if part is Part.ROUTER else "peer",
@@ -80,9 +79,9 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
             "link": {
                 "protocols": _protocols([*endpoints, *connect], settings),
                 "tx": {
-                    "lease": LEASE_MS,
+                    "lease": lease_ms,
                     "keep_alive": KEEP_ALIVES,
-                    "queue": {"size": _QUEUES, "congestion_control": {"block": {"wait_before_close": BLOCKED_US}}},
+                    "queue": {"size": _QUEUES, "congestion_control": {"block": {"wait_before_close": blocked_us}}},
                 },
                 "rx": {"max_message_size": MAX_MESSAGE_UP if part is Part.PROXY else MAX_MESSAGE},
             },

@@ -9,12 +9,13 @@ from typing import Final
 
 from skyloop.errors import Hint, UsageError
 from skyloop.transport.fabric import config
-from skyloop.transport.fabric.settings import FabricSettings, secured
+from skyloop.transport.fabric.settings import LEASE_S, MAX_LEASE_S, FabricSettings, secured
 
 _log = logging.getLogger(__name__)
 
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
+LEASE_VARIABLE: Final = "SKYLOOP_LEASE_S"
 MULTICAST: Final = "multicast"
 _ON: Final = frozenset({MULTICAST, "on", "1", "true", "yes"})
 _OFF: Final = frozenset({"", "off", "0", "false", "no"})
@@ -35,7 +36,7 @@ def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> Fab
         keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
 
     Raises:
-        UsageError: An address or the folder is not valid.
+        UsageError: An address, the folder or the variable ``SKYLOOP_LEASE_S`` is not valid.
     """
     found = _choose(network, keys)
     if found is not None and found.ring is not None:
@@ -106,10 +107,19 @@ def settings(
     Raises:
         UsageError: An address or the folder is not valid.
     """
-    found = FabricSettings(listen=listen, connect=connect, multicast=multicast)
+    found = FabricSettings(listen=listen, connect=connect, multicast=multicast, lease_s=_lease_s())
     config.endpoints_of((*listen, *connect), found)  # says what is wrong with an address before anything is opened
     folder = keys or os.environ.get(KEYS_VARIABLE) or None
     return found if folder is None else secure(found, folder)
+
+
+def _lease_s() -> float:
+    """Return the lease that the environment asks for [s]. Raises :class:`UsageError`."""
+    text = os.environ.get(LEASE_VARIABLE) or f"{LEASE_S:g}"
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"{LEASE_VARIABLE} is {text!r} and must be {LEASE_S:g} to {MAX_LEASE_S:g} seconds") from None
 
 
 def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:

@@ -27,6 +27,7 @@ from skyloop.messages import (
     Refused,
     Reply,
     Request,
+    StreamReport,
     VehiclePose,
     decode,
     encode,
@@ -53,6 +54,7 @@ ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinPr
 _RANK: Final = {ASK: 0, ORDER: 1, COMMAND: 2}
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
+_REPORT: Final = encode(StreamReport("", 0))[:6]  # all of the head, as garbage keeps its order
 _POSE: Final = bytes([KINDS[VehiclePose]])  # a vehicle may fly by it
 
 
@@ -188,6 +190,11 @@ def way_of(packet: bytes) -> str:
     except DecodeError:
         return ASK
     return ASK if isinstance(request, Request) and isinstance(request.body, ASKED) else ORDER
+
+
+def is_report(packet: bytes) -> bool:
+    """Return whether a packet reports what came of a stream: it may be lost, and one that is late tells the wrong."""
+    return packet[:6] == _REPORT
 
 
 def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:

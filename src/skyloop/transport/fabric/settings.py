@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import LinkError, UsageError
 from skyloop.transport.fabric.layout import ANYONE, check_identity
 
 if TYPE_CHECKING:
     from skyloop.keys import Credentials, Identity, KeyRing
+
+LEASE_S: Final = 0.7  #: without a sign of life for so long a peer is gone, if it asks for nothing else
+MAX_LEASE_S: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +34,16 @@ class FabricSettings:
     QUIC. An address may also be a whole Zenoh endpoint, ``tcp/10.0.0.5:7447``, which is used as it is.
 
     Raises:
-        UsageError: The identity is not valid, or is given without its certificate and key.
+        UsageError: The identity is not valid, or is given without its certificate and key; or the lease is none.
     """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     multicast: bool = True  #: search, and be found, by UDP multicast on the network segments of this host
     tls: TlsFiles | None = None
+    #: A link counts as lost when nothing came by it for so long [s], by the others as they are told, and by an
+    #: application 0.3 s later. A mobile network is silent for seconds, and what was lost takes another to come back.
+    lease_s: float = LEASE_S
     who: str = ANYONE  #: the identity: the common name of the certificate
     #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), None for none.
     access_control: dict[str, Any] | None = None
@@ -73,6 +79,8 @@ class FabricSettings:
 
     def __post_init__(self) -> None:
         check_identity(self.who)
+        if not LEASE_S <= self.lease_s <= MAX_LEASE_S:
+            raise UsageError(f"the lease is {self.lease_s!r} and must be {LEASE_S:g} to {MAX_LEASE_S:g} seconds")
         if self.tls is None and self.who != ANYONE:
             raise UsageError(f"the identity {self.who!r} needs its certificate and key")
 

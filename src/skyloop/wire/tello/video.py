@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.errors import DecodeError
-from skyloop.wire.tello.h264 import IDR, PPS, SLICE, SPS, START, Sequence, Slice, parse_sequence, parse_slice
-from skyloop.wire.tello.h264 import unit_type as type_of
-from skyloop.wire.tello.h264 import units as units_of
+from skyloop.wire.h264 import IDR, PPS, SLICE, SPS, START, Sequence, Slice, missing_between, parse_sequence, parse_slice
+from skyloop.wire.h264 import unit_type as type_of
+from skyloop.wire.h264 import units as units_of
 
 PIECE: Final = 1460  #: bytes of every datagram of a picture but its last
 MAX_PICTURE: Final = 1 << 19  #: bytes; real ones have a fiftieth of that
@@ -28,6 +28,9 @@ class AccessUnit:
     arrived_ns: int  #: when its first piece came
     after_gap: bool  #: a picture before it is known to be missing or damaged
     whole: bool  #: nothing shows that a piece of its own is missing
+    number: int = 0  #: counts the pictures that came
+    width: int = 0  #: by the newest parameters [px]; 0 before the first
+    height: int = 0
 
 
 def pieces(picture: bytes) -> list[bytes]:
@@ -51,6 +54,7 @@ class Assembly:
         self._sequence: Sequence | None = None
         self._before: Slice | None = None
         self._gap = True  # since the last picture that was given out
+        self._count = 0
 
     def feed(self, piece: bytes, now_ns: int) -> list[AccessUnit]:
         """A datagram that came now; the pictures that are complete with it, at most two."""
@@ -97,8 +101,10 @@ class Assembly:
         data = b"".join(self._pieces)
         self._pieces, self._size = [], 0
         is_key = IDR in kinds and {SPS, PPS} <= kinds
-        made = AccessUnit(data, is_key, self._arrived_ns, self._gap or gap, whole)
+        size = (0, 0) if self._sequence is None else (self._sequence.width, self._sequence.height)
+        made = AccessUnit(data, is_key, self._arrived_ns, self._gap or gap, whole, self._count, *size)
         self._gap = False
+        self._count += 1
         return [made]
 
     def _is_gap(self, head: list[bytes]) -> bool:
@@ -116,7 +122,6 @@ class Assembly:
         before, self._before = self._before, now
         if now.is_key or before is None:
             return False
-        turns = 1 << self._sequence.frame_number_bits
-        skipped = (now.frame_number - before.frame_number - before.is_reference) % turns
-        self.missing += min(skipped, turns // 2)
+        skipped = missing_between(before, now, self._sequence)
+        self.missing += min(skipped, 1 << self._sequence.frame_number_bits - 1)
         return skipped != 0 or not now.is_first

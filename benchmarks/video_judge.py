@@ -1,0 +1,37 @@
+"""How good the pictures are that arrive, in any contender's application. Needs NumPy alone."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from benchmarks.moving_scene import MovingScene, psnr_db
+from skyloop.bench.contract import Image, Received
+from skyloop.bench.schedule import MIDDLE
+
+SIZE: Final = MIDDLE  #: of the camera's pictures
+JUDGED: Final = 10  #: the quality of one picture in so many is measured
+QUALITY: Final = "quality "  #: and told as a channel for each decibel
+
+
+class Judge:
+    """Measures how good some of the pictures are.
+
+    Args:
+        received: Told of each.
+    """
+
+    def __init__(self, received: Received) -> None:
+        self._received = received
+        self._scene = MovingScene(SIZE)
+        self._count = 0
+
+    def look(self, image: Image, stamp_ns: int) -> None:
+        """Look at a picture, after it counted as shown."""
+        self._count += 1
+        if self._count % JUDGED:
+            return
+        if image.shape[1] != SIZE.width:
+            import cv2
+
+            image = cv2.resize(image, (SIZE.width, SIZE.height), interpolation=cv2.INTER_LINEAR)  # type: ignore[assignment]
+        self._received(f"{QUALITY}{psnr_db(image, self._scene.picture(stamp_ns)):.0f}", stamp_ns)

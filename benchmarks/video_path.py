@@ -1,0 +1,272 @@
+"""``python -m benchmarks.video_path``: video over the uplinks of mobile networks, replayed between two hosts."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path as File
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from benchmarks.hosts.impairments import Impairments
+from benchmarks.hosts.namespaces import Host, Lab
+from benchmarks.hosts.path import Path
+from benchmarks.hosts.traces import Trace
+from benchmarks.over_path import FORMS, FPS, address
+from benchmarks.video_judge import QUALITY, SIZE
+from skyloop.bench.contract import Arrivals
+from skyloop.bench.machine import Machine
+from skyloop.bench.pair import Pair
+from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO, Turn, sleep_until
+from skyloop.bench.tables import UNKNOWN, Table
+from skyloop.bench.workers import Workers
+from skyloop.files import MAX_RESULTS, read_json
+
+WEBRTC: Final = "WebRTC (aiortc)"
+CONTENDERS: Final = (*FORMS, WEBRTC)
+PYTHON_VARIABLE: Final = "SKYLOOP_AIORTC_PYTHON"
+DELAY_S: Final = 0.02  #: each way, besides the wait for the path
+GOOD_KBIT_S: Final = 300.0  #: the path is judged in the seconds of a trace that carry as much
+FROZEN_MS: Final = 250.0 + 1000.0 / FPS  #: the picture is frozen while the newest that was shown is older
+_PATH: Final = Impairments(delay_s=DELAY_S)
+_SEED: Final = 8
+_SECOND_MS: Final = 1000
+_STEP_MS: Final = 5.0
+_PORT: Final = 7447
+_LOOKS_WITHIN_S: Final = 30.0
+
+Progress = Callable[[float, str], None]
+
+
+class Ages(msgspec.Struct, frozen=True):
+    """Ages of what arrived while the path carried enough [ms]."""
+
+    p50: float
+    p95: float
+    p99: float
+
+
+class PathCase(msgspec.Struct, frozen=True):
+    """One contender on one trace."""
+
+    trace: str
+    contender: str
+    carried_kbit_s: float  #: by the path, on average over all the time
+    sent_kbit_s: float  #: of it that were used by all that the vehicle sent
+    good_share: float  #: of the time, in which the path carried enough; the following is of that time
+    video: Ages | None  #: age of each picture when the application has it; None: there was none
+    frozen_share: float | None
+    unavoidable_share: float  #: in which nobody could have shown a picture that is not frozen
+    pictures_per_s: float
+    psnr_db: float | None
+    feedback: Ages | None
+    command: Ages | None
+    commands_share: float  #: of those sent at any time that were executed
+    shown: list[tuple[int, int]] = []  #: of each picture: when it came [ms], and how old it was; of one trace only
+
+
+class VideoPath(msgspec.Struct, frozen=True, tag_field="what", tag="video_path"):
+    """A whole run, as in ``video_path.json``. ``seconds``: how long each case was measured."""
+
+    machine: Machine
+    seconds: float
+    cases: list[PathCase]
+    skipped: dict[str, str] = {}
+
+
+def aiortc_python() -> tuple[str, str]:
+    """Return the interpreter that has aiortc, and why there is none; one of the two is empty."""
+    python = os.environ.get(PYTHON_VARIABLE) or sys.executable
+    try:
+        ended = subprocess.run(
+            [python, "-c", "import aiortc, numpy"], capture_output=True, text=True, timeout=_LOOKS_WITHIN_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return "", f"{python} does not run ({type(error).__name__})"
+    if ended.returncode:
+        why = (ended.stderr.strip().splitlines() or ["it can't be imported"])[-1]
+        return "", f"{why}: pip install aiortc numpy, in an environment whose interpreter {PYTHON_VARIABLE} names"
+    return python, ""
+
+
+def measure(
+    seconds: float,
+    traces: Iterable[Trace],
+    contenders: Sequence[str] = CONTENDERS,
+    progress: Progress = lambda _share, _what: None,
+) -> VideoPath:
+    """Measure each contender on each trace.
+
+    Args:
+        seconds: How long each case is measured, from the beginning of the trace [s].
+        traces: What the way to the pilot carries.
+        contenders: Of :data:`CONTENDERS`.
+        progress: Called with the share that is done, 0 to 1, and what comes next.
+
+    Raises:
+        UnsupportedError: No hosts can be made here.
+    """
+    machine, skipped, cases = Machine.here(), {}, []
+    python, why = aiortc_python() if WEBRTC in contenders else ("", "")
+    if why:
+        skipped[WEBRTC] = why
+    wanted = [(trace, contender) for trace in traces for contender in contenders if contender not in skipped]
+    for index, (trace, contender) in enumerate(wanted):
+        progress(index / len(wanted), f"{trace.name}, {contender}")
+        with Lab() as lab, Workers() as workers:  # a lab for each: WebRTC takes whichever path there is
+            hosts = lab.host("vehicle"), lab.host("pilot")
+            case = _Stage(lab, workers, hosts, contender, python).play(trace, seconds)
+        if trace.name != wanted[0][0].name:
+            case = msgspec.structs.replace(case, shown=[])
+        cases.append(case)
+    return VideoPath(machine, seconds, cases, skipped)
+
+
+class _Stage:
+    """A path, and both ends of one contender."""
+
+    def __init__(self, lab: Lab, workers: Workers, hosts: tuple[Host, Host], contender: str, python: str) -> None:
+        self._path = Path(lab, *hosts, seed=_SEED, impairments=_PATH)
+        self._contender = contender
+        place = f"{self._path.first}:{_PORT}"
+        prefixes = (hosts[0].prefix, hosts[1].prefix)
+        if contender == WEBRTC:
+            self._pair = Pair(workers, "benchmarks.peers.webrtc", place, python=python, prefixes=prefixes)
+        else:
+            self._pair = Pair(workers, "benchmarks.over_path", address(contender, place), prefixes=prefixes)
+
+    def play(self, trace: Trace, seconds: float) -> PathCase:
+        """They connect before the trace begins, and part after its end."""
+        turn = Turn(0, seconds, SIZE, 1.0 / FPS)
+        self._pair.open(turn)
+        begin_ns = self._pair.begin()
+        sleep_until(begin_ns)
+        self._path.tell()
+        self._path.set(replace(_PATH, trace=replace(trace, begin_ns=begin_ns)), _PATH)
+        sleep_until(begin_ns + round(seconds * 1e9))
+        there, _ = self._path.tell()
+        self._path.set(_PATH)
+        arrivals = self._pair.arrivals(turn, begin_ns)
+        return judge(self._contender, trace, seconds, begin_ns, arrivals, there.size)
+
+
+def judge(contender: str, trace: Trace, seconds: float, begin_ns: int, arrivals: Arrivals, sent_bytes: int) -> PathCase:
+    """Make the figures of what arrived. Pure.
+
+    Args:
+        contender: Its name.
+        trace: What the path carried.
+        seconds: For how long [s].
+        begin_ns: When it began.
+        arrivals: When what was sent and received, by channel [ns].
+        sent_bytes: Bytes that passed the path to the pilot.
+    """
+    good = [
+        trace.kbit(begin, begin + _SECOND_MS) >= GOOD_KBIT_S
+        for begin in range(0, int(seconds * _SECOND_MS), _SECOND_MS)
+    ]
+    shown = _newest_first(arrivals.get(VIDEO, []), begin_ns, seconds)
+    in_time = [age for at, age in shown if good[int(at // _SECOND_MS)]]
+    qualities = [(float(name.removeprefix(QUALITY)), pairs) for name, pairs in arrivals.items() if QUALITY in name]
+    judged = sum(len(pairs) for _, pairs in qualities)
+    steps = [ms for ms in np.arange(0.0, seconds * _SECOND_MS, _STEP_MS) if good[int(ms // _SECOND_MS)]]
+    commands, delay_ms = arrivals.get(COMMAND, []), DELAY_S * 1e3
+    return PathCase(
+        trace=trace.name,
+        contender=contender,
+        carried_kbit_s=trace.kbit(0, seconds * _SECOND_MS) / seconds,
+        sent_kbit_s=sent_bytes * 8e-3 / seconds,
+        good_share=sum(good) / len(good),
+        video=_ages(in_time),
+        frozen_share=_frozen(shown, steps) if in_time else None,
+        unavoidable_share=float(np.mean([trace.waits_ms(ms - delay_ms) + delay_ms > FROZEN_MS for ms in steps])),
+        pictures_per_s=len(in_time) / max(1, sum(good)),
+        psnr_db=sum(decibel * len(pairs) for decibel, pairs in qualities) / judged if judged else None,
+        feedback=_ages(_in_good(arrivals.get(FEEDBACK, []), good, begin_ns)),
+        command=_ages(_in_good(commands, good, begin_ns)),
+        commands_share=len(commands) / Turn(0, seconds).count(COMMAND),
+        shown=[(round(at), round(age)) for at, age in shown],
+    )
+
+
+def _newest_first(pairs: list[tuple[int, int]], begin_ns: int, seconds: float) -> list[tuple[float, float]]:
+    """Return when each picture came, from the begin [ms], and how old it was; none that was overtaken."""
+    found, newest_ns = [], -1
+    for sent_ns, received_ns in sorted(pairs, key=lambda pair: pair[1]):
+        at_ms = (received_ns - begin_ns) / 1e6
+        if sent_ns > newest_ns and at_ms < seconds * _SECOND_MS:
+            newest_ns = sent_ns
+            found.append((at_ms, (received_ns - sent_ns) / 1e6))
+    return found
+
+
+def _in_good(pairs: list[tuple[int, int]], good: Sequence[bool], begin_ns: int) -> list[float]:
+    """Return the ages of what came while the path carried enough [ms]."""
+    found = []
+    for sent_ns, received_ns in pairs:
+        second = int((received_ns - begin_ns) / 1e6 // _SECOND_MS)
+        if second < len(good) and good[second]:
+            found.append((received_ns - sent_ns) / 1e6)
+    return found
+
+
+def _ages(ages_ms: list[float]) -> Ages | None:
+    return Ages(*(float(value) for value in np.percentile(ages_ms, [50, 95, 99]))) if ages_ms else None
+
+
+def _frozen(shown: list[tuple[float, float]], steps: list[float]) -> float:
+    """Return the share of the steps at which the newest picture shown is too old."""
+    came = np.array([at for at, _ in shown])
+    captured = np.array([at - age for at, age in shown])
+    index = np.searchsorted(came, steps, side="right") - 1
+    ages = np.where(index >= 0, np.asarray(steps) - captured[np.maximum(index, 0)], np.inf)
+    return float(np.mean(ages > FROZEN_MS))
+
+
+def table(results: VideoPath) -> Table:
+    """Return all figures."""
+    rows = []
+    for case in results.cases:
+        rows.append(
+            [
+                case.trace,
+                case.contender,
+                _three(case.video),
+                UNKNOWN if case.frozen_share is None else f"{case.frozen_share:.1%} ({case.unavoidable_share:.1%})",
+                f"{case.pictures_per_s:.1f}",
+                f"{case.sent_kbit_s:.0f} / {case.carried_kbit_s:.0f}",
+                UNKNOWN if case.psnr_db is None else f"{case.psnr_db:.0f}",
+                _three(case.feedback),
+                _three(case.command),
+                f"{case.commands_share:.1%}",
+            ]
+        )
+    columns = [
+        *("uplink", "video", "its age", "frozen (unavoidably)", "pictures a second", "kbit/s used / carried"),
+        *("PSNR in dB", "age of feedback", "age of commands", "executed"),
+    ]
+    return Table("Ages in ms: median, 95th and 99th percentile, while the uplink carries 300 kbit/s", columns, rows)
+
+
+def _three(ages: Ages | None) -> str:
+    return UNKNOWN if ages is None else f"{ages.p50:.0f}, {ages.p95:.0f}, {ages.p99:.0f}"
+
+
+def load(path: File) -> VideoPath:
+    """Read ``video_path.json``.
+
+    Raises:
+        FileFormatError: It is anything else.
+    """
+    return read_json(path, VideoPath, "the results of benchmarks.video_path", MAX_RESULTS)
+
+
+if __name__ == "__main__":
+    from benchmarks.command import main
+
+    main("video_path")

@@ -1,0 +1,243 @@
+"""One camera as H.264 on one page: in which form it gets it, and which of the pictures. On the event loop.
+
+Pages that keep up share a form. One whose acknowledgements come late gets a stream of its own, whose rate and size
+follow the path to this page, until all was quiet for a while.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.cockpit.broadcast import Wake
+from skyloop.cockpit.encoded_feed import EncodedFeed, Form, NumberedPicture, form_for
+from skyloop.errors import SkyloopError
+from skyloop.messages import CameraInfo, EncodedFrame
+
+if TYPE_CHECKING:
+    from skyloop.cockpit.station import Station
+
+LATE_S: Final = 0.25  #: a picture that takes longer to be acknowledged is late
+FALLS_BEHIND_S: Final = 1.0  #: a page of which all have been late for so long gets a stream of its own
+QUIET_S: Final = 10.0  #: with nothing late for so long it shares one again; twice as long after each relapse
+MOST_QUIET_S: Final = 160.0
+SILENT_S: Final = 3.0  #: a form of which nothing comes for so long is not to be had
+RETRY_S: Final = 10.0  #: after so long it is tried again, the next time after twice as long …
+MOST_RETRY_S: Final = 300.0  #: … up to this: a proxy that refuses it says so each time
+MOST_UNDER_WAY: Final = 8  #: pictures that were sent and not acknowledged
+MOST_BYTES: Final = 1_000_000  #: of these, unless one alone has more
+
+
+class PagePath:
+    """Judges whether a page keeps up, by what it acknowledges. Pure: the time is an argument."""
+
+    def __init__(self) -> None:
+        self.behind = False  #: it needs less than what others get
+        self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, when it was sent
+        self._trip_s = 0.0  # of the newest acknowledged
+        self._changed_ns: int | None = None  # since when all are late, or none is
+        self._was_late = False
+        self._quiet_s = QUIET_S
+        self._back_ns: int | None = None
+
+    @property
+    def free(self) -> bool:
+        """Whether another picture may be sent."""
+        waiting = self._under_way
+        return len(waiting) < MOST_UNDER_WAY and (not waiting or sum(size for _, size, _ in waiting) < MOST_BYTES)
+
+    @property
+    def waiting(self) -> int:
+        """How many pictures are under way."""
+        return len(self._under_way)
+
+    def sent(self, number: int, size: int, now_ns: int) -> None:
+        """Note a picture, with its bytes."""
+        self._under_way.append((number, size, now_ns))
+
+    def acknowledged(self, number: int, now_ns: int) -> int:
+        """Note that the page has a picture, and all before it; return how many that were new."""
+        count = 0
+        while self._under_way and self._under_way[0][0] <= number:
+            self._trip_s = seconds(now_ns - self._under_way.popleft()[2])
+            count += 1
+        return count
+
+    def update(self, now_ns: int, extra_s: float = 0.0) -> bool:
+        """Judge anew; return whether the page is behind.
+
+        Args:
+            now_ns: The present time.
+            extra_s: How long pictures take up to here [s].
+        """
+        oldest_s = seconds(now_ns - self._under_way[0][2]) if self._under_way else 0.0
+        late = max(oldest_s, self._trip_s, extra_s) > LATE_S
+        if self._changed_ns is None or late != self._was_late:
+            self._changed_ns, self._was_late = now_ns, late
+        lasts_s = seconds(now_ns - self._changed_ns)
+        if late and not self.behind and lasts_s >= FALLS_BEHIND_S:
+            relapse = self._back_ns is not None and seconds(now_ns - self._back_ns) < 2.0 * self._quiet_s
+            self._quiet_s = min(2.0 * self._quiet_s, MOST_QUIET_S) if relapse else QUIET_S
+            self.behind, self._changed_ns = True, now_ns
+        elif self.behind and not late and lasts_s >= self._quiet_s:
+            self.behind, self._back_ns, self._changed_ns = False, now_ns, now_ns
+        return self.behind
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """A picture that a page is to get."""
+
+    serial: int
+    picture: EncodedFrame
+    form: Form
+    age_s: float
+
+
+class PageStream:
+    """One camera for one page.
+
+    Args:
+        station: The drone.
+        camera: The camera.
+        width: Of the pane [device pixels]; 0: full size.
+        max_fps: Most pictures a second; None: all.
+        wake: Called on the event loop for each picture; None: the page looks by itself.
+        clock: The monotonic clock [ns].
+    """
+
+    def __init__(
+        self,
+        station: Station,
+        camera: CameraInfo,
+        width: int,
+        max_fps: float | None,
+        wake: Wake | None,
+        clock: Clock = monotonic_ns,
+    ) -> None:
+        self.path = PagePath()
+        self.skipped = 0  #: pictures that were not sent, as the page could not have decoded them
+        self._station = station
+        self._camera = camera
+        self._width = width
+        self._max_fps = max_fps
+        self._wake = wake
+        self._clock = clock
+        self._name = ""  # of the stream of its own, while it has one
+        self._feed: EncodedFeed | None = None
+        self._next: EncodedFeed | None = None  # takes the place of it with its first key picture
+        self._serial = 0  # of the picture sent last
+        self._follows = True  # the page can decode the one after it
+        self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # of messages, with the newest picture in each
+        self._late_s = 0.0  # of the newest picture when it came here
+        self._missed = 0  # pictures before those that are ready
+        self._refused_ns: int | None = None
+        self._retry_s = RETRY_S
+
+    @property
+    def shows(self) -> bool:
+        """Whether the page is shown it: as long as it is not, other pictures are of use."""
+        return self._feed is not None
+
+    def resize(self, width: int) -> None:
+        """Note that the pane has another width [device pixels] now."""
+        self._width = width
+
+    def take(self) -> list[Sent]:
+        """Return the pictures to send now, in order: they are taken as sent. :meth:`sent` says under which number."""
+        self._choose()
+        if self._next is not None and self._ready(self._next, 0):
+            self._release(self._feed)
+            self._feed, self._next, self._serial = self._next, None, 0
+            self._refused_ns, self._retry_s = None, RETRY_S
+        feed = self._feed
+        if feed is None or not self.path.free:
+            return []
+        pictures, skipped = self._ready(feed, self._serial), self._missed
+        pictures = pictures[: MOST_UNDER_WAY - self.path.waiting]
+        if not pictures:
+            return []
+        if self._serial:
+            self.skipped += skipped
+        self._serial, self._follows = pictures[-1].serial, True
+        now_ns = self._clock() + self._station.drone.clock_offset_ns
+        self._late_s = seconds(now_ns - pictures[-1].picture.published_ns)
+        return [Sent(one.serial, one.picture, feed.form, seconds(now_ns - one.picture.captured_ns)) for one in pictures]
+
+    def sent(self, number: int, one: Sent) -> None:
+        """Note under which number a picture that was taken is sent."""
+        if self._feed is not None:
+            self._numbers.append((number, self._feed, one.picture.seq))
+            self.path.sent(number, len(one.picture.data), self._clock())
+
+    def acknowledged(self, number: int) -> int:
+        """Handle what the page has drawn, or left out; return how many pictures that were new."""
+        newest = None
+        while self._numbers and self._numbers[0][0] <= number:
+            newest = self._numbers.popleft()
+        if newest is not None:
+            newest[1].acknowledge(newest[2])
+        return self.path.acknowledged(number, self._clock())
+
+    def restart(self) -> None:
+        """The page can't decode what comes next: go on with a key picture."""
+        self._follows = False
+
+    def close(self) -> None:
+        """Show it no longer. Idempotent."""
+        for feed in (self._feed, self._next):
+            self._release(feed)
+        self._feed = self._next = None
+        self._numbers.clear()
+        if self._name:
+            self._station.free_name(self._name)
+            self._name = ""
+
+    def _ready(self, feed: EncodedFeed, serial: int) -> list[NumberedPicture]:
+        """Return the pictures of a form after one that the page can decode; ask for a key picture if there is none."""
+        pictures, self._missed = feed.after(serial, follows=self._follows)
+        if not pictures and self._missed:
+            feed.ask_for_key()
+        return pictures
+
+    def _choose(self) -> None:
+        """Subscribe to the form that this page is to have now; what it has stays until a key picture of it is here."""
+        form = form_for(self._camera, self._width, self._max_fps)
+        if self.path.update(self._clock(), self._late_s):
+            self._name = self._name or self._station.own_name()
+            form = Form(None, form.scale, self._max_fps, self._name)
+        for feed in filter(None, (self._next, self._feed)):
+            if feed.silent_s > SILENT_S:
+                self._refuse(feed)
+                return
+        present = self._next or self._feed
+        refused = self._refused_ns is not None and self._clock() - self._refused_ns < nanoseconds(self._retry_s)
+        if refused or (present is not None and present.form == form):
+            return
+        self._release(self._next)
+        self._next = None
+        if self._feed is not None and self._feed.form == form:
+            return  # back before the other one came
+        feed = self._station.encoded(self._camera.name, form)
+        with suppress(SkyloopError):  # it is going away
+            feed.subscribe(self, self._wake)
+            self._next = feed
+
+    def _refuse(self, feed: EncodedFeed) -> None:
+        if self._refused_ns is not None:
+            self._retry_s = min(2.0 * self._retry_s, MOST_RETRY_S)
+        self._refused_ns = self._clock()
+        self._release(feed)
+        if feed is self._next:
+            self._next = None
+        else:
+            self._feed = None
+
+    def _release(self, feed: EncodedFeed | None) -> None:
+        if feed is not None:
+            feed.unsubscribe(self)
+            if not feed.wanted:
+                self._station.forget(feed)

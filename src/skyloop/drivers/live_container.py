@@ -1,0 +1,390 @@
+"""Live video that PyAV opens, from the network or a device, for :class:`skyloop.drivers.live_video.LiveVideo`.
+
+Every error of opening and reading is an OSError that says why in words.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from skyloop.clock import Clock, nanoseconds
+from skyloop.drivers.backlog import Coded
+from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.live_video import Decoded
+from skyloop.drivers.pave_decoder import av, limit_memory
+from skyloop.errors import UnsupportedError
+from skyloop.messages.encoded import H264
+from skyloop.pyav import new_decoder
+from skyloop.wire.h264 import Inspector, Unit
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.codeccontext import VideoCodecContext
+
+HOPELESS_S: Final = 3.0  #: how long nothing can be decoded before it is reported
+STRICT_S: Final = 15.0  #: how long nothing of H.264 is without fault before damage is no longer looked for
+#: How many pictures FFmpeg holds back: where one ends shows when the next begins, and a transport stream's packets end
+#: in the same way once more.
+_HELD_BACK: Final = {"rtsp": 1, "sdp": 1, "h264": 1, "hevc": 1, "mpegts": 2}
+_REORDERED_NS: Final = 1_000_000_000  # a step back of the stamps up to this is one of B pictures, not a clock set back
+_STAMPS: Final = 128  # capture times that are kept: two a picture, more than any decoder holds back
+_NO_STAMPS: Final[Any] = av.format.Flags.no_timestamps.value
+
+
+class ProtocolRefusedError(ConnectionError):
+    """Raised when a server does not want the protocol that was asked for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """A picture's bytes, and what it takes to decode them and to know when they were captured."""
+
+    packet: av.Packet[av.VideoStream]
+    context: VideoCodecContext  # of its connection
+    number: int  # of the connection, from 0
+    unit: Unit | None = None  # as H.264 in Annex B form; None: it is none, or its headers are not known
+    reason: str = ""  # why it can't be handed on as it came; empty if it can
+    reordered: bool = False  # of H.264: pictures build on later ones
+
+    @property
+    def is_h264(self) -> bool:
+        return self.context.name == H264
+
+
+class ContainerStream:
+    """One connection to whatever PyAV opens.
+
+    Args:
+        name: What FFmpeg opens: an address or a path; or the content of a file.
+        number: Of the connection.
+        clock: Monotonic, ns.
+        format_name: FFmpeg's format; None: it finds out.
+        options: FFmpeg's.
+        open_s: For the connection, the handshake and the size of the pictures, all together; a device that hangs takes
+            longer.
+        read_s: For the next picture. FFmpeg can't be interrupted earlier, so :meth:`read` takes up to this.
+
+    Raises:
+        ProtocolRefusedError: The server does not want the protocol that was asked for.
+        OSError: It can't be opened, or holds no video that is known here.
+    """
+
+    broken = 0  # FFmpeg does not report what it throws away
+    lost_bytes = 0
+
+    def __init__(
+        self,
+        name: str | bytes,
+        number: int,
+        clock: Clock,
+        *,
+        format_name: str | None = None,
+        options: dict[str, str],
+        open_s: float,
+        read_s: float,
+    ) -> None:
+        self._connection = number
+        self._clock = clock
+        self._read_s = read_s
+        begun_ns = clock()
+        try:
+            self._container: InputContainer = av.open(
+                io.BytesIO(name) if isinstance(name, bytes) else name,
+                mode="r",
+                format=format_name,
+                options=options,
+                timeout=(open_s, read_s),
+            )
+        except Exception as error:
+            if clock() - begun_ns >= nanoseconds(open_s):  # which FFmpeg takes for damage, in the midst of a handshake
+                raise TimeoutError(f"no answer, or no frame, within {open_s:g} s") from error
+            raise _os_error(error) from error
+        try:
+            self._context, self._packets = self._chosen()
+            self._units = Units(self._container.streams.video[0], self._context)
+        except BaseException:
+            self._container.close()
+            raise
+        held_back = _HELD_BACK.get(self._container.format.name, 0)
+        self._came: deque[int] = deque(maxlen=held_back + 1)  # when FFmpeg gave the last ones
+        self._number = 0
+        self._live_clock = LiveClock()
+        self._newest_ns: int | None = None  # stamp
+        self._offset_ns = 0
+        self._captured_newest_ns = 0
+
+    def read(self) -> list[Coded]:
+        """Return the next picture, as a list of one.
+
+        Raises:
+            OSError: The stream ended, failed, or gave nothing for ``read_s``.
+        """
+        try:
+            packet = next(self._packets, None)
+        except av.error.ExitError as error:
+            raise TimeoutError(f"nothing came for {self._read_s:g} s") from error
+        except Exception as error:
+            raise _os_error(error) from error
+        if packet is None or not packet.size:
+            raise ConnectionError("the stream ended")
+        now_ns = self._clock()
+        self._came.append(now_ns)
+        unit = self._units.of(packet)
+        captured_ns = min(self._captured_ns(packet), now_ns)
+        if self._units.in_order:  # a stamp that was learned meanwhile does not set the time back
+            captured_ns = self._captured_newest_ns = max(captured_ns, self._captured_newest_ns)
+        units = self._units
+        piece = Piece(packet, self._context, self._number, unit, units.reason, not units.in_order)
+        self._number += 1
+        is_key = packet.is_keyframe or self._context.codec.intra_only
+        return [Coded(piece, is_key, captured_ns, now_ns, self._connection)]
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._container.close()
+
+    def _chosen(self) -> tuple[VideoCodecContext, Iterator[av.Packet[av.VideoStream]]]:
+        """Return the first video, ready to be read and decoded."""
+        videos = self._container.streams.video
+        if not videos:
+            raise ConnectionError("what comes holds no video")
+        context = videos[0].codec_context
+        if context is None:
+            raise ConnectionError("what comes is in a codec that is not known here")
+        if not (context.width and context.height):
+            raise ConnectionError("the stream has no frame size: it is damaged, or no video")
+        limit_memory(context)
+        return context, self._container.demux(videos[0])
+
+    def _captured_ns(self, packet: av.Packet[av.VideoStream]) -> int:
+        """Return when a picture was captured: by its stamp and the smallest delay seen lately, else when it came."""
+        stamp_ns = _stamp_ns(packet)
+        if stamp_ns is None or self._container.format.flags & _NO_STAMPS:
+            return self._came[0]
+        back_ns = 0 if self._newest_ns is None else self._newest_ns - stamp_ns
+        if not self._units.in_order and 0 < back_ns < _REORDERED_NS:  # of a picture that others build on
+            return stamp_ns + self._offset_ns
+        if self._newest_ns is None or back_ns:
+            self._newest_ns = stamp_ns
+            self._offset_ns = self._live_clock.captured_ns(stamp_ns / 1e9, self._came[0]) - stamp_ns
+        return stamp_ns + self._offset_ns
+
+
+class Units:
+    """The H.264 of a stream in Annex B form, whatever it comes in.
+
+    ``reason`` says why its pictures can't be handed on as they came; empty as long as they can.
+
+    Args:
+        stream: Of an open container.
+        context: Of the stream.
+    """
+
+    def __init__(self, stream: av.VideoStream, context: VideoCodecContext) -> None:
+        self._is_h264 = context.name == H264
+        self.reason = "" if self._is_h264 else f"the video is {context.name}, not H.264"
+        self.in_order = self._is_h264  #: no picture built on a later one so far
+        self._filter: av.BitStreamFilterContext | None = None
+        parameters = bytes(context.extradata or b"")
+        if self._is_h264 and parameters[:1] == b"\1":  # sizes in place of start codes, as in MP4
+            self._filter, parameters = av.BitStreamFilterContext("h264_mp4toannexb", stream), b""
+        self._inspector = Inspector(parameters)
+
+    def of(self, packet: av.Packet[av.VideoStream]) -> Unit | None:
+        """Return a packet's picture; None if it is none. From the first that can't be handed on there is a reason."""
+        if not self._is_h264:
+            return None
+        data = self._annex_b(packet)
+        if packet.is_corrupt or data is None:
+            self._inspector.restart()
+            return None
+        unit = self._inspector.inspect(data)
+        if unit is not None and unit.reason:
+            self.reason, self.in_order = unit.reason, False
+        return unit
+
+    def _annex_b(self, packet: av.Packet[av.VideoStream]) -> bytes | None:
+        if self._filter is None:
+            return bytes(packet)
+        copy = av.Packet(bytes(packet))  # the filter takes what it is given
+        try:
+            return b"".join(bytes(part) for part in self._filter.filter(copy))
+        except (av.error.FFmpegError, ValueError):
+            return None
+
+
+class LiveDecoder:
+    """Decodes one connection after the other.
+
+    H.264 that shows damage is not shown, and nothing that builds upon it, up to the next key picture, with which a
+    fresh decoder begins: what an old one remembers of damage may show. A stream of which nothing can be shown in that
+    way for :data:`STRICT_S` (an encoder with faults of its own, or one that sends no key pictures) is left to FFmpeg's
+    own judgement, up to the next key that is without fault.
+
+    Args:
+        on_whole: Called with each frame that was decoded and shows no damage. On the decoding thread.
+        on_forgiving: Called once with a text when damage is no longer looked for.
+    """
+
+    def __init__(
+        self,
+        on_whole: Callable[[Coded], None] = lambda _: None,
+        on_forgiving: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.waited = 0
+        self.damaged = 0
+        self._on_whole = on_whole
+        self._on_forgiving = on_forgiving
+        self._shown = 0
+        self._forgave = False
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the stream so far: the next picture does not continue it."""
+        self._before: Piece | None = None
+        self._failing_ns: int | None = None  # since when no piece could be decoded
+        self._barren_ns: int | None = None  # since when no picture of H.264 came out
+        self._strict: VideoCodecContext | None = None  # None: H.264 waits for a key
+        self._shown_ns = 0  # capture time of the newest picture: a later one is not captured earlier
+        self._reorders = False  # it holds pictures back that build on later ones
+        self._forgiving: VideoCodecContext | None = None
+        # Capture times of what was given to a decoder, by whether that is the strict one and the stamp it was given.
+        self._captured: dict[tuple[bool, int | None], int] = {}
+
+    def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
+        """See :class:`skyloop.drivers.live_video.Decoder`.
+
+        Raises:
+            UnsupportedError: Nothing could be decoded for :data:`HOPELESS_S`.
+        """
+        piece = coded.data
+        if not isinstance(piece, Piece):
+            raise TypeError("a piece of a live stream is wanted")
+        before, self._before = self._before, piece
+        follows = not piece.number or (before is not None and before.number + 1 == piece.number)
+        self._note_stamp(piece, coded)
+        image = self._of_h264(piece, coded, follows) if piece.is_h264 else self._of_other(piece, coded, follows)
+        if image is None:
+            return None
+        self._failing_ns = self._barren_ns = None
+        if not show:
+            return None
+        self._shown += 1
+        pixels = np.ascontiguousarray(image.to_ndarray(format="bgr24"), dtype=np.uint8)
+        strictly = self._forgiving is None and piece.is_h264
+        captured_ns = self._captured.get((strictly, image.pts), coded.captured_ns)
+        self._shown_ns = max(self._shown_ns, captured_ns)
+        return Decoded(self._shown, pixels, self._shown_ns)
+
+    def _of_other(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
+        if not follows:
+            piece.context.flush_buffers()  # what was left out would show as a smear
+        return self._judged(piece.context, piece.packet, coded)
+
+    def _of_h264(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
+        unit = piece.unit
+        if unit is None:  # parameters alone, or noise
+            self._note_failure(coded)
+            return None
+        surprised = piece.reordered and not self._reorders  # what it builds on would be shown before it
+        if not follows or unit.after_gap or surprised:
+            self._strict = None
+            if self._forgiving is not None:
+                self._forgiving.flush_buffers()
+        image = self._of_strict(piece, unit, coded)
+        if image is not None:
+            self._forgiving = None
+            return image
+        if self._forgiving is not None:
+            return self._judged(self._forgiving, piece.packet, coded)
+        if self._strict is None:
+            self._barren_ns = coded.arrived_ns if self._barren_ns is None else self._barren_ns
+            if coded.arrived_ns - self._barren_ns > nanoseconds(STRICT_S):
+                self._forgive(piece)
+        return None
+
+    def _of_strict(self, piece: Piece, unit: Unit, coded: Coded) -> av.VideoFrame | None:
+        if self._strict is None:
+            if not unit.is_key:
+                self.waited += 1
+                return None
+            self._reorders = piece.reordered or bool(piece.context.has_b_frames)
+            self._strict = new_decoder(H264, "a camera", low_delay=not self._reorders)
+        packet = av.Packet(unit.data)
+        packet.pts = piece.number  # which comes out with the picture; not each packet of a stream has a stamp
+        try:
+            images = self._strict.decode(packet)
+        except (av.error.FFmpegError, ValueError):
+            images = None
+        if images is None or any(image.is_corrupt for image in images):
+            self._strict = None
+            self.damaged += 1
+            return None
+        self._on_whole(coded)
+        if not images:
+            self.waited += 1  # it is held back for others that are shown before it
+            return None
+        return images[-1]
+
+    def _judged(
+        self, context: VideoCodecContext, packet: av.Packet[av.VideoStream], coded: Coded
+    ) -> av.VideoFrame | None:
+        """Decode a piece. Return its picture, None if there is none that FFmpeg calls good."""
+        try:
+            images = context.decode(packet)
+        except (av.error.FFmpegError, ValueError):
+            self._note_failure(coded)
+            return None
+        good = [image for image in images if not image.is_corrupt]
+        if images and not good:
+            self._note_failure(coded)
+        elif not good:
+            self.waited += 1
+        return good[-1] if good else None
+
+    def _note_stamp(self, piece: Piece, coded: Coded) -> None:
+        self._captured[True, piece.number] = self._captured[False, piece.packet.pts] = coded.captured_ns
+        while len(self._captured) > _STAMPS:
+            del self._captured[next(iter(self._captured))]
+
+    def _note_failure(self, coded: Coded) -> None:
+        now_ns = coded.arrived_ns
+        self._failing_ns = now_ns if self._failing_ns is None else self._failing_ns
+        if now_ns - self._failing_ns > nanoseconds(HOPELESS_S):
+            raise UnsupportedError(f"for {HOPELESS_S:g} s, nothing that came could be decoded")
+        self.damaged += 1
+
+    def _forgive(self, piece: Piece) -> None:
+        context: VideoCodecContext = av.CodecContext.create(H264, "r")
+        if piece.context.extradata:
+            context.extradata = piece.context.extradata
+        limit_memory(context)
+        self._forgiving = context
+        if not self._forgave:
+            self._forgave = True
+            self._on_forgiving(
+                f"for {STRICT_S:g} s no key picture came without a fault: frames are shown with what damage they have "
+                "until one does"
+            )
+
+
+def _stamp_ns(timed: av.Packet[av.VideoStream] | av.VideoFrame) -> int | None:
+    if timed.pts is None or timed.time_base is None:
+        return None
+    return nanoseconds(float(timed.pts * timed.time_base))
+
+
+def _os_error(error: Exception) -> OSError:
+    """Return an error in words, without the address, which may hold a password."""
+    if isinstance(error, OSError) and error.errno == errno.EPROTONOSUPPORT:
+        return ProtocolRefusedError(error.strerror)
+    if isinstance(error, av.error.InvalidDataError):
+        return ConnectionError("what comes is no video that is known here")
+    return ConnectionError(getattr(error, "strerror", None) or str(error) or repr(error))

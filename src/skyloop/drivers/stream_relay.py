@@ -1,0 +1,140 @@
+"""Hands pictures on as the vehicle encoded them, to who wants them: begun with a key, without gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from skyloop.drivers.base import Sink
+from skyloop.messages import EventKind, Intrinsics, Severity
+from skyloop.messages.encoded import Chain
+from skyloop.wire.h264 import Unit
+
+KEYLESS: Final = 600  #: pictures without a key after which it is reported that nothing can be handed on
+
+
+class StreamRelay:
+    """Hands H.264 on while somebody wants it, beginning with a key picture, and after a gap with the next one.
+
+    Whether pictures are decoded as well makes no difference. Not thread-safe.
+
+    Args:
+        sink: The proxy's.
+        intrinsics: Returns those of a camera for a width and height.
+    """
+
+    def __init__(self, sink: Sink, intrinsics: Callable[[str, int, int], Intrinsics | None]) -> None:
+        self._sink = sink
+        self._intrinsics = intrinsics
+        self._chain = Chain()
+        self._source: tuple[str, int] | None = None  # camera and connection of the picture before
+
+    def wanted(self, camera: str) -> bool:
+        """Return whether a camera's stream is wanted. If not, the next one that is begins with a key picture."""
+        wanted = self._sink.wants_stream(camera)
+        if not wanted:
+            self.restart()
+        return wanted
+
+    def restart(self) -> None:
+        """Begin with the next key picture."""
+        self._source = None
+
+    def take(
+        self,
+        camera: str,
+        unit: Unit,
+        captured_ns: int,
+        *,
+        number: int,
+        connection: int,
+        picture: bool = True,
+    ) -> bool:
+        """Hand a picture on, if it is wanted and can be decoded after the last one.
+
+        Args:
+            camera: That the vehicle shows now.
+            unit: The picture, undamaged.
+            captured_ns: As of the decoded frame.
+            number: Counts the pictures of the connection; one that was left out is missing in the numbers.
+            connection: Its number.
+            picture: False for parameters alone, which are not handed on.
+
+        Returns:
+            Whether it was handed on.
+        """
+        if not self.wanted(camera):
+            return False
+        source = camera, connection
+        if unit.after_gap or source != self._source:
+            self._chain.restart()
+        self._source = source
+        if not self._chain.follows(number, key=unit.is_key) or not picture:
+            return False
+        self._sink.stream(
+            camera,
+            unit.data,
+            captured_ns,
+            width=unit.width,
+            height=unit.height,
+            key=unit.is_key,
+            intrinsics=self._intrinsics(camera, unit.width, unit.height),
+        )
+        return True
+
+
+class CheckedRelay:
+    """Hands on the H.264 of one camera whose stream is not known beforehand, and reports once why it does not.
+
+    Used by one thread at a time.
+
+    Args:
+        relay: Hands it on.
+        sink: The proxy's, for events.
+        camera: Its name.
+        where: What an event is about.
+    """
+
+    def __init__(self, relay: StreamRelay, sink: Sink, camera: str, where: str) -> None:
+        self._relay = relay
+        self._sink = sink
+        self._camera = camera
+        self._where = where
+        self._refused = (-1, "")  # connection, and why
+        self._waited = 0
+        self._reported = ""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the stream is wanted."""
+        return self._relay.wanted(self._camera)
+
+    def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:
+        """Hand on a picture that came undamaged; see :meth:`StreamRelay.take`.
+
+        Args:
+            unit: The picture; None: its headers are not known.
+            reason: Why it can't be handed on, which counts for the rest of the connection; empty if it can.
+            captured_ns: As of the decoded frame.
+            number: Counts the pictures of the connection.
+            connection: Its number.
+        """
+        if not self.wanted:
+            return
+        if reason:
+            self._refused = connection, reason
+        if self._refused[0] == connection:
+            self._report(self._refused[1])
+            return
+        taken = unit is not None and self._relay.take(
+            self._camera, unit, captured_ns, number=number, connection=connection
+        )
+        self._waited = 0 if taken else self._waited + 1
+        if self._waited == KEYLESS:
+            self._report(f"of {KEYLESS} pictures none was a key (IDR) with its parameters: let the encoder send some")
+
+    def _report(self, why: str) -> None:
+        if why != self._reported:
+            self._reported = why
+            text = f"{self._where}: {why}: only decoded frames are available, nothing is handed on as it came"
+            self._sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, where=self._where)

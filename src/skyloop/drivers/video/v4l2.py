@@ -1,0 +1,273 @@
+"""What a camera of Video4Linux offers, and its exposure and gain, by the kernel's own calls.
+
+Layouts and numbers are those of ``linux/videodev2.h`` (``Documentation/userspace-api/media/v4l``), which are the same
+on all architectures with integers of 32 bits. FFmpeg streams from the device meanwhile: settings need no stream.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final
+
+#: Descriptor, request and buffer, which is changed; raises OSError.
+Ioctl = Callable[[int, int, bytearray], object]
+
+_READ, _WRITE = 2, 1  # _IOC_READ, _IOC_WRITE
+_CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE, and V4L2_CAP_VIDEO_CAPTURE
+_DEVICE_CAPS: Final = 1 << 31
+_DISCRETE: Final = 1
+_MOST: Final = 256  # formats, sizes and rates of a device that answers for ever
+
+CAPABILITY: Final = struct.Struct("=16s32s32sIII12x")
+FORMAT: Final = struct.Struct("=III32sI16x")
+SIZE: Final = struct.Struct("=III6I8x")
+INTERVAL: Final = struct.Struct("=IIIII6I8x")
+QUERY: Final = struct.Struct("=II32siiiiI8x")
+CONTROL: Final = struct.Struct("=Ii")
+
+
+def _request(direction: int, number: int, layout: struct.Struct) -> int:
+    """The kernel's ``_IOC('V', …)``."""
+    return direction << 30 | layout.size << 16 | ord("V") << 8 | number
+
+
+QUERYCAP: Final = _request(_READ, 0, CAPABILITY)
+ENUM_FMT: Final = _request(_READ | _WRITE, 2, FORMAT)
+G_CTRL: Final = _request(_READ | _WRITE, 27, CONTROL)
+S_CTRL: Final = _request(_READ | _WRITE, 28, CONTROL)
+QUERYCTRL: Final = _request(_READ | _WRITE, 36, QUERY)
+ENUM_FRAMESIZES: Final = _request(_READ | _WRITE, 74, SIZE)
+ENUM_FRAMEINTERVALS: Final = _request(_READ | _WRITE, 75, INTERVAL)
+
+AUTO_GAIN: Final = 0x00980912
+GAIN: Final = 0x00980913
+AUTO_EXPOSURE: Final = 0x009A0901
+EXPOSURE: Final = 0x009A0902  #: in units of 100 µs
+_AUTO, _MANUAL, _APERTURE_FIRST = 0, 1, 3  # of AUTO_EXPOSURE; UVC cameras have the last one for "auto"
+_EXPOSURE_MS: Final = 0.1
+_DISABLED: Final = 1
+
+#: FFmpeg's names of formats, by ours and by the kernel's.
+FORMATS: Final = {"mjpeg": "mjpeg", "yuyv": "yuyv422", "h264": "h264", "nv12": "nv12", "grey": "gray"}
+_NAMES: Final = {"MJPG": "mjpeg", "JPEG": "mjpeg", "YUYV": "yuyv", "H264": "h264", "NV12": "nv12", "GREY": "grey"}
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSize:
+    """A size of pictures, or the range of sizes, with its rates."""
+
+    width: int  #: [px]; of a range the largest
+    height: int
+    fps: tuple[float, ...]  #: [1/s], the highest first; of a range its ends
+    smallest: tuple[int, int] | None = None  #: of a range
+
+    def __str__(self) -> str:
+        size = f"{self.width}x{self.height}"
+        if self.smallest is not None:
+            size = f"{self.smallest[0]}x{self.smallest[1]} to {size}"
+        return size + (f" at {', '.join(f'{rate:g}' for rate in self.fps)}" if self.fps else "")
+
+
+@dataclass(frozen=True, slots=True)
+class PixelFormat:
+    """How pictures come."""
+
+    code: str  #: the kernel's, such as ``MJPG``
+    description: str
+    sizes: tuple[FrameSize, ...]
+
+    @property
+    def option(self) -> str:
+        """The value of ``format=`` that asks for it; empty if it can't be asked for."""
+        return _NAMES.get(self.code, "")
+
+    def __str__(self) -> str:
+        name = f"format={self.option}" if self.option else f"{self.code} ({self.description})"
+        return f"{name}: {'; '.join(map(str, self.sizes)) or 'sizes not known'}"
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """A setting of the device, in its own unit."""
+
+    number: int
+    name: str
+    minimum: int
+    maximum: int
+    step: int
+    default: int
+    value: int
+
+
+class V4l2Device:
+    """An open device.
+
+    Args:
+        descriptor: Of its node.
+        ioctl: The kernel's call; None: ``fcntl.ioctl``.
+    """
+
+    def __init__(self, descriptor: int, ioctl: Ioctl | None = None) -> None:
+        """Store the arguments. No I/O."""
+        if ioctl is None:
+            from fcntl import ioctl as kernels  # not there on Windows
+
+            ioctl = kernels
+        self._descriptor = descriptor
+        self._ioctl = ioctl
+
+    def captures(self) -> bool:
+        """Return whether it gives pictures; raises OSError if it is no device of Video4Linux."""
+        *_, everything, own = CAPABILITY.unpack(self._call(QUERYCAP, bytearray(CAPABILITY.size)))
+        return bool((own if everything & _DEVICE_CAPS else everything) & _CAPTURE)
+
+    def formats(self) -> list[PixelFormat]:
+        """Return the formats with their sizes and rates, as far as the device tells them."""
+        found = []
+        for index in range(_MOST):
+            answer = self._try(ENUM_FMT, FORMAT, index, _CAPTURE, 0, b"", 0)
+            if answer is None:
+                break
+            _, _, _, description, code = answer
+            found.append(PixelFormat(_fourcc(code), _text(description), tuple(self._sizes(code))))
+        return found
+
+    def control(self, number: int) -> Control | None:
+        """Return a setting; None if the device has none of the kind."""
+        answer = self._try(QUERYCTRL, QUERY, number, 0, b"", 0, 0, 0, 0, 0)
+        value = self._try(G_CTRL, CONTROL, number, 0)
+        if answer is None or value is None:
+            return None
+        _, _, name, minimum, maximum, step, default, flags = answer
+        if flags & _DISABLED:
+            return None
+        return Control(number, _text(name), minimum, maximum, step, default, value[1])
+
+    def set_exposure(self, exposure_ms: float | None) -> str:
+        """Set the exposure.
+
+        Args:
+            exposure_ms: [ms]; None: the camera chooses.
+
+        Returns:
+            Why it could not be set, in words; empty if it was.
+        """
+        if exposure_ms is None:
+            problem = self._set(AUTO_EXPOSURE, _APERTURE_FIRST) and self._set(AUTO_EXPOSURE, _AUTO)
+            return f"the camera has no automatic exposure: {problem}" if problem else ""
+        known = self.control(EXPOSURE)
+        if known is None:
+            return "the camera's exposure can't be set"
+        lowest, highest = known.minimum * _EXPOSURE_MS, known.maximum * _EXPOSURE_MS
+        if not lowest <= exposure_ms <= highest:
+            return f"exposure is {exposure_ms:g} ms and must be from {lowest:g} to {highest:g} for this camera"
+        self._set(AUTO_EXPOSURE, _MANUAL)  # one that has no automatic has no such control
+        return self._set(EXPOSURE, round(exposure_ms / _EXPOSURE_MS))
+
+    def set_gain(self, gain: int | None) -> str:
+        """Set the gain, in the device's own unit; None: the camera chooses. Returns what :meth:`set_exposure` does."""
+        if gain is None:
+            problem = self._set(AUTO_GAIN, 1)
+            return f"the camera has no automatic gain: {problem}" if problem else ""
+        known = self.control(GAIN)
+        if known is None:
+            return "the camera's gain can't be set"
+        if not known.minimum <= gain <= known.maximum:
+            return f"gain is {gain} and must be from {known.minimum} to {known.maximum} for this camera"
+        self._set(AUTO_GAIN, 0)
+        return self._set(GAIN, gain)
+
+    def settings(self) -> list[str]:
+        """Return exposure and gain in words: their ranges, and what they are now."""
+        found = []
+        exposure, mode = self.control(EXPOSURE), self.control(AUTO_EXPOSURE)
+        if exposure is not None:
+            ends = f"{exposure.minimum * _EXPOSURE_MS:g} to {exposure.maximum * _EXPOSURE_MS:g} ms"
+            chosen = mode is not None and mode.value != _MANUAL
+            found.append(f"exposure={ends}, now {'auto' if chosen else f'{exposure.value * _EXPOSURE_MS:g} ms'}")
+        gain, auto = self.control(GAIN), self.control(AUTO_GAIN)
+        if gain is not None:
+            now = "auto" if auto is not None and auto.value else str(gain.value)
+            found.append(f"gain={gain.minimum} to {gain.maximum}, now {now}")
+        return found
+
+    def _sizes(self, code: int) -> Iterator[FrameSize]:
+        for index in range(_MOST):
+            answer = self._try(ENUM_FRAMESIZES, SIZE, index, code, *[0] * 7)
+            if answer is None:
+                return
+            _, _, kind, *numbers = answer
+            if kind == _DISCRETE:
+                width, height = numbers[:2]
+                yield FrameSize(width, height, tuple(self._rates(code, width, height)))
+            else:
+                least_width, width, _, least_height, height, _ = numbers
+                yield FrameSize(width, height, tuple(self._rates(code, width, height)), (least_width, least_height))
+                return
+
+    def _rates(self, code: int, width: int, height: int) -> Iterator[float]:
+        for index in range(_MOST):
+            answer = self._try(ENUM_FRAMEINTERVALS, INTERVAL, index, code, width, height, *[0] * 7)
+            if answer is None:
+                return
+            kind, *numbers = answer[4:]
+            for above, below in [numbers[:2]] if kind == _DISCRETE else [numbers[:2], numbers[2:4]]:
+                if above:
+                    yield below / above
+            if kind != _DISCRETE:
+                return
+
+    def _set(self, number: int, value: int) -> str:
+        try:
+            self._call(S_CTRL, bytearray(CONTROL.pack(number, value)))
+        except OSError as error:
+            return _reason(error)
+        return ""
+
+    def _try(self, request: int, layout: struct.Struct, *numbers: object) -> tuple[int, ...] | None:
+        """Return the device's answer, None if it has none."""
+        try:
+            return layout.unpack(self._call(request, bytearray(layout.pack(*numbers))))
+        except OSError:
+            return None
+
+    def _call(self, request: int, buffer: bytearray) -> bytearray:
+        self._ioctl(self._descriptor, request, buffer)
+        return buffer
+
+
+@contextmanager
+def opened(path: str, ioctl: Ioctl | None = None) -> Iterator[V4l2Device]:
+    """Open a device for its settings.
+
+    Args:
+        path: Such as ``/dev/video0``.
+        ioctl: As for :class:`V4l2Device`.
+
+    Raises:
+        OSError: It can't be opened.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+    try:
+        yield V4l2Device(descriptor, ioctl)
+    finally:
+        os.close(descriptor)
+
+
+def _fourcc(code: int) -> str:
+    return (code & 0x7FFFFFFF).to_bytes(4, "little").decode("latin-1").strip()
+
+
+def _text(field: object) -> str:
+    return bytes(field).split(b"\0")[0].decode("utf-8", "replace") if isinstance(field, bytes) else ""
+
+
+def _reason(error: OSError) -> str:
+    if error.errno in (errno.EINVAL, errno.ENOTTY):
+        return "the camera has no such setting, or not that value"
+    return error.strerror or str(error)

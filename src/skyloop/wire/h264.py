@@ -1,0 +1,264 @@
+"""As much of H.264 as it takes to separate pictures, and to see what is missing, reordered or of another size. Pure.
+
+ITU-T H.264: 7.3 and 7.4 (units, parameter sets, headers of slices), 7.4.3 (numbers of pictures), Annex B, Annex E.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.errors import DecodeError
+
+SLICE, IDR, SPS, PPS = 1, 5, 7, 8  #: types of NAL units
+START: Final = b"\0\0\0\1"
+MAX_SETS: Final = 8  #: parameter sets of a kind that are remembered; cameras send one
+_ANY_START: Final = re.compile(rb"\x00\x00\x01")
+_HEADER_BYTES: Final = 32  # more than the beginning of a slice header takes
+_SET_BYTES: Final = 512  # more than a sequence parameter set takes, scaling lists included
+_CHROMA_PROFILES: Final = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128})
+_ALL_COLOURS: Final = 3  # chroma_format_idc of 4:4:4
+_MAX_BLOCKS: Final = 1024  # to a side, 16384 pixels
+_MAX_CYCLE: Final = 255
+_B: Final = 1  # slice_type, modulo 5
+
+
+@dataclass(frozen=True, slots=True)
+class Sequence:
+    """What a sequence parameter set says that is needed here."""
+
+    frame_number_bits: int
+    width: int  #: of the picture to show [px]
+    height: int
+    interlaced: bool = False  #: pictures may be fields
+    colour_planes: bool = False  #: coded one by one
+    gaps_allowed: bool = False  #: in the numbers of pictures, where a sender leaves some out
+
+
+@dataclass(frozen=True, slots=True)
+class Slice:
+    """The beginning of a slice's header."""
+
+    is_key: bool
+    is_first: bool  #: of its picture
+    is_reference: bool
+    frame_number: int
+    is_b: bool = False  #: may build on later pictures
+
+
+def units(stream: bytes) -> list[bytes]:
+    """The NAL units of a piece of stream in Annex B form. What comes before the first start code is left out."""
+    return [unit.rstrip(b"\0") for unit in _ANY_START.split(stream)[1:] if unit.rstrip(b"\0")]
+
+
+def unit_type(unit: bytes) -> int:
+    return unit[0] & 31
+
+
+def parse_sequence(unit: bytes) -> Sequence:
+    """A sequence parameter set. Raises :class:`DecodeError`."""
+    bits = _Bits(unit[1:_SET_BYTES])
+    profile = bits.take(8)
+    bits.take(16)
+    bits.exp_golomb()
+    chroma, planes = 1, False
+    if profile in _CHROMA_PROFILES:
+        chroma = bits.exp_golomb()
+        planes = chroma == _ALL_COLOURS and bool(bits.take(1))
+        bits.exp_golomb()
+        bits.exp_golomb()
+        bits.take(1)
+        if bits.take(1):
+            for number in range(12 if chroma == _ALL_COLOURS else 8):
+                if bits.take(1):
+                    _skip_scaling_list(bits, 16 if number < 6 else 64)
+    frame_number_bits = bits.exp_golomb() + 4
+    _skip_order(bits)
+    bits.exp_golomb()  # reference frames
+    gaps_allowed = bool(bits.take(1))
+    columns, rows = bits.exp_golomb() + 1, bits.exp_golomb() + 1
+    frames_only = bits.take(1)
+    rows *= 2 - frames_only
+    if frame_number_bits > 16 or columns > _MAX_BLOCKS or rows > _MAX_BLOCKS or chroma > _ALL_COLOURS:
+        raise DecodeError("numbers in a sequence parameter set that can't be")
+    if not frames_only:
+        bits.take(1)
+    bits.take(1)
+    width, height = columns * 16, rows * 16
+    if bits.take(1):
+        across = 2 if chroma in (1, 2) and not planes else 1
+        down = (2 if chroma == 1 and not planes else 1) * (2 - frames_only)
+        left, right, top, bottom = (bits.exp_golomb() for _ in range(4))
+        width -= across * (left + right)
+        height -= down * (top + bottom)
+    if width < 1 or height < 1:
+        raise DecodeError("a sequence parameter set that leaves nothing of its pictures")
+    return Sequence(frame_number_bits, width, height, not frames_only, planes, gaps_allowed)
+
+
+def parse_slice(unit: bytes, sequence: Sequence) -> Slice:
+    """The beginning of a slice's header. Raises :class:`DecodeError`."""
+    bits = _Bits(unit[1:_HEADER_BYTES])
+    first = bits.exp_golomb()
+    kind = bits.exp_golomb()
+    bits.exp_golomb()  # parameter set
+    if sequence.colour_planes:
+        bits.take(2)
+    number = bits.take(sequence.frame_number_bits)
+    return Slice(unit_type(unit) == IDR, first == 0, bool(unit[0] & 0x60), number, kind % 5 == _B)
+
+
+def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
+    """How many reference pictures are missing between two that came one after the other, by their numbers (7.4.3)."""
+    if now.is_key:
+        return 0
+    turns = 1 << sequence.frame_number_bits
+    return (now.frame_number - before.frame_number - before.is_reference) % turns
+
+
+def _skip_order(bits: _Bits) -> None:
+    """Picture order, of any of its three types."""
+    kind = bits.exp_golomb()
+    if kind == 0:
+        bits.exp_golomb()
+    elif kind == 1:
+        bits.take(1)
+        bits.exp_golomb()
+        bits.exp_golomb()
+        cycle = bits.exp_golomb()
+        if cycle > _MAX_CYCLE:
+            raise DecodeError("a cycle in a sequence parameter set that is too long")
+        for _ in range(cycle):
+            bits.exp_golomb()
+
+
+def _skip_scaling_list(bits: _Bits, size: int) -> None:
+    last = following = 8
+    for _ in range(size):
+        if following:
+            code = bits.exp_golomb()
+            following = (last + ((code + 1) // 2 if code % 2 else -(code // 2))) % 256
+        last = following or last
+
+
+class _Bits:
+    def __init__(self, data: bytes) -> None:
+        data = data.replace(b"\0\0\3", b"\0\0")
+        self._value = int.from_bytes(data, "big")
+        self._left = 8 * len(data)
+
+    def take(self, count: int) -> int:
+        if count > self._left:
+            raise DecodeError("a NAL unit that ends too early")
+        self._left -= count
+        return self._value >> self._left & ((1 << count) - 1)
+
+    def exp_golomb(self) -> int:
+        zeros = 0
+        while not self.take(1):
+            zeros += 1
+            if zeros > 31:
+                raise DecodeError("a number in a NAL unit that is too large")
+        return (1 << zeros | self.take(zeros)) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """An access unit, and what the stream shows about it."""
+
+    data: bytes  #: in Annex B form, of a key picture with its parameter sets
+    is_key: bool  #: decoding can begin here: an IDR picture whose parameter sets are known
+    after_gap: bool  #: between the picture before and this one something is missing, or there was none before
+    width: int  #: [px]
+    height: int
+    reason: str = ""  #: why no stream of such pictures is handed on; empty if it can be
+
+
+class Inspector:
+    """Looks at the access units of one stream, one after the other, without decoding.
+
+    Remembers parameter sets, which a stream may send once, and puts them in front of each key picture. Of a stream
+    with several sequence parameter sets, the last one counts.
+
+    Args:
+        parameters: Sets that came beside the stream (of SDP or a container), in Annex B form.
+    """
+
+    def __init__(self, parameters: bytes = b"") -> None:
+        self._sets: dict[int, dict[bytes, bytes]] = {SPS: {}, PPS: {}}  # of each type, by its beginning
+        self._sequence: Sequence | None = None
+        self._before: Slice | None = None
+        for unit in units(parameters):
+            self._remember(unit)
+
+    def inspect(self, data: bytes) -> Unit | None:
+        """Look at the next access unit, in Annex B form.
+
+        Returns:
+            None if it holds no picture, or one whose headers are damaged or unknown; the next one is after a gap then.
+        """
+        found = units(data)
+        kinds = {unit_type(unit) for unit in found}
+        for unit in found:
+            self._remember(unit)
+        slices = [unit for unit in found if unit_type(unit) in (SLICE, IDR)]
+        if not slices or self._sequence is None:
+            if slices:
+                self._before = None
+            return None
+        try:
+            heads = [parse_slice(unit, self._sequence) for unit in slices]
+        except DecodeError:
+            self._before = None
+            return None
+        now, before = heads[0], self._before
+        is_key = IDR in kinds and all(self._sets.values())
+        self._before = now
+        gap = not now.is_first or (not is_key and (before is None or self._is_missing(before, now)))
+        if is_key and not {SPS, PPS} <= kinds:
+            sets = [known for of_kind in self._sets.values() for known in of_kind.values()]
+            data = START + START.join([*sets, *(unit for unit in found if unit_type(unit) not in (SPS, PPS))])
+        return Unit(data, is_key, gap, self._sequence.width, self._sequence.height, self._reason(heads))
+
+    def restart(self) -> None:
+        """Pictures were left out: none continues the last one."""
+        self._before = None
+
+    def _is_missing(self, before: Slice, now: Slice) -> bool:
+        assert self._sequence is not None
+        return not self._sequence.gaps_allowed and missing_between(before, now, self._sequence) != 0
+
+    def _reason(self, heads: list[Slice]) -> str:
+        assert self._sequence is not None
+        if any(head.is_b for head in heads):
+            return "pictures build on later ones (B-frames)"
+        return "pictures are interlaced" if self._sequence.interlaced else ""
+
+    def _remember(self, unit: bytes) -> None:
+        kind = unit_type(unit)
+        if kind not in self._sets:
+            return
+        if kind == SPS:
+            try:
+                sequence = parse_sequence(unit)
+            except DecodeError:
+                return  # a damaged one: that of before counts, and the decoder has the last word
+            if sequence != self._sequence:
+                self._sequence, self._before = sequence, None
+                for known in self._sets.values():
+                    known.clear()
+        known = self._sets[kind]
+        number = _set_number(unit)
+        if number not in known and len(known) >= MAX_SETS:
+            known.clear()
+        known[number] = unit
+
+
+def _set_number(unit: bytes) -> bytes:
+    """The number of a parameter set, as the key that it is remembered by."""
+    bits = _Bits(unit[4 if unit_type(unit) == SPS else 1 :][:_HEADER_BYTES])
+    try:
+        return bytes([bits.exp_golomb() % 256])
+    except DecodeError:
+        return b""

@@ -1,0 +1,155 @@
+"""Video on the page in Chromium: H.264 decoded and drawn, JPEGs where it can't be; a stalled page harms nobody."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+import skyloop
+from skyloop.messages import FlightState
+from tests.cockpit.browser import WATCHED, Deck, DronePage
+from tests.cockpit.test_page_faults import stopped
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytestmark = pytest.mark.process
+pytest.importorskip("av", reason="H.264 needs: pip install 'skyloop[video]'")
+
+NO_DECODER: Final = "delete window.VideoDecoder"
+BROKEN: Final = "VideoDecoder.prototype.decode = () => { throw new Error('broken') }"
+INSECURE: Final = "Object.defineProperty(window, 'isSecureContext', { value: false })"
+#: Loses what comes over WebSockets in binary while ``window.lose`` is above 0, and notes what is sent.
+LOSES: Final = """
+window.lose = 0;
+window.said = [];
+window.WebSocket = class extends WebSocket {
+  constructor(...given) {
+    super(...given);
+    this.addEventListener("message", (event) => {
+      if (window.lose <= 0 || typeof event.data === "string") return;
+      window.lose -= 1;
+      event.stopImmediatePropagation();
+    });
+  }
+  send(text) {
+    window.said.push(text);
+    super.send(text);
+  }
+};
+"""
+#: Some of them: all would take long to get here.
+PIXELS: Final = """canvas => [...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data]
+  .filter((_, at) => at % 37 === 0)"""
+MOST_S: Final = 40.0  # on a machine that is busy pictures come late, and it is tried again
+FAR: Final = 12.0  # of 255, on average: two encodings of one picture are nearer than that
+
+
+@pytest.fixture(scope="module")
+def open_cockpit(open_cockpit: tuple[Browser, str]) -> Iterator[tuple[Browser, str]]:
+    """The cockpit, with one drone that stands."""
+    from tests.processes.conftest import Process
+
+    drone = Process("-m", "skyloop", "proxy", WATCHED, "--name", "film")
+    try:
+        drone.until("ready")
+        yield open_cockpit
+    finally:
+        drone.end()
+
+
+def form(page: DronePage) -> str:
+    return page.attribute(".camera", "data-form")
+
+
+def pixels(page: DronePage) -> list[int]:
+    found: list[int] = page.pane.locator(".video").evaluate(PIXELS)
+    return found
+
+
+@pytest.mark.daily
+def test_h264_is_decoded_and_drawn_as_the_jpeg_is(deck: Deck) -> None:
+    page = deck.page("film")
+    page.until(lambda: form(page).startswith("h264"), "H.264 is shown", MOST_S)
+    page.wait_for_new_picture()
+    rate = page.pane.locator(".chip.rate")
+    page.until(lambda: "H.264" in (rate.text_content() or "") and "kB/s" in (rate.text_content() or ""), "it says so")
+    assert (rate.get_attribute("title") or "").startswith("H.264")
+    plain = deck.page("film", prepare=NO_DECODER)
+    plain.until(lambda: form(plain) == "jpeg", "JPEGs are shown")
+    assert "decodes no H.264" in plain.attribute(".chip.rate", "title")
+    one, other = pixels(page), pixels(plain)
+    assert len(one) == len(other) > 8000
+    assert sum(abs(a - b) for a, b in zip(one, other, strict=True)) / len(one) < FAR
+    assert max(one) > 0
+    assert (page.problems, plain.problems) == ([], [])
+
+
+def test_a_browser_that_fails_to_decode_gets_jpegs(deck: Deck) -> None:
+    page = deck.page("film", prepare=BROKEN)
+    page.until(lambda: "could not decode" in page.attribute(".chip.rate", "title"), "it gave up")
+    assert form(page) == "jpeg"
+    page.wait_for_new_picture()
+
+
+def test_over_plain_http_the_page_says_why_and_what_to_do(deck: Deck) -> None:
+    page = deck.page("film", prepare=INSECURE)
+    page.until(lambda: form(page) == "jpeg", "JPEGs are shown")
+    assert "only over https" in page.attribute(".chip.rate", "title")
+    page.page.get_by_role("button", name="Settings").click()
+    page.page.get_by_text("skyloop cockpit --https").wait_for()
+
+
+def test_a_key_is_asked_for_after_a_gap(deck: Deck) -> None:
+    page = deck.page("film", prepare=LOSES)
+    page.until(lambda: form(page).startswith("h264"), "H.264 is shown", MOST_S)
+    page.wait_for_new_picture()
+    page.page.evaluate("window.lose = 2")
+    page.until(lambda: page.page.evaluate("window.said.includes('{\"key\":true}')"), "a key picture is asked for")
+    page.wait_for_new_picture()
+    page.wait_for_new_picture()
+    assert form(page).startswith("h264")
+    assert page.problems == []
+
+
+def test_tiles_show_h264_and_tell_what_it_takes(deck: Deck) -> None:
+    page = deck.overview()
+    tile = page.page.locator('.tile[data-drone="film"]')
+    page.until(lambda: (tile.get_attribute("data-form") or "").startswith("h264"), "H.264 is shown", MOST_S)
+    title = tile.locator("canvas").get_attribute("title") or ""
+    assert "kB/s" in title
+    shown = int(tile.get_attribute("data-frames") or "0")
+    page.until(lambda: int(tile.get_attribute("data-frames") or "0") >= shown + 10, "pictures go on")
+    assert page.problems == []
+
+
+def test_a_stopped_page_harms_neither_the_pilot_nor_other_pages(open_cockpit: tuple[Browser, str], deck: Deck) -> None:
+    browser, _ = open_cockpit
+    session = browser.new_browser_cdp_session()
+
+    def renderers() -> set[int]:
+        processes = session.send("SystemInfo.getProcessInfo")["processInfo"]
+        return {one["id"] for one in processes if one["type"] == "renderer"}
+
+    live = deck.page("film")
+    live.until(lambda: form(live).startswith("h264"), "H.264 is shown", MOST_S)
+    others = renderers()
+    frozen = deck.page("film")
+    frozen.until(lambda: form(frozen).startswith("h264"), "H.264 is shown", MOST_S)
+    frozen.wait_for_new_picture()
+    with skyloop.connect("film", name="flies.py") as pilot:
+        pilot.takeoff()
+        with stopped(*(renderers() - others)):
+            until_s = time.monotonic() + 3.0
+            while time.monotonic() < until_s:
+                pilot.velocity(yaw_rate=0.2)
+                live.wait_for_new_picture()
+                assert live.attribute(".camera", "data-stale") == "false"
+                assert pilot.feedback().state is FlightState.FLYING
+        pilot.land()
+    frozen.until(lambda: frozen.attribute(".camera", "data-stale") == "false", "it is live again")
+    frozen.wait_for_new_picture()
+    assert (live.problems, frozen.problems) == ([], [])
