@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -180,15 +178,6 @@ def test_a_form_for_one_follows_what_it_acknowledges(bench: Bench) -> None:
         time.sleep(0.002)
     assert len(pictures(app)) <= before + 8
     assert form.skipped >= 12
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a priority for each thread")
-def test_who_encodes_gives_way_to_who_flies(bench: Bench) -> None:
-    shown(bench, watcher(bench), 1)
-    (thread,) = (one for one in threading.enumerate() if one.name == "skyloop-h264-front")
-    assert thread.native_id is not None
-    assert os.getpriority(os.PRIO_PROCESS, thread.native_id) >= 10
-    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) < 10 or os.nice(0) >= 10
 
 
 def test_a_slow_path_gets_smaller_pictures_and_larger_ones_only_after_a_while(bench: Bench) -> None:

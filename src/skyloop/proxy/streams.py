@@ -8,11 +8,8 @@ does not.
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -40,7 +37,6 @@ IDLE_S: Final = 1.0  #: a form without a subscriber for so long ends its thread
 GOOD_BITS: Final = 0.2  #: for a pixel of a picture: more is not worth its bytes
 _FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
-_NICENESS: Final = 10  # of the threads that encode: pilots' commands come first
 _FPS: Final = 30.0  # of a camera that doesn't say
 _BETTER_NS: Final = nanoseconds(3.0)  # a larger picture only after so long: each change costs a key picture
 #: How the rate of the vehicle's own pictures may be to what the path carries, for them to be handed on, and to go on.
@@ -202,7 +198,6 @@ class StreamForm:
             thread.join()
 
     def _run(self) -> None:
-        _give_way()
         while (picture := self._next()) is not None:
             try:
                 self._encode(picture)
@@ -370,13 +365,6 @@ class Streams:
         """End all threads."""
         for form in self._forms.known:
             form.end()
-
-
-def _give_way() -> None:
-    """Let the calling thread work only while none that flies wants the processor. Linux has a priority for each."""
-    if sys.platform == "linux":
-        with suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
 
 
 def _even(header: FrameHeader, scale: float) -> tuple[int, int]:
