@@ -224,15 +224,17 @@ def warmth(seconds: Seconds = None, minutes: Minutes = None, output: Output = No
 
 
 def recordings(
-    flight: Annotated[float, typer.Option(min=1.0, help="How long the recorded flight is [s]")] = 600.0,
     encode: Annotated[
         bool, typer.Option("--encode/--no-encode", help="Also the export that encodes each picture")
     ] = True,
+    seconds: Annotated[float | None, typer.Option(min=1.0, help="Length of the flight [default: 600]")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="The same in minutes")] = None,
     output: Output = None,
 ) -> None:
     """Measure how long it takes to open, look at, seek in and export a recording."""
     from benchmarks import recordings
 
+    flight = 600.0 if seconds is minutes is None else duration_s(seconds, minutes)
     with measuring("recordings", output) as progress:
         results = recordings.measure(flight, encode=encode, progress=lambda share: progress(share, "a recording"))
     finish("recordings", results, as_rich([recordings.table(results)], str(results.machine)), output)
