@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -25,7 +26,7 @@ from skyloop.cli.bench import (
     parse_sizes,
     print_skipped,
 )
-from skyloop.errors import UsageError
+from skyloop.errors import MissingExtraError, UsageError
 
 
 def peers(
@@ -67,6 +68,9 @@ def load(
     pages: Annotated[
         int, typer.Option(min=0, max=50, help="Of a cockpit, on 640x480 at 15 frames a second; 0 for none")
     ] = 10,
+    encoded: Annotated[
+        bool, typer.Option("--encoded/--no-encoded", help="8 viewers of H.264, one of them stopped")
+    ] = True,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
@@ -87,8 +91,17 @@ def load(
     if pages and (problem := cockpit_problem()):
         skipped[load.pages_name(pages)] = problem
         pages = 0
+    if encoded and find_spec("av") is None:
+        skipped[load.ENCODED] = str(MissingExtraError("encoding H.264", "video"))
+        encoded = False
     cases = load.cases_of(
-        numbers, slow_processor=slow_processor, stuck=stuck, recorder=recorder, disk_full=disk_full, pages=pages
+        numbers,
+        slow_processor=slow_processor,
+        stuck=stuck,
+        recorder=recorder,
+        disk_full=disk_full,
+        pages=pages,
+        encoded=encoded,
     )
     with measuring("load", output) as progress:
         results = load.measure(wanted_s, cases, record_to=record_to, skipped=skipped, progress=progress)
@@ -211,15 +224,17 @@ def warmth(seconds: Seconds = None, minutes: Minutes = None, output: Output = No
 
 
 def recordings(
-    flight: Annotated[float, typer.Option(min=1.0, help="How long the recorded flight is [s]")] = 600.0,
     encode: Annotated[
         bool, typer.Option("--encode/--no-encode", help="Also the export that encodes each picture")
     ] = True,
+    seconds: Annotated[float | None, typer.Option(min=1.0, help="Length of the flight [default: 600]")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="The same in minutes")] = None,
     output: Output = None,
 ) -> None:
     """Measure how long it takes to open, look at, seek in and export a recording."""
     from benchmarks import recordings
 
+    flight = 600.0 if seconds is minutes is None else duration_s(seconds, minutes)
     with measuring("recordings", output) as progress:
         results = recordings.measure(flight, encode=encode, progress=lambda share: progress(share, "a recording"))
     finish("recordings", results, as_rich([recordings.table(results)], str(results.machine)), output)

@@ -7,13 +7,14 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import msgspec
 
 from benchmarks.disk import small_disk
-from benchmarks.onlookers import observe, record, show
+from benchmarks.onlookers import OWN, SHARED, observe, record, show
 from skyloop.bench.contract import Arrivals
 from skyloop.bench.machine import Machine, cpu_time_s
 from skyloop.bench.ours import proxy_name
@@ -27,6 +28,7 @@ from skyloop.files import MAX_RESULTS, read_json
 TURN_S: Final = 5.0
 RECORDED_PERIOD_S: Final = 1 / 30
 STUCK_AMONG: Final = 8  #: observers, one of which is stopped
+ENCODED: Final = "8 viewers of H.264, one of them stopped"  #: half of one form, the others of one of their own
 _ANSWERS_WITHIN_S: Final = 20.0
 
 ALONE: Final = "nobody else"
@@ -46,6 +48,7 @@ class Case(NamedTuple):
     name: str
     observers: int = 0
     stuck: bool = False  #: the last of the observers is stopped
+    encoded: bool = False  #: the observers take H.264
     slow: bool = False
     recorder: bool = False
     killed: bool = False  #: the recorder, half-way through
@@ -102,6 +105,7 @@ def cases_of(
     recorder: bool = True,
     disk_full: bool = True,
     pages: int = 0,
+    encoded: bool = False,
 ) -> list[Case]:
     """Return the cases to measure.
 
@@ -112,6 +116,7 @@ def cases_of(
         recorder: Whether to measure a recorder, and one that is killed.
         disk_full: Whether to measure a recorder whose disk is full.
         pages: How many pages of a cockpit to measure; 0 for none.
+        encoded: Whether to measure viewers of H.264.
     """
     cases = [Case(ALONE)]
     counts = sorted({number for number in observers if number > 0})
@@ -121,6 +126,8 @@ def cases_of(
         cases.append(Case(observers_name(number), observers=number))
         if stuck and number == STUCK_AMONG:
             cases.append(Case(observers_name(number, stuck=True), observers=number, stuck=True))
+    if encoded:
+        cases.append(Case(ENCODED, observers=STUCK_AMONG, stuck=True, encoded=True))
     if slow_processor:
         cases.append(Case(SLOW, slow=True))
     if pages:
@@ -256,7 +263,7 @@ class _Stage:
         pair = self._pairs[case.slow]
         observers = self._observers[: case.observers]
         pair.open(turn)
-        _tell(observers, "connect")
+        _tell(observers, ["connect"] if not case.encoded else [SHARED, OWN])
         recorder = self._start_recorder(turn, fill=case.disk_full) if case.recorder else None
         pages = self._workers.start(show, self._proxy, case.pages) if case.pages else None
         parts = {
@@ -295,9 +302,9 @@ class _Stage:
         return worker
 
 
-def _tell(workers: Sequence[Worker], word: str) -> None:
-    """All at once, then all their answers."""
-    for worker in workers:
+def _tell(workers: Sequence[Worker], words: Sequence[str]) -> None:
+    """All at once, these words in turn, then all their answers."""
+    for worker, word in zip(workers, cycle(words), strict=False):
         worker.pipe.send(word)
     for worker in workers:
         worker.answer(_ANSWERS_WITHIN_S)

@@ -129,6 +129,8 @@ def emulate(pipe: Pipe, ports: Sequence[Ports]) -> None:
         ]
         for firmware in made:
             stack.enter_context(firmware)
+        gc.collect()
+        gc.freeze()  # vehicles have no collector that stops all of them
         loop.start()
         stack.callback(loop.stop)
         pipe.send([firmware.address for firmware in made])
@@ -249,9 +251,9 @@ def fly(pipe: Pipe, count: int, seconds: float) -> None:
                 stack.callback(drone.close)
         stack.enter_context(suppress(SkyloopError))  # at its end the swarm tells again who failed
         formation = _Formation(stack.enter_context(Swarm(drones)))
-        formation.take_off()
         gc.collect()
-        gc.freeze()
+        gc.freeze()  # once it is connected, as docs/host.md advises
+        formation.take_off()
         pipe.send(len(formation.drones.active))
         begin_ns = pipe.recv()
         if begin_ns is None:

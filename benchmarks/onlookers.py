@@ -20,18 +20,26 @@ from skyloop.errors import LinkError, MissingExtraError
 if TYPE_CHECKING:
     from skyloop.cockpit.testing import Pages
 
+#: What an observer is told that is to take H.264: all of one form, or each of its own.
+SHARED: Final = "h264"
+OWN: Final = "h264, own"
+_KBIT_S: Final = 1000
 _LOOK_S: Final = 0.02  #: shorter than the pause between two frames of a page
 
 
 def observe(pipe: Pipe, proxy: str) -> None:
     """Run an observer of feedback and video, which connects when told to and sends at the end what it received."""
     pipe.send("ready")
-    while pipe.recv() is not None:
+    while (word := pipe.recv()) is not None:
         recorder = Recorder()
         listening = Listening(recorder.received)
         with connect(proxy, access="observe", name="observer") as drone:
             drone.on_feedback(listening.feedback, inline=True)
-            drone.on_frame(listening.frame, camera=CAMERA, inline=True)
+            if word in (SHARED, OWN):
+                rate = _KBIT_S if word == SHARED else None
+                drone.on_encoded(listening.picture, camera=CAMERA, kbit_s=rate, inline=True)
+            else:
+                drone.on_frame(listening.frame, camera=CAMERA, inline=True)
             pipe.send("connected")
             pipe.recv()
         pipe.send(recorder.arrivals)

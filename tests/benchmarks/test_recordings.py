@@ -13,7 +13,7 @@ from benchmarks.command import build
 
 def test_the_command_measures_what_is_done_with_a_recording(tmp_path: Path) -> None:
     ended = CliRunner().invoke(
-        build("recordings"), ["--flight", "1", "--output", str(tmp_path)], env={"COLUMNS": "120"}
+        build("recordings"), ["--seconds", "1", "--output", str(tmp_path)], env={"COLUMNS": "120"}
     )
     assert ended.exit_code == 0, ended.output
     results = msgspec.json.decode((tmp_path / "recordings.json").read_bytes(), type=recordings.Recordings)

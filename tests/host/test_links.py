@@ -33,7 +33,7 @@ class Link:
     def fileno(self) -> int:
         return self.near.fileno()
 
-    def serve(self) -> int | None:
+    def serve(self, *, readable: bool) -> int | None:
         if self.stopping:
             return None
         self.served += 1

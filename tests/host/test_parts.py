@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import cast
 
 from skyloop.host.own_process import FIRST_PAUSE_S, LONGEST_PAUSE_S, pause_s
-from skyloop.host.ticker import Ticker
+from skyloop.host.ticker import WHOLE_ROUNDS, Ticker
 from skyloop.host.watchdog import HANG_LOOKS, LOOK_S, STALL_LOOKS, SharedLoop, Watchdog
 from skyloop.host.workers import IDLE_THREADS, MAX_THREADS, RequestWorkers
+from skyloop.proxy import Proxy
 from skyloop.transport.testing import wait_until
 from tests.proxy.fake import Bench
 
@@ -112,6 +115,45 @@ def test_a_ticker_that_is_split_goes_on_with_its_one_proxy() -> None:
         wait_until(lambda: len(ticks["one"]) > counts["one"] + 10, "the other one goes on")
         assert len(ticks["two"]) == count
         ticker.close()
+
+
+class Ticked:
+    """Stands in for a proxy, and keeps how it was ticked."""
+
+    name = "ticked"
+
+    def __init__(self, *, at_rest: bool) -> None:
+        self.at_rest = at_rest
+        self.ticks: list[str] = []
+
+    def clock(self) -> int:
+        return 0
+
+    def tick(self, _: int) -> None:
+        self.ticks.append("whole")
+
+    def tick_flight(self, _: int) -> None:
+        self.ticks.append("flight")
+
+
+def test_a_vehicle_at_rest_has_a_fifth_of_the_ticks_of_one_that_flies() -> None:
+    flies, rests = Ticked(at_rest=False), Ticked(at_rest=True)
+    ticker = Ticker(lambda *_: None, cast(list[Proxy], [flies, rests]))
+    wait_until(lambda: len(flies.ticks) >= 4 * WHOLE_ROUNDS, "there were four rounds of each")
+    ticker.close()
+    whole = [number for number, tick in enumerate(flies.ticks) if tick == "whole"]
+    assert [later - number for number, later in pairwise(whole)] == [WHOLE_ROUNDS] * (len(whole) - 1)
+    assert set(rests.ticks) == {"whole"}
+    assert abs(len(rests.ticks) - len(whole)) <= 1
+
+
+def test_one_that_rests_has_all_ticks_as_soon_as_somebody_takes_it() -> None:
+    rests = Ticked(at_rest=True)
+    ticker = Ticker(lambda *_: None, cast(list[Proxy], [rests]))
+    wait_until(lambda: bool(rests.ticks), "it is ticked")
+    rests.at_rest = False
+    wait_until(lambda: rests.ticks.count("flight") >= WHOLE_ROUNDS, "it is ticked in each round")
+    ticker.close()
 
 
 def test_the_jobs_of_a_lane_are_done_in_order_and_one_at_a_time() -> None:

@@ -13,6 +13,7 @@ from skyloop.messages import (
     Hover,
     Idle,
     Land,
+    LinkState,
     Refusal,
     ReleaseAuthority,
     Takeoff,
@@ -225,3 +226,40 @@ def test_a_driver_whose_failsafe_raises_against_its_contract_is_tried_again(
     monkeypatch.undo()
     bench.run(0.3)
     assert bench.driver.told == [Hover()]
+
+
+def test_nothing_is_at_rest_from_a_grant_until_the_flight_is_over(bench: Bench) -> None:
+    """What is at rest may be ticked seldom: neither a pilot on the ground nor anything in the air is."""
+    bench.driver.report(state=FlightState.LANDED)
+    bench.run(1.1)
+    assert bench.proxy.at_rest
+    pilot = bench.pilot()
+    assert not bench.proxy.at_rest
+    bench.take_off(pilot)
+    pilot.end.close()
+    bench.run(10.0, lambda: pytest.fail("it flies") if bench.proxy.at_rest else None)
+    assert bench.driver.told[-1] == Land()
+    bench.driver.report(state=FlightState.LANDED)
+    bench.run(1.1)
+    assert bench.proxy.at_rest
+
+
+def test_a_link_that_broke_and_feedback_that_is_due_are_no_rest(bench: Bench) -> None:
+    bench.driver.report(state=FlightState.LANDED)
+    bench.run(1.1)
+    bench.driver.link(LinkState.UP)
+    bench.run(0.1)
+    assert bench.proxy.at_rest
+    bench.driver.link(LinkState.LOST)
+    assert not bench.proxy.at_rest
+    bench.run(0.1)
+    assert bench.proxy.at_rest
+    bench.proxy.publisher.stamp({})
+    assert not bench.proxy.at_rest
+
+
+def test_what_others_fly_is_not_at_rest(bench: Bench) -> None:
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(1.1)
+    assert bench.proxy.handler.ownership.others
+    assert not bench.proxy.at_rest

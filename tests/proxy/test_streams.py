@@ -248,7 +248,7 @@ def test_an_encoder_that_fails_is_reported_and_made_anew(
     told = threading.Event()
     made._fail = lambda why: (failed.append(why), told.set())  # type: ignore[assignment, func-returns-value]
     with monkeypatch.context() as broken:
-        broken.setattr(streams, "H264Encoder", lambda *_: (_ for _ in ()).throw(ValueError("no encoder today")))
+        broken.setattr(streams, "H264Encoder", lambda *_, **__: (_ for _ in ()).throw(ValueError("no encoder today")))
         made.put(header(1), np.zeros(64 * 48 * 3, np.uint8))
         assert told.wait(WAIT_S)
     assert "no encoder today" in failed[0]

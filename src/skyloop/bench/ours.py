@@ -10,7 +10,7 @@ from skyloop.bench.vehicle import CAMERA, USUAL_CAMERA, BenchVehicle, stamped
 from skyloop.bench.waypoints import Setpoint
 from skyloop.client import Drone, Frame, connect
 from skyloop.client.channels import VideoOptions
-from skyloop.messages import Feedback
+from skyloop.messages import EncodedFrame, Feedback
 from skyloop.proxy import Proxy
 from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
@@ -73,6 +73,10 @@ class Listening:
     def frame(self, frame: Frame) -> None:
         """Report a frame."""
         self._received(VIDEO, frame.captured_ns)
+
+    def picture(self, picture: EncodedFrame) -> None:
+        """Report an encoded picture."""
+        self._received(VIDEO, picture.captured_ns)
 
 
 class Application:

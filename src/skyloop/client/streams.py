@@ -11,7 +11,7 @@ import numpy as np
 
 from skyloop.client.channels import Channel
 from skyloop.clock import Clock
-from skyloop.messages import EncodedFrame, Encoding, FrameHeader, StreamReport, encode
+from skyloop.messages import EncodedFrame, FrameHeader, StreamReport, encode
 from skyloop.messages.encoded import H264, Chain, Pieces
 from skyloop.pyav import new_decoder
 from skyloop.transport.base import Pixels
@@ -129,17 +129,7 @@ class StreamDecoder:
                 continue
             self._stream.report(picture.seq)
             height, width = pixels.shape[:2]
-            header = FrameHeader(
-                picture.camera,
-                picture.seq,
-                picture.captured_ns,
-                picture.published_ns,
-                width,
-                height,
-                Encoding.BGR8,
-                pixels.nbytes,
-                picture.intrinsics if (width, height) == (picture.width, picture.height) else None,
-            )
+            header = picture.decoded(width, height)
             self._deliver(header, pixels.reshape(-1), came_ns)
 
     def _next(self) -> tuple[EncodedFrame, int] | None:

@@ -137,8 +137,11 @@ class ServedLink(Protocol):
     def fileno(self) -> int:
         """Return what becomes readable when :meth:`serve` is to be called."""
 
-    def serve(self) -> int | None:
+    def serve(self, *, readable: bool) -> int | None:
         """Do what there is to do, without waiting. What it raises is reported already; it is tried again after a pause.
+
+        Args:
+            readable: Whether :meth:`fileno` is; if not, only the time asks for it.
 
         Returns:
             When to call it again at the latest, on the monotonic clock [ns]; None: never, but :meth:`end` once.

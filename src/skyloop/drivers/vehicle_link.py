@@ -223,12 +223,12 @@ class VehicleLink(ABC, Generic[S]):
             with self.lock:
                 self.session.failed(error)
 
-    def _step(self, *, wait: bool = True) -> None:
+    def _step(self, *, wait: bool = True, look: bool = True) -> None:
         self._renew()  # before the wait, so that no socket is closed between being ready and being read
         with self.lock:
             self._awake_ns = self.session.due_ns
             wait_ns = self._awake_ns - self._clock() if wait else 0
-        for key, _ in self._selector.select(max(0.0, seconds(wait_ns))):
+        for key, _ in self._selector.select(max(0.0, seconds(wait_ns))) if look else ():
             key.data()
         with self.lock:
             now_ns = self._clock()
@@ -266,13 +266,13 @@ class VehicleLink(ABC, Generic[S]):
         """Return what is readable when there is something to read."""
         return self._selector.fileno()
 
-    def serve(self) -> int | None:
+    def serve(self, *, readable: bool) -> int | None:
         """Do what there is to do; see :class:`skyloop.drivers.base.ServedLink`."""
         if self._stopping.is_set():
             return None
         self._within = threading.get_ident()
         try:
-            self._step(wait=False)
+            self._step(wait=False, look=readable)
         except Exception as error:
             self._deliver([partial(_report_failure, error)])
             raise

@@ -11,6 +11,8 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from heapq import heapify, heappop, heappush
+from itertools import count
 from typing import Any, Final
 
 from skyloop.clock import nanoseconds, seconds
@@ -18,6 +20,7 @@ from skyloop.drivers.base import ServedLink
 from skyloop.drivers.vehicle_link import PAUSE_S
 
 _LONGEST_WAIT_NS: Final = 1_000_000_000
+_MOST_STALE: Final = 4  #: entries of the queue for each link, before those that no longer count are thrown out
 
 
 class LinkThread:
@@ -39,6 +42,8 @@ class LinkThread:
         self._lock = threading.Lock()  # guards who is in there
         self._members: dict[ServedLink, Any] = {}
         self._due_ns: dict[ServedLink, int] = {}
+        self._queue: list[tuple[int, int, ServedLink]] = []  # a heap: when due; an entry of another time is stale
+        self._order = count()  # of entries that are due at once
         self._paused: set[ServedLink] = set()  # after an error: not waited for
         self._closing = False
         self._selector.register(self._awake, selectors.EVENT_READ)
@@ -55,7 +60,8 @@ class LinkThread:
             vehicle: What :attr:`inside` shows while it is served.
         """
         with self._lock:
-            self._members[link], self._due_ns[link] = vehicle, 0
+            self._members[link] = vehicle
+            self._plan(link, 0)
             self._selector.register(link, selectors.EVENT_READ, link)
         self._wake()
 
@@ -75,7 +81,8 @@ class LinkThread:
             self._thread.join()
 
     def _forget(self, link: ServedLink) -> None:
-        del self._members[link], self._due_ns[link]
+        del self._members[link]
+        self._due_ns.pop(link, None)
         self._paused.discard(link)
         self._unwatch(link)
 
@@ -83,20 +90,49 @@ class LinkThread:
         with suppress(KeyError, ValueError, OSError):
             self._selector.unregister(link)
 
+    def _plan(self, link: ServedLink, due_ns: int) -> None:
+        """Have a link served again by then. With the lock held."""
+        if self._due_ns.get(link) == due_ns:
+            return
+        self._due_ns[link] = due_ns
+        heappush(self._queue, (due_ns, next(self._order), link))
+        if len(self._queue) > _MOST_STALE * len(self._due_ns):
+            self._queue = [entry for entry in self._queue if self._due_ns.get(entry[2]) == entry[0]]
+            heapify(self._queue)
+
+    def _next_ns(self) -> int | None:
+        """Return when the next link is due; None without any. With the lock held."""
+        queue = self._queue
+        while queue and self._due_ns.get(queue[0][2]) != queue[0][0]:
+            heappop(queue)
+        return queue[0][0] if queue else None
+
+    def _due(self, now_ns: int) -> set[ServedLink]:
+        """Return the links that are due. With the lock held."""
+        due: set[ServedLink] = set()
+        while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
+            link = heappop(self._queue)[2]
+            del self._due_ns[link]  # until it was served
+            due.add(link)
+        return due
+
     def _run(self) -> None:
         while not self._closing:
             with self._lock:
-                next_ns = min(self._due_ns.values(), default=time.monotonic_ns() + _LONGEST_WAIT_NS)
+                next_ns = self._next_ns()
+            if next_ns is None:
+                next_ns = time.monotonic_ns() + _LONGEST_WAIT_NS
             wait_s = seconds(max(0, min(next_ns - time.monotonic_ns(), _LONGEST_WAIT_NS)))
             ready = {key.data for key, _ in self._selector.select(wait_s)}
             if None in ready:
+                ready.remove(None)
                 with suppress(OSError):
                     self._awake.recv(4096)
             now_ns = time.monotonic_ns()
             with self._lock:
-                turns = [link for link, due_ns in self._due_ns.items() if link in ready or due_ns <= now_ns]
+                turns = ready | self._due(now_ns)
             for link in turns:
-                self._serve(link)
+                self._serve(link, readable=link in ready)
             self.inside = None
         with self._lock:
             left = list(self._members)
@@ -106,26 +142,27 @@ class LinkThread:
         self._awake.close()
         self._waker.close()
 
-    def _serve(self, link: ServedLink) -> None:
+    def _serve(self, link: ServedLink, *, readable: bool) -> None:
         with self._lock:
             vehicle = self._members.get(link)
             if vehicle is None:
                 return  # it is another thread's meanwhile
             if link in self._paused:
                 self._paused.remove(link)
+                readable = True  # it may be: it was not waited for
                 self._selector.register(link, selectors.EVENT_READ, link)
         self.inside = vehicle
         self.entries += 1
         failed = False
         due_ns: int | None
         try:
-            due_ns = link.serve()
+            due_ns = link.serve(readable=readable)
         except Exception:  # noqa: BLE001  it has told; the links of all others go on
             failed, due_ns = True, time.monotonic_ns() + nanoseconds(PAUSE_S)
         with self._lock:
             if due_ns is not None:
                 if link in self._members:
-                    self._due_ns[link] = due_ns
+                    self._plan(link, due_ns)
                     if failed:
                         self._unwatch(link)
                         self._paused.add(link)

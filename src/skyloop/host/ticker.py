@@ -1,4 +1,7 @@
-"""One thread that updates all proxies of a process 50 times a second: authority, failsafes, software autopilots."""
+"""One thread that updates all proxies of a process 50 times a second: authority, failsafes, software autopilots.
+
+What is not the flight's, and everything of a vehicle that nobody flies, has its turn only in each fifth round.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,8 @@ from skyloop.proxy.core.autopilot import PERIOD_S
 
 #: Ticks in a row that raise, half a second of them, until a proxy counts as failed: it has no failsafe any more.
 MAX_FAILURES: Final = 25
+#: Rounds from one to the next in which a proxy does everything: ten times a second.
+WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
 #: Called with a proxy whose ticks raise, and the last error, on the ticker's thread; must return at once.
@@ -67,20 +72,28 @@ class Ticker:
     def _run(self) -> None:
         period_ns = nanoseconds(PERIOD_S)
         due_ns = time.monotonic_ns() + period_ns
+        rounds = 0
         while not self._closing.wait(max(0, due_ns - time.monotonic_ns()) / 1e9):
             with self._lock:
                 proxies = list(self._failures)
-            for proxy in proxies:
-                if proxy in self._failures:  # it is not another ticker's meanwhile
-                    self._tick(proxy)
+            for place, proxy in enumerate(proxies, rounds):  # each round a fifth of them, so that all are alike long
+                failures = self._failures.get(proxy)
+                if failures is not None:  # it is not another ticker's meanwhile
+                    self._tick(proxy, whole=failures > 0 or place % WHOLE_ROUNDS == 0)
             self.inside = None
+            rounds += 1
             due_ns = max(due_ns + period_ns, time.monotonic_ns())  # late ones are not made up for
 
-    def _tick(self, proxy: Proxy) -> None:
+    def _tick(self, proxy: Proxy, *, whole: bool) -> None:
         self.inside = proxy
         self.entries += 1
         try:
-            proxy.tick(proxy.clock())
+            if whole:
+                proxy.tick(proxy.clock())
+            elif proxy.at_rest:
+                return
+            else:
+                proxy.tick_flight(proxy.clock())
         except Exception as error:  # noqa: BLE001  whatever is wrong with one vehicle, the others need their failsafes
             self._failed(proxy, error)
         else:

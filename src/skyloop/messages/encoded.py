@@ -7,7 +7,8 @@ from typing import Annotated, Final
 
 import msgspec
 
-from skyloop.messages.frame import Intrinsics, Name, Pixels
+from skyloop.messages.frame import FrameHeader, Intrinsics, Name, Pixels
+from skyloop.messages.kinds import Encoding
 from skyloop.messages.numbers import Count, TimeNs
 
 H264: Final = "h264"  #: the one codec that is recorded as it comes
@@ -39,6 +40,13 @@ class EncodedFrame(msgspec.Struct, frozen=True, array_like=True):
     topic: Topic = ""  #: that it was published on; empty: ``stream/CAMERA``, as the vehicle encoded it
     piece: Annotated[int, msgspec.Meta(ge=0, lt=MAX_PIECES)] = 0
     pieces: Annotated[int, msgspec.Meta(ge=1, le=MAX_PIECES)] = 1
+
+    def decoded(self, width: int, height: int) -> FrameHeader:
+        """Return the header of the frame that was decoded from it, in BGR and of this size [px]."""
+        same = (width, height) == (self.width, self.height)
+        times = (self.captured_ns, self.published_ns)
+        lens = self.intrinsics if same else None  # it is for the announced size
+        return FrameHeader(self.camera, self.seq, *times, width, height, Encoding.BGR8, width * height * 3, lens)
 
 
 class StreamReport(msgspec.Struct, frozen=True, array_like=True):

@@ -61,7 +61,10 @@ class ActionExecutor:
     @property
     def airborne(self) -> bool:
         """Whether the vehicle flies, or may: one that never reports its state does from its first command on."""
-        state = self.state
+        return self.is_airborne(self.state)
+
+    def is_airborne(self, state: FlightState) -> bool:
+        """Return :attr:`airborne` for a flight state that was read."""
         return state.airborne or (state is FlightState.UNKNOWN and isinstance(self._in_force, _FLYING))
 
     def left_to(self) -> str:

@@ -245,6 +245,17 @@ class CommandHandler:
         return self._executor.airborne and self.ownership.ours
 
     @property
+    def at_rest(self) -> bool:
+        """Whether nothing flies, nobody is in command and nothing is to be done. Takes no lock."""
+        return (
+            self.authority.holder is None
+            and self.ladder.idle
+            and not self.ownership.ours
+            and self._vehicle.link_breaks == self._breaks_seen
+            and not self._executor.airborne
+        )
+
+    @property
     def piloted(self) -> bool:
         """Whether somebody in command flies the vehicle now. Takes no lock."""
         return self.authority.holder is not None and self._executor.airborne
@@ -444,7 +455,8 @@ class CommandHandler:
     def _observe_ownership(self, now_ns: int) -> None:
         """Observe whose flight it is by now, and act on a change."""
         executor = self._executor
-        changed = self.ownership.observe(executor.state, executor.airborne, executor.left_to(), now_ns)
+        state = executor.state
+        changed = self.ownership.observe(state, executor.is_airborne(state), executor.left_to(), now_ns)
         if changed is None:
             return
         self.on_ownership(changed.whose is Whose.OURS)
@@ -461,9 +473,10 @@ class CommandHandler:
     def _update_failsafe(self, now_ns: int) -> None:
         self._observe_ownership(now_ns)
         feedback = self._vehicle.feedback_now
+        state = self._executor.state
         inputs = FailsafeInputs(
-            state=self._executor.state,
-            airborne=self._executor.airborne,
+            state=state,
+            airborne=self._executor.is_airborne(state),
             last_command_ns=self.authority.last_command_ns,
             pilot=self._pilot,
             link_up=self._vehicle.link_up,

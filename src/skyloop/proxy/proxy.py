@@ -396,14 +396,23 @@ class Proxy:
 
     def tick(self, now_ns: int) -> None:
         """Update what goes by time: authority, failsafe, software autopilot, feedback of a silent vehicle, events."""
-        self.handler.tick(now_ns)
+        self.tick_flight(now_ns)
         self._end_silent(now_ns)
-        self.publisher.keep_alive(now_ns)
         self.workers.tick(now_ns)
         self.events.tick(now_ns)
+        self.overview.tick(now_ns)
+
+    def tick_flight(self, now_ns: int) -> None:
+        """Update of what :meth:`tick` does that which a flight needs 50 times a second; the rest may be seldom."""
+        self.handler.tick(now_ns)
+        self.publisher.keep_alive(now_ns)
         flown = self.handler.piloted and not self._stopping.is_set()  # a tick may come back after the end, from a hang
         self.keep_warm(self.handler.warm_s if flown else 0.0)
-        self.overview.tick(now_ns)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether nothing flies, nobody is in command, and feedback shows so: there is nothing to hurry for."""
+        return self.handler.at_rest and self.publisher.is_shown
 
     def _end_silent(self, now_ns: int) -> None:
         """End connections without a Hello: they take places from others."""

@@ -157,6 +157,11 @@ class VehiclePublisher:
         self._owner = owner
         self._published_ns = -KEEP_ALIVE_NS
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether feedback shows the proxy's own fields and the link as they are."""
+        return self._published_ns >= 0
+
     def keep_alive(self, now_ns: int) -> None:
         """Publish what the proxy knows if the vehicle has been silent. Call some times a second."""
         if now_ns - self._published_ns < KEEP_ALIVE_NS:

@@ -55,7 +55,7 @@ class ReturnSupervisor:
         if not ours:
             checks.back = None
         before = self.start, self.phase
-        back = checks.back if executor.airborne else None
+        back = checks.back if checks.back is not None and executor.airborne else None
         self.start = checks.start.position
         self.phase = ReturnPhase.NONE if back is None else back.phase
         return (self.start, self.phase) != before

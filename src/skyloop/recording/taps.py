@@ -215,18 +215,7 @@ class Stream:
             return
         self._begun = True
         self.newest_ns = now_ns
-        width, height = picture.width, picture.height
-        header = FrameHeader(
-            picture.camera,
-            picture.seq,
-            picture.captured_ns,
-            picture.published_ns,
-            width,
-            height,
-            Encoding.BGR8,
-            width * height * 3,
-            picture.intrinsics,
-        )
+        header = picture.decoded(picture.width, picture.height)
         record = FrameRecord(header, now_ns, H264, picture.key)
         size = len(picture.data) + _SIZE
         self._put(self._channel, Rank.FRAME, Picture(record, picture.data), size, now_ns)

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession
-from skyloop.drivers.mavlink.setpoints import Goal
+from skyloop.drivers.mavlink.setpoints import STEP_NS, Goal
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
-from skyloop.messages import FlightState, Hover, Idle, Land, LinkState, Severity, Takeoff, Velocity
+from skyloop.messages import EmergencyStop, FlightState, Hover, Idle, Land, LinkState, Severity, Takeoff, Velocity
 from skyloop.wire.mavlink.codec import Codec
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.texts import chunks_of
@@ -434,7 +434,11 @@ def test_a_vehicle_is_asked_after_as_often_as_something_is_under_way() -> None:
     bench.session.command(Land(), bench.clock())
     assert bench.session.setpoints is not None
     assert bench.session.setpoints.goal is Goal.LAND
-    assert next_ns() == TICK_NS, "a landing is followed step by step"
+    assert bench.session.due_ns <= bench.clock(), "it begins at once"
+    assert next_ns() == STEP_NS, "and is followed step by step"
+    bench.session.command(EmergencyStop(), bench.clock())
+    assert bench.session.due_ns <= bench.clock()
+    assert next_ns() == TICK_NS, "a stop is hurried"
 
 
 @AUTOPILOTS
@@ -447,7 +451,12 @@ def test_a_vehicle_at_rest_is_missed_in_time_and_its_mode_seen_at_once(autopilot
             bench.tick()
         assert bench.clock() - heard_ns == pytest.approx(after_ns, abs=1000)
     bench.found()
+    bench.tick()
+    bench.hear(bench.vehicle.heartbeat())
+    assert bench.session.due_ns > bench.clock(), "one that says nothing new"
+    bench.vehicle.armed = True
     for message in (bench.vehicle.heartbeat(), m.MAVLink_current_mode_message(0, 1, 1)):
+        bench.clock.advance(0.001)
         bench.tick()
         bench.hear(message)
         assert bench.session.due_ns <= bench.clock()

@@ -252,6 +252,7 @@ class VehicleClock:
         self.round_trip_s: float | None = None  #: of the best answer lately
         self.restarted = False  #: its clock was set back; read and cleared by the owner
         self._samples: deque[tuple[int, int, int]] = deque()  # when, round trip, their clock minus ours
+        self._offset_ns: int | None = None  # their clock minus ours, of the best sample
         self._asked_ns = 0
         self._asked = 0
         self._live = LiveClock()
@@ -274,7 +275,8 @@ class VehicleClock:
             self._samples.append((now_ns, round_trip_ns, message.tc1 - (message.ts1 + round_trip_ns // 2)))
             while now_ns - self._samples[0][0] > KEEP_NS:
                 self._samples.popleft()
-            self.round_trip_s = seconds(min(each[1] for each in self._samples))
+            _, best_ns, self._offset_ns = min(self._samples, key=lambda each: each[1])
+            self.round_trip_s = seconds(best_ns)
         return []
 
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
@@ -290,9 +292,8 @@ class VehicleClock:
             if step < -REBOOT_MS and boot_ms < before:
                 self.restarted = True
         live_ns = self._live.captured_ns(boot_ms / 1000.0, now_ns)
-        if self._samples:
-            _, _, offset_ns = min(self._samples, key=lambda each: each[1])
-            synced_ns = boot_ms * 1_000_000 - offset_ns
+        if self._offset_ns is not None:
+            synced_ns = boot_ms * 1_000_000 - self._offset_ns
             # Stamps are cut to whole milliseconds, so they may be that much too early.
             if 0 <= now_ns - synced_ns <= PLAUSIBLE_NS:
                 live_ns = synced_ns

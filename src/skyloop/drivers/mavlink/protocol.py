@@ -79,6 +79,7 @@ class MavlinkSession(VehicleSession):
         self._heartbeat_ns = -HEARTBEAT_NS
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
+        self._said: tuple[int | None, bool, int] | None = None  # mode, whether it is armed, MAV_STATE, when last looked
         self._unsupported_reason = "no data from it"
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
 
@@ -216,7 +217,10 @@ class MavlinkSession(VehicleSession):
             if age_s is None or age_s > QUIET_ATTITUDE_S:
                 self._publish(self.clock.now(now_ns), now_ns)
         if kind in _MODES:
-            self.due_ns = 0  # a caller that waits for a mode can go on
+            said = self.telemetry.custom_mode(), self.telemetry.armed(), self.telemetry.status()
+            if said != self._said:
+                self._said = said
+                self.due_ns = 0  # a caller that waits for a mode can go on
 
     def _publish(self, captured_ns: int, now_ns: int) -> None:
         vehicle = self.vehicle_state(now_ns)
@@ -320,7 +324,7 @@ class MavlinkSession(VehicleSession):
     # Losing and finding ------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        self._received_ns = None
+        self._received_ns = self._said = None
         self._selector.forget()
         self.parameters.fail_writes(reason)
         self.commands.reset()

@@ -54,6 +54,7 @@ CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 CUT_PACE_S: Final = 0.2
 CUT_FOR_NS: Final = nanoseconds(10.0)  #: a stop is sent for so long at most, while the vehicle reports that it is armed
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
+STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
 HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
 
 
@@ -98,6 +99,7 @@ class SetpointController:
         self._entered = False  # the mode that is wanted was seen since
         self._strayed_ns: int | None = None  # since when it is another one again
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
+        self._stepped_ns = 0  # when what is wanted now had its last step; 0: it has not had one
         self._cut_ns = 0
         self._events: list[VehicleEvent] = []
 
@@ -246,6 +248,7 @@ class SetpointController:
     def _end(self) -> None:
         """End whatever was wanted, and the stream."""
         self.goal, self._takeoff, self._setpoint = Goal.NOTHING, None, None
+        self._stepped_ns = 0
         self._lead_ns, self._entered, self._strayed_ns, self._settling_ns = None, False, None, None
 
     # What is reported -----------------------------------------------------------------------------------------------
@@ -303,6 +306,7 @@ class SetpointController:
 
     def messages(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
         """Return the set-points that are due now; commands go to the command sender."""
+        self._stepped_ns = now_ns
         if self.stopped:
             if vehicle.armed and now_ns - self._cut_ns < CUT_FOR_NS:
                 self._commands.request(CUT, now_ns, CUT_PACE_S)
@@ -325,8 +329,10 @@ class SetpointController:
 
     def due_ns(self, now_ns: int) -> int | None:
         """Return when :meth:`messages` has something to do next; None: nothing by the time alone."""
-        if self.stopped or self.goal in (Goal.TAKE_OFF, Goal.HOLD, Goal.LAND):
+        if self.stopped:
             return now_ns
+        if self.goal in (Goal.TAKE_OFF, Goal.HOLD, Goal.LAND):
+            return self._stepped_ns + STEP_NS
         if self.goal is Goal.FOLLOW and self._setpoint is not None:
             return self._sent_ns + self._setpoint.period_ns
         return None

@@ -99,11 +99,8 @@ class Telemetry:
 
     def ages(self, now_ns: int) -> dict[str, Value]:
         """Return the age [s] of each kind, for feedback's ``native``."""
-        return {
-            f"mavlink.age.{kind.lower()}": round(seconds(now_ns - at_ns), 3)
-            for kind, (_, at_ns) in self._newest.items()
-            if kind in _AGED
-        }
+        newest = self._newest
+        return {name: round(seconds(now_ns - newest[kind][1]), 3) for kind, name in _AGED.items() if kind in newest}
 
     # What it means -----------------------------------------------------------------------------------------------
 
@@ -119,7 +116,7 @@ class Telemetry:
     def armed(self) -> bool:
         """Return whether it is armed, by the newest heartbeat."""
         heartbeat = self._newest.get("HEARTBEAT")
-        return heartbeat is not None and bool(heartbeat[0].base_mode & ModeFlag.ARMED)
+        return heartbeat is not None and bool(heartbeat[0].base_mode & _ARMED)
 
     def status(self) -> int:
         """Return ``MAV_STATE`` of the newest heartbeat; 0 if none came."""
@@ -129,10 +126,7 @@ class Telemetry:
     def landed(self, now_ns: int) -> Landed:
         """Return what it reports of standing on the ground."""
         message = self.newest("EXTENDED_SYS_STATE", now_ns, LANDED_S)
-        try:
-            return Landed.UNKNOWN if message is None else Landed(message.landed_state)
-        except ValueError:
-            return Landed.UNKNOWN
+        return Landed.UNKNOWN if message is None else _LANDED.get(message.landed_state, Landed.UNKNOWN)
 
     def prearm_good(self, now_ns: int) -> bool | None:
         """Return whether the pre-arm checks pass; None where the vehicle does not report them."""
@@ -183,12 +177,16 @@ class Telemetry:
         message = self.newest("GLOBAL_POSITION_INT", now_ns, FLOWING_S)
         return None if message is None else (message.vx / 100.0, message.vy / 100.0, message.vz / 100.0)
 
-    def altitude_m(self, now_ns: int) -> float | None:
-        """Return the height [m] above the ground by a downward sensor, else above home, else above the origin."""
+    def altitude_m(self, position: Vector | None, now_ns: int) -> float | None:
+        """Return the height [m] above the ground by a downward sensor, else above home, else above the origin.
+
+        Args:
+            position: As :meth:`position` returns it.
+            now_ns: The present time.
+        """
         sensor = self.newest("DISTANCE_SENSOR", now_ns, FLOWING_S)
         if sensor is not None and sensor.orientation == _DOWN and _in_range(sensor):
             return float(sensor.current_distance) / 100.0
-        position = self.position(now_ns)
         if position is not None:
             return (self._ground_down or 0.0) - position[2]
         message = self.newest("GLOBAL_POSITION_INT", now_ns, FLOWING_S)
@@ -207,26 +205,29 @@ class Telemetry:
             ready: Whether it may be armed; None: unknown.
             now_ns: The present time.
         """
-        attitude = self.attitude(now_ns)
+        attitude, position = self.attitude(now_ns), self.position(now_ns)
         return VehicleState(
             mode=mode,
             armed=self.armed(),
             status=self.status(),
             landed=self.landed(now_ns),
             ready=ready,
-            position=self.position(now_ns),
+            position=position,
             velocity=self.velocity(now_ns),
             yaw=attitude[2] if attitude is not None else None,
-            altitude_m=self.altitude_m(now_ns),
+            altitude_m=self.altitude_m(position, now_ns),
             amsl_m=self.amsl_m(now_ns),
             remote=self.remote(now_ns),
         )
 
 
+_ARMED: Final = int(ModeFlag.ARMED)  # with the flag itself the enumeration's code would run, many times a second
+_LANDED: Final = {int(each): each for each in Landed}
 _DOWN: Final = 25  #: MAV_SENSOR_ROTATION_PITCH_270
 _APART_S: Final = 0.5  #: farther apart two places are not taken together
-_AGED: Final = frozenset(
-    {
+_AGED: Final = {
+    kind: f"mavlink.age.{kind.lower()}"
+    for kind in (
         "HEARTBEAT",
         "ATTITUDE",
         "LOCAL_POSITION_NED",
@@ -234,8 +235,8 @@ _AGED: Final = frozenset(
         "SYS_STATUS",
         "EXTENDED_SYS_STATE",
         "GPS_RAW_INT",
-    }
-)
+    )
+}
 
 
 def _at_the_same_time(local: Message, world: Message) -> tuple[Vector, Message] | None:
@@ -283,7 +284,7 @@ def feedback_of(
         roll_rad=roll,
         pitch_rad=pitch,
         yaw_rad=yaw,
-        altitude_m=telemetry.altitude_m(now_ns),
+        altitude_m=telemetry.altitude_m(position, now_ns),
         velocity_m_s=_velocity(telemetry.velocity(now_ns), yaw),
         angular_velocity_rad_s=_rates(telemetry, now_ns),
         acceleration_m_s2=_force(telemetry, now_ns),
