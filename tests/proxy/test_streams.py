@@ -384,6 +384,18 @@ def test_a_subscriber_that_needs_a_key_gets_one_that_is_encoded_until_the_vehicl
     assert camera.play(1.5)[0].key
 
 
+def test_a_vehicle_that_stops_to_send_its_own_pictures_has_its_frames_encoded() -> None:
+    camera = OwnStream(1000)
+    camera.play(3.0)
+    camera.rate.kbit_s = 2000
+    assert camera.play(2.0)
+    assert camera.form.passing
+    camera.clock.advance(1.1)
+    assert not camera.form.passing
+    assert camera.form.wants(header(1), 1)
+    assert camera.form._anew, "what is encoded now begins with a key picture"
+
+
 def test_only_a_form_that_asks_for_all_pictures_at_full_size_takes_the_vehicles_own() -> None:
     camera = CameraInfo("front", 640, 360, 30.0, stream="h264")
     for options in ("subscriber=me&scale=0.5", "max_fps=5&subscriber=me", "kbit_s=500"):

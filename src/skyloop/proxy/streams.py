@@ -47,6 +47,7 @@ _TRY_AGAIN_NS: Final = nanoseconds(5.0)
 _TRY_AT_MOST_NS: Final = nanoseconds(80.0)
 _OWN_KBIT_S: Final = 12_000  # the most that is tried for them [kbit/s]
 _MEASURE_NS: Final = nanoseconds(1.0)
+_OWN_SILENT_NS: Final = nanoseconds(1.0)  # without one for so long, the vehicle has stopped to send them
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,8 @@ class StreamForm:
         self._rate = StreamRate(most_kbit_s, clock()) if request.subscriber else None
         #: Whether the vehicle's own pictures may be handed on.
         self.takes_own = own and self._rate is not None
-        self.passing = False  #: whether they are, now
+        self._passing = False  # whether they are, as long as they come
+        self._own_ns = 0  # when the newest of them came
         self._limiter = RateLimiter(request.max_fps)
         self._scale, self._better_ns = request.scale, clock()
         self._changed = threading.Condition()  # guards all of the following, and the rate
@@ -110,6 +112,15 @@ class StreamForm:
         self._try_ns, self._again_ns = 0, _TRY_AGAIN_NS
         self._seq = clock() // 1_000_000  # a form that is made anew goes on with higher numbers
 
+    @property
+    def passing(self) -> bool:
+        """Whether the vehicle's own pictures are handed on now: not if it has stopped to send them."""
+        return self._passing and self._clock() - self._own_ns < _OWN_SILENT_NS
+
+    def _encode_again(self) -> None:
+        """Encode from here on, beginning with a key picture. The lock is held."""
+        self._passing, self._wants_key, self._anew = False, True, True
+
     def wants(self, header: FrameHeader, subscribers: int) -> bool:
         """Return whether a frame is to be encoded. On the thread that publishes it; call it once for each.
 
@@ -122,6 +133,8 @@ class StreamForm:
             self._subscribers = subscribers
             if not subscribers or self.passing:
                 return False
+            if self._passing:  # none come any more
+                self._encode_again()
             if self._rate is not None and not self._rate.may_send(self._clock()):
                 self.skipped += 1
                 return False
@@ -162,19 +175,20 @@ class StreamForm:
         rate, now_ns = self._rate, self._clock()
         with self._changed:
             self._measure(len(picture.data), now_ns)
+            self._own_ns = now_ns
             if rate is None or not subscribers or not self._own_kbit_s:
-                self.passing = False
+                self._passing = False
                 return None
             fits = rate.may_send(now_ns)
-            if self.passing and (self._wants_key or not fits or self._own_kbit_s > _KEEP_SHARE * rate.kbit_s):
+            if self._passing and (self._wants_key or not fits or self._own_kbit_s > _KEEP_SHARE * rate.kbit_s):
                 if not self._wants_key:  # it was too much
                     self._try_ns = now_ns + self._again_ns
                     self._again_ns = min(2 * self._again_ns, _TRY_AT_MOST_NS)
-                self.passing, self._wants_key, self._anew = False, True, True
+                self._encode_again()
             begins = picture.key and fits and now_ns >= self._try_ns
-            if not self.passing and begins and self._own_kbit_s <= _BEGIN_SHARE * rate.kbit_s:
-                self.passing, self._wants_key = True, False
-            if not self.passing:
+            if not self._passing and begins and self._own_kbit_s <= _BEGIN_SHARE * rate.kbit_s:
+                self._passing, self._wants_key = True, False
+            if not self._passing:
                 return None
             self._seq += 1
             rate.sent(self._seq, len(picture.data), now_ns)
@@ -237,16 +251,17 @@ class StreamForm:
         if len(data) > MAX_ENCODED:
             raise UsageError(f"it has {len(data)} bytes, at most {MAX_ENCODED} are sent")
         with self._changed:
-            if self.passing:
+            if self._passing:
                 return  # the vehicle's own pictures have taken over meanwhile
             self._seq += 1
+            seq = self._seq
             if is_key:
                 self._wants_key, self._key_ns = False, now_ns
             if self._rate is not None:
-                self._rate.sent(self._seq, len(data), self._clock())
+                self._rate.sent(seq, len(data), self._clock())
         times = (header.captured_ns, header.published_ns)
         self._publish(
-            EncodedFrame(header.camera, self._seq, *times, *size, H264, is_key, data, header.intrinsics, self.topic)
+            EncodedFrame(header.camera, seq, *times, *size, H264, is_key, data, header.intrinsics, self.topic)
         )
 
     def _follow_path(self, header: FrameHeader) -> int:
