@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Final, NamedTuple
 
 from skyloop.bench.workers import Pipe
@@ -12,7 +12,7 @@ from skyloop.client import Drone, Frame, connect
 from skyloop.control import Controller
 from skyloop.drivers.sim import SimDriver, options_of
 from skyloop.drivers.uri import parse_uri
-from skyloop.errors import NoAnswerError
+from skyloop.errors import AuthorityError, LinkError, NoAnswerError
 from skyloop.messages import Applied, Failsafe, Feedback, FlightState, Velocity
 from skyloop.proxy import Proxy
 from skyloop.sim.host import SimHost
@@ -104,7 +104,8 @@ def _hover(drone: Drone) -> None:
         except NoAnswerError:
             if time.monotonic() > deadline:
                 raise
-            drone.takeoff(wait=False)
+            with suppress(LinkError, AuthorityError):  # the link is lost once more, or not yet ours again
+                drone.takeoff(wait=False)
 
 
 def look_on(pipe: Pipe, place: str, names: list[str]) -> None:

@@ -144,7 +144,7 @@ def test_a_stopped_browser_is_a_silent_pilot(open_cockpit: tuple[Browser, str], 
         page.page.keyboard.up("w")
         page.until(lambda: page.pane.locator(".ended").is_visible(), "it tells that control was lost")
         assert "control ran out" in page.says(".ended")
-        assert "Nobody" in page.says(".holder")
+        page.until(lambda: "Nobody" in page.says(".holder"), "it is told who has control now")
         assert not drone.feedback().lease, "it is not taken back by itself"
         page.pane.get_by_role("button", name="Understood").click()
         page.until(lambda: not page.pane.locator(".ended").is_visible(), "it was read")

@@ -10,6 +10,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 import msgspec
@@ -213,7 +214,8 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     set_timeout(sock, socket.SO_RCVTIMEO, ANSWERS_WITHIN_S)
     received = bytearray()
     try:
-        sock.send(msgspec.json.encode(request), socket.MSG_NOSIGNAL)
+        with suppress(BrokenPipeError):  # who is refused is answered and hung up on before having asked
+            sock.send(msgspec.json.encode(request), socket.MSG_NOSIGNAL)
         while (packet := sock.recv(_CHUNK)) and len(received) < MAX_ANSWER:
             received += packet
     except BlockingIOError:
