@@ -19,7 +19,8 @@ from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError,
 from skyloop.logfile.layout import Channel
 from skyloop.logfile.reader import Recording
 from skyloop.messages import Attitude, Feedback
-from skyloop.recording.review.episodes import STATE, Episode, Form, episodes, form_of
+from skyloop.messages.rows import STATE
+from skyloop.recording.review.episodes import Episode, Form, episodes, form_of
 from skyloop.recording.review.lerobot import export_lerobot
 from skyloop.recording.review.tables import Table, tables
 from tests.cli.conftest import Ended

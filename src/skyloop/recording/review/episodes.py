@@ -15,18 +15,9 @@ from numpy.typing import NDArray
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import FlightState
+from skyloop.messages.rows import ACTIONS, STATE
 from skyloop.recording.review.tables import Table
 
-#: What a drone knows of itself, by the names of feedback's columns; what a recording does not know is left out.
-STATE: Final = (
-    *("roll_rad", "pitch_rad", "yaw_rad", "altitude_m"),
-    *("velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s"),
-)
-#: What an application commands, by the name of its set-point.
-ACTIONS: Final[dict[str, tuple[str, ...]]] = {
-    "velocity": ("forward", "left", "up", "yaw_rate"),
-    "attitude": ("roll", "pitch", "climb", "yaw_rate"),
-}
 MARK: Final = "mark"  #: the name of a logged text that begins another episode, whose task it is
 _STILL: Final = "hover"
 _STEERED: Final = (FlightState.HOVERING.value, FlightState.FLYING.value)
@@ -42,8 +33,8 @@ class Form:
     """What each row holds.
 
     Attributes:
-        state: Names of the state's numbers, of :data:`STATE`.
-        set_point: The set-point that was commanded, a key of :data:`ACTIONS`.
+        state: Names of the state's numbers, of :data:`~skyloop.messages.rows.STATE`.
+        set_point: The set-point that was commanded, a key of :data:`~skyloop.messages.rows.ACTIONS`.
         cameras: Whose pictures a row has.
         fps: Rows a second.
     """
