@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import BatteryState, CameraInfo, CompressedImage, Image, Imu
 
 from skyloop.ros.tf_type import tf_message_type
+from skyloop.wire.ros2.tf_message import TYPE_HASH, TYPE_NAME
 
 LASTING = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TOPICS = {  # type, and how many are waited for
@@ -39,6 +40,7 @@ def main() -> None:
     rclpy.init()
     node = rclpy.create_node("bag", namespace=namespace)
     store = get_typestore(Stores.ROS2_JAZZY)
+    assert store.hash_rihs01(TYPE_NAME) == f"RIHS01_{TYPE_HASH.hex()}"
     counts = dict.fromkeys(TOPICS, 0)
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for topic, (kind, quality, _) in TOPICS.items():
