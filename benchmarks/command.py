@@ -223,6 +223,24 @@ def warmth(seconds: Seconds = None, minutes: Minutes = None, output: Output = No
     finish("warmth", results, as_rich([warmth.table(results)], str(results.machine)), output)
 
 
+def ros(
+    ros_python: Annotated[
+        str | None,
+        typer.Option(help="The Python that has rclpy and Skyloop [default: $SKYLOOP_ROS_PYTHON or this one]"),
+    ] = None,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    output: Output = None,
+) -> None:
+    """Measure what the bridge to ROS 2 adds to the delays of commands and images."""
+    from benchmarks import ros
+
+    wanted_s = duration_s(seconds, minutes)
+    with measuring("ros", output) as progress:
+        results = ros.measure(wanted_s, ros_python, progress)
+    finish("ros", results, as_rich([ros.table(results)], str(results.machine)), output)
+
+
 def recordings(
     encode: Annotated[
         bool, typer.Option("--encode/--no-encode", help="Also the export that encodes each picture")
@@ -264,7 +282,7 @@ def video_path(
 
 BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
     function.__name__: function
-    for function in (peers, load, codecs, network, swarm, scale, fleet, learning, warmth, recordings, video_path)
+    for function in (peers, load, codecs, network, swarm, scale, fleet, learning, warmth, ros, recordings, video_path)
 }
 
 
