@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs, into .third-party/, programs that we did not write and that fly the emulated drones in tests/third_party, and
-# what is too large for everybody's environment: Ray, and ROS 2 to compare delays with. Nothing of Skyloop needs them;
+# what is too large for everybody's environment: Ray, and ROS 2. Nothing of Skyloop needs them;
 # without them those tests are skipped. Needs a Python with venv, and node with npm.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -22,7 +22,10 @@ environment mavproxy MAVProxy mavproxy==1.8.75 setuptools & jobs+=($!)
 environment dronekit2 dronekit dronekit2==3.0.0 setuptools & jobs+=($!)
 environment djitellopy djitellopy djitellopy==2.5.0 & jobs+=($!)
 environment ray 'ray, skyloop' --editable '.[sim,ray]' & jobs+=($!)
-environment ros2 'rclpy, skyloop' ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs --editable . & jobs+=($!)
+# Once with Skyloop, and once for a program that knows nothing of it.
+environment ros2 'rclpy, nav_msgs, std_srvs, rosbags, cv2, skyloop.ros' 'rosbags>=0.11' --editable '.[sim,vision,ros]' & jobs+=($!)
+environment ros2-program 'rclpy, std_srvs, cv2' ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs ros-geometry-msgs \
+  ros-std-srvs 'opencv-python-headless>=4.10' & jobs+=($!)
 [[ -e .third-party/node_modules/ar-drone/package.json ]] ||
   npm install --silent --no-audit --no-fund --prefix .third-party ar-drone@0.3.3 & jobs+=($!)
 # Not the newest OpenCV, whose 5 changed shapes and dtypes of ArUco's results: to be put before the installed one.

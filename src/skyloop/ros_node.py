@@ -11,6 +11,7 @@ import re
 import tempfile
 import threading
 from collections.abc import Iterable, Mapping, MutableMapping
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,7 +26,10 @@ DISCOVERY_VARIABLES: Final = (
     "ROS_LOCALHOST_ONLY",
     "ROS_DISCOVERY_SERVER",
 )
-PROFILES_VARIABLE: Final = DISCOVERY_VARIABLES[0]
+#: Where Fast DDS 3 looks for a profile, and Fast DDS 2, of Jazzy and before.
+PROFILES_VARIABLE, OLD_PROFILES_VARIABLE = DISCOVERY_VARIABLES[:2]
+_OLD_DISTRIBUTIONS: Final = ("humble", "iron", "jazzy")
+_FIRST_WITH_FAST_DDS_3: Final = 8  #: major version of rclpy
 MOST_DOMAIN: Final = 101  #: above it, the ports of DDS may be taken by outgoing connections on Linux
 SHARED_BYTES: Final = 16 * 2**20  #: shared memory of a participant: several pictures, where 512 KiB hold not even one
 
@@ -91,16 +95,27 @@ def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> 
         Whether it was left to this.
     """
     if any(environment.get(variable) for variable in DISCOVERY_VARIABLES):
-        return PROFILES_VARIABLE in environment and environment[PROFILES_VARIABLE] == _profile.get("path")
+        return _profile.get("path") in (environment.get(variable) for variable in DISCOVERY_VARIABLES[:2])
+    if environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") != "rmw_fastrtps_cpp":
+        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # which another DDS keeps by itself
+        return True
     folder = tempfile.TemporaryDirectory(prefix="skyloop-ros-")
     atexit.register(folder.cleanup)
     path = Path(folder.name) / "loopback.xml"
     path.write_text(LOOPBACK_PROFILE)
-    environment[PROFILES_VARIABLE] = _profile["path"] = str(path)
+    variable = OLD_PROFILES_VARIABLE if _has_fast_dds_2(environment) else PROFILES_VARIABLE
+    environment[variable] = _profile["path"] = str(path)
     return True
 
 
 _profile: dict[str, str] = {}  # the path of the profile that was written
+
+
+def _has_fast_dds_2(environment: Mapping[str, str]) -> bool:
+    try:
+        return int(version("ros-rclpy").partition(".")[0]) < _FIRST_WITH_FAST_DDS_3
+    except (PackageNotFoundError, ValueError):  # a distribution's own
+        return environment.get("ROS_DISTRO", "") in _OLD_DISTRIBUTIONS
 
 
 def domain_of(text: str | None) -> int | None:

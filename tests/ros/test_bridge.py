@@ -20,7 +20,14 @@ from skyloop.proxy.proxy import Proxy
 from skyloop.ros import Bridge, Settings
 from skyloop.ros.names import Frames, namespaces_of
 from skyloop.ros.tf_type import tf_message_type
-from skyloop.ros_node import DISCOVERY_VARIABLES, PROFILES_VARIABLE, domain_of, ros_name, stay_on_this_machine
+from skyloop.ros_node import (
+    DISCOVERY_VARIABLES,
+    OLD_PROFILES_VARIABLE,
+    PROFILES_VARIABLE,
+    domain_of,
+    ros_name,
+    stay_on_this_machine,
+)
 from skyloop.transport.memory import MemoryServer
 from tests.integration.fake_vehicle import FakeVehicle
 from tests.ros.fake_rclpy import Fake, Message, Node
@@ -360,3 +367,9 @@ def test_this_machine_only_unless_the_environment_says_otherwise() -> None:
     assert stay_on_this_machine(alone)
     assert "<address>127.0.0.1</address>" in Path(alone[PROFILES_VARIABLE]).read_text()
     assert PROFILES_VARIABLE not in os.environ
+    old = {"ROS_DISTRO": "humble"}
+    assert stay_on_this_machine(old)
+    assert "<address>127.0.0.1</address>" in Path(old[OLD_PROFILES_VARIABLE]).read_text()
+    other = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+    assert stay_on_this_machine(other)
+    assert other["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from skyloop.ros_node import LOOPBACK_PROFILE, PROFILES_VARIABLE
+from skyloop.ros_node import LOOPBACK_PROFILE, OLD_PROFILES_VARIABLE, PROFILES_VARIABLE
 from tests.third_party.conftest import HERE, absent
 
 SECONDS = 30.0
@@ -43,7 +43,8 @@ def python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sockets: Path) -> st
         absent("SKYLOOP_ROS_PYTHON names no interpreter with rclpy and Skyloop: scripts/third-party.sh makes one")
     profile = tmp_path / "loopback.xml"
     profile.write_text(LOOPBACK_PROFILE)
-    monkeypatch.setenv(PROFILES_VARIABLE, str(profile))
+    for variable in (PROFILES_VARIABLE, OLD_PROFILES_VARIABLE):  # whichever version of Fast DDS it is
+        monkeypatch.setenv(variable, str(profile))
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(sockets))
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     monkeypatch.setenv("PYTHONPATH", str(HERE.parents[1] / "src"))
