@@ -95,7 +95,7 @@ def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> 
         Whether it was left to this.
     """
     if any(environment.get(variable) for variable in DISCOVERY_VARIABLES):
-        return _profile.get("path") in (environment.get(variable) for variable in DISCOVERY_VARIABLES[:2])
+        return bool(_profile) and _profile["path"] in map(environment.get, DISCOVERY_VARIABLES[:2])
     if environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") != "rmw_fastrtps_cpp":
         environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # which another DDS keeps by itself
         return True
