@@ -159,7 +159,10 @@ def _running(command: list[str], environment: dict[str, str], ready: str) -> Ite
         finally:
             if child.poll() is None:
                 child.send_signal(signal.SIGINT)
-                child.wait(30)
+                try:
+                    child.wait(30)
+                except subprocess.TimeoutExpired:
+                    child.kill()
 
 
 if __name__ == "__main__":

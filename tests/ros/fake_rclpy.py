@@ -21,7 +21,7 @@ class Message:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name.isupper():
             raise AttributeError(name)
-        made = [] if name in ("poses", "transforms") else "" if name == "frame_id" else Message()
+        made: Any = [] if name in ("poses", "transforms") else "" if name == "frame_id" else Message()
         self.__dict__[name] = made
         return made
 

@@ -172,6 +172,6 @@ def test_transforms_as_the_bytes_of_their_type() -> None:
 
 @given(st.lists(st.text(min_size=0, max_size=9), min_size=1, max_size=4))
 def test_each_transform_begins_aligned(names: list[str]) -> None:
-    packed = encode_transforms([Transform(0, name, name, (0.0,) * 3, (0.0, 0.0, 0.0, 1.0)) for name in names])  # type: ignore[arg-type]
+    packed = encode_transforms([Transform(0, name, name, (0.0,) * 3, (0.0, 0.0, 0.0, 1.0)) for name in names])
     assert struct.unpack_from("<I", packed, 4) == (len(names),)
     assert len(packed) % 4 == 0

@@ -10,6 +10,8 @@ import json
 import math
 import sys
 import time
+from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,13 +25,13 @@ from std_srvs.srv import Trigger
 MARKER, SIZE_M, DISTANCE_M = 7, 0.3, 1.5
 
 
-class Follower(Node):
+class Follower(Node):  # type: ignore[misc]  # rclpy has no types here
     def __init__(self, namespace: str) -> None:
         super().__init__("follower", namespace=namespace)
         self.detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
         half = SIZE_M / 2
         self.square = np.array([(-half, half, 0), (half, half, 0), (half, -half, 0), (-half, -half, 0)])
-        self.matrix = None
+        self.matrix: Any = None
         self.flying = False
         self.frames = self.in_view = 0
         self.ages_ms: list[float] = []
@@ -57,7 +59,7 @@ class Follower(Node):
             self.frames += 1
         self.command.publish(self.towards(found[0]) if found else self.searching())
 
-    def towards(self, corners: np.ndarray) -> Twist:
+    def towards(self, corners: Any) -> Twist:
         _, _, (right, down, ahead) = cv2.solvePnP(
             self.square, corners.reshape(4, 2), self.matrix, self.distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
         )
@@ -82,7 +84,7 @@ class Follower(Node):
         if future.result() is None or not future.result().success:
             raise RuntimeError(f"{name}: {future.result()}")
 
-    def spin(self, seconds: float, until=lambda: False) -> None:
+    def spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end and not until():
             rclpy.spin_once(self, timeout_sec=0.1)

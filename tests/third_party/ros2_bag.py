@@ -9,6 +9,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from geometry_msgs.msg import TwistStamped
@@ -61,14 +62,14 @@ def main() -> None:
             rclpy.spin_once(node, timeout_sec=0.1)
     node.destroy_node()
     rclpy.shutdown()
-    read: dict[str, dict[str, object]] = {}
+    read: dict[str, dict[str, Any]] = {}
     with Reader(folder) as reader:
         for connection, at_ns, data in reader.messages():
             message = store.deserialize_cdr(data, connection.msgtype)
             stamped = message.transforms[0] if connection.topic.startswith("/tf") else message
             stamp = stamped.header.stamp
             known = read.setdefault(connection.topic, {"count": 0, "type": connection.msgtype})
-            known["count"] = int(known["count"]) + 1
+            known["count"] = known["count"] + 1
             known["age_s"] = at_ns / 1e9 - stamp.sec - stamp.nanosec / 1e9
             known["frame"] = stamped.header.frame_id
             if hasattr(message, "transforms"):

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 PERIOD_S, WIDTH, HEIGHT = 0.03, 320, 240
 
 
-class Robot(Node):
+class Robot(Node):  # type: ignore[misc]  # rclpy has no types here
     def __init__(self, namespace: str) -> None:
         super().__init__("robot", namespace=namespace)
         self.x = self.y = self.z = self.yaw = 0.0
