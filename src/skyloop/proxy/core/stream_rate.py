@@ -1,12 +1,12 @@
 """How much of an encoded stream a path carries: judged by what a subscriber acknowledges, the time passed as argument.
 
-Delay comes first. What a picture's round trip takes above the shortest of late is taken for waiting in the path. A queue
-that stands brings the rate below what is delivered (as in Cardwell et al., "BBR: Congestion-Based Congestion Control",
-ACM Queue 14(5), 2016). A mobile network carries ten times as much in one tenth of a second as in the next, so a rate near
-the average often stands still: a single picture that waited for long brings the rate down, too, and it grows so slowly
-that few do. No picture is begun while more is under way than the path delivers in :data:`MOST_WAIT_S`, so that one
-that stalls holds a few pictures and not seconds of them, and nothing has to be thrown away after it was encoded. While
-it stands still a picture is sent now and then, so that a young one is there as soon as anything passes.
+Delay comes first. What a picture's round trip takes above the shortest of late is taken for waiting in the path. A
+queue that stands brings the rate below what is delivered (as in Cardwell et al., "BBR: Congestion-Based Congestion
+Control", ACM Queue 14(5), 2016). A mobile network carries ten times as much in one tenth of a second as in the next,
+so near the average pictures are often late: each time the rate falls, too, and it grows so slowly that few are.
+No picture is begun while more is under way than the path delivers in :data:`MOST_WAIT_S`, so that one that stalls holds
+a few pictures and not seconds of them, and nothing has to be thrown away after it was encoded. While it stands still a
+picture is sent now and then, so that a young one is there as soon as anything passes.
 """
 
 from __future__ import annotations
