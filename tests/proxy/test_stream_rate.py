@@ -176,6 +176,17 @@ def test_what_was_never_sent_changes_nothing() -> None:
     assert (rate.kbit_s, rate.lost, rate.wait_s) == (300, 0, 0.0)
 
 
+def test_what_is_forgotten_holds_nothing_up() -> None:
+    rate = StreamRate(2000, 0)
+    for seq in range(1, 5):
+        rate.sent(seq, 5000, seq * MS)
+    assert not rate.may_send(200 * MS)
+    rate.forget()
+    assert rate.may_send(200 * MS)
+    rate.acknowledged(3, 210 * MS)
+    assert (rate.lost, rate.wait_s) == (0, 0.0)
+
+
 def test_the_size_of_pictures_follows_the_rate() -> None:
     vga = 640 * 480 * 30
     assert picture_form(2000, vga) == (1.0, 1.0)

@@ -149,6 +149,12 @@ class StreamRate:
             growth_1_s = SEARCH_1_S if self._searches or self.kbit_s < START_KBIT_S else GROWTH_1_S
             self.kbit_s = min(self.kbit_s * (1.0 + growth_1_s * step_s), self._most_kbit_s)
 
+    def forget(self) -> None:
+        """Forget what is under way: it will not be acknowledged."""
+        self._under_way.clear()
+        self._waits.clear()
+        self._bytes = 0
+
     def _stands_still(self) -> None:
         if not self._silent:
             self._silent = True
