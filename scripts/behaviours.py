@@ -48,7 +48,7 @@ FOLLOW_S: Final = 40.0
 FOLLOW_RMS_M: Final = 0.25
 SETTLED_NS: Final = 5_000_000_000  # after the first sighting, from when on the distance counts
 LANDING_M: Final = 0.2
-RACE_FPS: Final = 60.0
+RACE_FPS: Final = 15.0
 
 
 class Flight(NamedTuple):

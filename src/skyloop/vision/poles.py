@@ -16,6 +16,8 @@ from skyloop.vision.planar import Array, checked
 
 _LEAST_HEIGHT_PX: Final = 20
 _SLIM: Final = 3.0  # so much higher than wide
+_ABOVE_PX: Final = 6
+_COLOURFUL: Final = 100  # of 255
 _LEAST_SHARE: Final = 0.8  # of the rows in its middle where it is one piece: two behind each other aren't
 
 
@@ -80,11 +82,19 @@ class PoleDetector:
             if line is None:
                 continue
             middle, width_px = line
+            if self._hidden(pixels, x + middle, y):
+                continue
             top = np.array([x + middle, y - 0.5])
             flat = normalised(top[None], intrinsics)[0]
             if np.isfinite(flat).all():
                 found.append(PoleSighting(top, np.array([*flat, 1.0]), width_px))
         return sorted(found, key=lambda one: -one.width_px)
+
+    def _hidden(self, pixels: NDArray[np.uint8], x: float, y: int) -> bool:
+        """Return whether something colourful is right above: a gate's bar that hides the top, more likely than not."""
+        column = min(max(round(x), 0), pixels.shape[1] - 1)
+        above = pixels[max(0, y - _ABOVE_PX) : max(1, y - 1), column : column + 1]
+        return bool((self._cv.cvtColor(above, self._cv.COLOR_BGR2HSV)[..., 1] > _COLOURFUL).any())
 
 
 def _line(shape: NDArray[np.bool_]) -> tuple[float, float] | None:
