@@ -24,7 +24,8 @@ def test_tops_of_poles_and_gates_are_found_where_they_are_whatever_the_tilt() ->
     poles = gates = right = 0
     for number in range(24):
         position = np.array([*rng.uniform((-6.5, -3.5), (-4.8, 1.5)), rng.uniform(1.0, 1.6)])
-        turn = rotation_from_euler(*rng.normal(0.0, 0.08, 2), rng.uniform(-0.5, 0.2))
+        roll, pitch = rng.normal(0.0, 0.08, 2).tolist()
+        turn = rotation_from_euler(roll, pitch, rng.uniform(-0.5, 0.2))
         picture = effects.apply(
             renderer.render(SceneState(position[None], turn[None], ()), FPV_CAMERA.pose(position, turn, 0), FPV_CAMERA),
             number,
