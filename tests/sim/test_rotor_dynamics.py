@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import re
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
-from skyloop.sim.columns import ARRAYS, NUMBERS
+from skyloop.sim.columns import ARRAYS, NUMBERS, Operations
 from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters, with_ideal_sensors
 from skyloop.sim.rotor_dynamics import (
     PLANT_STEP_S,
@@ -27,6 +29,7 @@ from skyloop.sim.rotor_dynamics import (
 )
 from skyloop.sim.rotor_parameters import InstrumentParameters
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
+from tests.docs.pages import rows, section
 
 VEHICLES = [RACER, IRIS, CRAZYFLIE]
 CONSTANTS = [constants_of(vehicle) for vehicle in VEHICLES]
@@ -132,13 +135,14 @@ def test_a_quaternion_stays_a_rotation(
     quaternion: tuple[float, ...],
     turning: tuple[float, ...],
     velocity: tuple[float, ...],
-    speeds: tuple[float, ...],
+    speeds: tuple[float, float, float, float],
 ) -> None:
     turned, *_ = advance(
         NUMBERS, CONSTANTS[one], (*quaternion, *turning), speeds, 0.0, motion(velocity, 0.1), (0.0, 0.0, 10.0), True
     )
-    rows = np.array(rotation(*turned[:4]))
-    assert rows @ rows.T == pytest.approx(np.eye(3), abs=1e-12)
+    w, x, y, z, *_ = turned
+    turn = np.array(rotation(w, x, y, z))
+    assert turn @ turn.T == pytest.approx(np.eye(3), abs=1e-12)
 
 
 @pytest.mark.parametrize("one", range(3))
@@ -150,9 +154,16 @@ def test_rotors_turn_the_body_as_their_places_and_spins_say(
     one: int, faster: tuple[int, int], axis: int, sign: int
 ) -> None:
     """Left ones faster: right side down. Rear ones: nose down. Front left and rear right, clockwise: to the left."""
-    speeds = [500.0 + 50.0 * (rotor in faster) for rotor in range(4)]
+    one_s, two_s, three_s, four_s = [500.0 + 50.0 * (rotor in faster) for rotor in range(4)]
     turned, *_ = advance(
-        NUMBERS, CONSTANTS[one], (*LEVEL, 0.0, 0.0, 0.0), tuple(speeds), 0.0, motion((0, 0, 0)), UNTOUCHED, False
+        NUMBERS,
+        CONSTANTS[one],
+        (*LEVEL, 0.0, 0.0, 0.0),
+        (one_s, two_s, three_s, four_s),
+        0.0,
+        motion((0, 0, 0)),
+        UNTOUCHED,
+        False,
     )
     about = turned[4:]
     assert about[axis] * sign > 0
@@ -198,7 +209,16 @@ def test_the_mixer_stays_within_what_rotors_can(
     )
 )
 def test_numbers_and_arrays_give_the_same_bits(drones: list[tuple[tuple[float, ...], ...]]) -> None:
-    def one_step(do, constants, quaternion, turning, velocity, speeds, wanted, knock):  # type: ignore[no-untyped-def]
+    def one_step(
+        do: Operations,
+        constants: Constants,
+        quaternion: Any,
+        turning: Any,
+        velocity: Any,
+        speeds: Any,
+        wanted: Any,
+        knock: Any,
+    ) -> list[Any]:
         targets = mix(do, constants, turning, speeds, wanted, abs(knock), 0.9 + 0 * knock)
         after, twist = spin(do, constants, speeds, targets)
         volts, amps = load(do, constants, electric_power(constants, after), 12.0 + 0 * knock, 11.0 + 0 * knock)
@@ -208,16 +228,13 @@ def test_numbers_and_arrays_give_the_same_bits(drones: list[tuple[tuple[float, .
         )  # fmt: skip
         return [*after, twist, volts, amps, *state[0], *state[1], *state[2], state[3]]
 
-    rows = []
+    each: list[list[float]] = []
     for constants, (quaternion, turning, velocity, speeds, wanted, knock) in zip(CONSTANTS, drones, strict=True):
-        rows.append(one_step(NUMBERS, constants, quaternion, turning, velocity, speeds, wanted, knock))
+        each.append(one_step(NUMBERS, constants, quaternion, turning, velocity, speeds, wanted, knock))
     columns = [np.array(values).T for values in zip(*drones, strict=True)]
-    quaternion, turning, velocity, speeds, wanted, knock = columns
-    together = one_step(
-        ARRAYS, all_constants(CONSTANTS), tuple(quaternion), tuple(turning), tuple(velocity), tuple(speeds),
-        tuple(wanted), knock,
-    )  # fmt: skip
-    assert np.array(rows).T.tolist() == [row.tolist() for row in together]
+    arrays = [*(tuple(some) for some in columns[:-1]), columns[-1]]
+    together = one_step(ARRAYS, all_constants(CONSTANTS), *arrays)
+    assert np.array(each).T.tolist() == [row.tolist() for row in together]
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
@@ -310,3 +327,26 @@ def test_ideal_sensors_are_ideal_instruments_too() -> None:
     assert ideal is not None
     assert ideal.instruments.gyro_noise_rad_s == ideal.instruments.gps_bias_m == 0.0
     assert ideal.instruments.bias_time_constant_s == InstrumentParameters().bias_time_constant_s
+
+
+def test_the_page_has_the_parameters_of_the_code() -> None:
+    for first, *cells in rows(section("docs/rotors.md", "## Parameters"))[:-1]:
+        names = re.findall(r"`(\w+)`", first)
+        for vehicle, cell in zip(VEHICLES, cells, strict=True):
+            values: list[float] = []
+            for name in names:
+                value = vehicle.mass_kg if name == "mass_kg" else getattr(vehicle.rotors, name)
+                values += value if isinstance(value, tuple) else [value]
+            assert [float(number) for number in cell.split(", ")] == pytest.approx(values, rel=1e-5), first
+
+
+def test_the_page_has_the_errors_of_the_instruments() -> None:
+    standard = InstrumentParameters()
+    table = {row[0]: row[1:3] for row in rows(section("docs/rotors.md", "## Instruments"))}
+    names = ["gyro", "accelerometer", "magnetometer", "barometer", "gps", "gps_velocity", "range", "flow"]
+    values = {field.name: getattr(standard, field.name) for field in fields(standard)}
+    assert len(table) == len(names)
+    for name, cells in zip(names, table.values(), strict=True):
+        for kind, cell in zip(("noise", "bias"), cells, strict=True):
+            found = [value for field, value in values.items() if field.startswith(f"{name}_{kind}_")]
+            assert [float(cell.split()[0])] == found if cell else found == []
