@@ -141,7 +141,7 @@ def test_a_quaternion_stays_a_rotation(
         NUMBERS, CONSTANTS[one], (*quaternion, *turning), speeds, 0.0, motion(velocity, 0.1), (0.0, 0.0, 10.0), True
     )
     w, x, y, z, *_ = turned
-    turn = np.array(rotation(w, x, y, z))
+    turn: np.typing.NDArray[np.float64] = np.array(rotation(w, x, y, z))
     assert turn @ turn.T == pytest.approx(np.eye(3), abs=1e-12)
 
 

@@ -5,12 +5,13 @@ Parameters that are not given have their defaults. ``docs/rotors.md`` repeats th
 Sources: [A] Agilicious, P. Foehn et al., "Agilicious: Open-source and open-hardware agile quadrotor for vision-based
 flight", Science Robotics 7(67), 2022: thrust and torque fit, rotor speeds and lag in its library's ``Quadrotor``. [L]
 The simulator of "Learning on the Fly", Robotics and Perception Group, University of Zurich, 2025: its default
-quadrotor, and for drag a comment in its example of a vehicle. [N] L. Bauersfeld et al., "NeuroBEM: Hybrid Aerodynamic Quadrotor Model", RSS 2021: the same racer's
-5.1-inch propellers. [R] F. Furrer, M. Burri, M. Achtelik, R. Siegwart, "RotorS - A Modular Gazebo MAV Simulator
-Framework", 2016: ``iris.xacro``. [F] J. Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", ETH
-Zurich, 2015. [E] J. Eschmann, D. Albani, G. Loianno, "Data-Driven System Identification of Quadrotors Subject to Motor
-Delays", 2024, as RotorPy 3.0.0 has it. [D] drone-models 0.1.0, Learning Systems and Robotics Lab, 2026: attitude
-responses of three Crazyflies, identified from flights. [B] Bitcraze, Crazyflie 2.1 data sheet.
+quadrotor, and for drag a comment in its example of a vehicle. [N] L. Bauersfeld et al., "NeuroBEM: Hybrid Aerodynamic
+Quadrotor Model", RSS 2021: the same racer's 5.1-inch propellers. [R] F. Furrer, M. Burri, M. Achtelik, R. Siegwart,
+"RotorS - A Modular Gazebo MAV Simulator Framework", 2016: ``iris.xacro``. [F] J. Förster, "System Identification of
+the Crazyflie 2.0 Nano Quadrocopter", ETH Zurich, 2015. [E] J. Eschmann, D. Albani, G. Loianno, "Data-Driven System
+Identification of Quadrotors Subject to Motor Delays", 2024, as RotorPy 3.0.0 has it. [D] drone-models 0.1.0, Learning
+Systems and Robotics Lab, 2026: attitude responses of three Crazyflies, identified from flights. [B] Bitcraze,
+Crazyflie 2.1 data sheet.
 """
 
 from __future__ import annotations
