@@ -26,6 +26,7 @@ class Purpose(IntEnum):
     LIGHT = 7
     LABELS = 8
     LAYOUT = 9
+    INSTRUMENTS = 10
 
 
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
