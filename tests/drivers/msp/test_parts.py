@@ -186,11 +186,9 @@ def test_a_question_is_asked_three_times() -> None:
     questions = Questions()
     questions.ask(1, answers.append)
     questions.ask(2, answers.append)
-    sent = 0
     for step in range(3):
         assert questions.due(step * PATIENCE_NS) == Frame(1)
         assert questions.due(step * PATIENCE_NS + 1) is None
-        sent += 1
     assert questions.due(3 * PATIENCE_NS) == Frame(2)
     assert answers == [None]
     assert not questions.on_frame(Frame(9, b"", Direction.REPLY))

@@ -1,4 +1,4 @@
-"""The session with an emulated board, in simulated time: arming, flight, refusals, silence, failsafe, a pilot's switch."""
+"""The session with an emulated board, in simulated time: arming, flight, refusals, silence, a pilot's switch."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
 from hypothesis import given
@@ -128,10 +129,8 @@ READERS: list[Callable[[bytes], object]] = [
 
 @given(st.sampled_from(READERS), st.binary(max_size=80))
 def test_hostile_payloads(read: Callable[[bytes], object], payload: bytes) -> None:
-    try:
-        read(payload)
-    except DecodeError as error:
-        assert str(error)
+    with suppress(DecodeError):
+        assert read(payload) is not None
 
 
 # Curves --------------------------------------------------------------------------------------------------------------

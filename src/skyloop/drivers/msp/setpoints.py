@@ -190,7 +190,9 @@ class SetpointController:
         return self._wanted
 
     def why_not(self, now_ns: int) -> str:
-        """Return why it can't take off now; empty if nothing is known to prevent it."""
+        """Return why it can't take off now; empty if nothing is known to prevent it, or it is at it already."""
+        if self.phase is not Phase.STANDING:
+            return ""
         if self.stopped:
             return "the motors were stopped: reset the emergency first"
         if not self.receiving or self.report.armed is None:
