@@ -349,6 +349,8 @@ def test_above_the_limit_of_altitude_the_vehicle_comes_down_while_it_is_steered(
 def test_a_vehicle_refuses_what_the_software_autopilot_would_begin() -> None:
     with Bench(actions={"attitude"}) as bench:
         pilot = bench.pilot()
+        bench.driver.report(altitude_m=0.0)
+        bench.driver.answers = False  # it goes on to stand
         bench.driver.refuses = "it can't be armed: THROTTLE"
         pilot.command(Takeoff())
         assert "takeoff: it can't be armed: THROTTLE" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
