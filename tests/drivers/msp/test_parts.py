@@ -250,7 +250,7 @@ def inav_reply(frame: Frame, flags: int) -> Frame:
 
 def test_inav_is_read_and_armed() -> None:
     session, parser, sink = MspSession(options_of(parse_uri("msp:///dev/ttyACM0")), 0), Parser(), RecordingSink()
-    flags, sticks = 0, [0]
+    flags, sticks, now_ns = 0, [0], 0
 
     def run(seconds: float) -> None:
         nonlocal now_ns, sticks
@@ -264,7 +264,6 @@ def test_inav_is_read_and_armed() -> None:
             for publish in session.drain():
                 publish(sink)
 
-    now_ns = 0
     run(1.0)
     assert sink.link_state is LinkState.UP
     assert session.setup is not None

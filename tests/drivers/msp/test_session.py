@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -147,6 +148,7 @@ def test_what_appears_while_it_arms_is_told_by_name() -> None:
         (BoardSettings(ranges=(ModeRange(1, 1, 900, 2100),)), "no AUX channel arms it"),
         (BoardSettings(ranges=(ModeRange(0, 0, 1700, 2100),)), "no AUX channel switches ANGLE mode on"),
         (BoardSettings(rx_msp=False), "sticks do not come by MSP"),
+        (BoardSettings(on_loss=()), "before its failsafe, is not known"),
         (BoardSettings(on_loss=((OnLoss.HOLD, 1500),) * 18), "holds the last roll, pitch, yaw, throttle"),
     ],
 )
@@ -289,11 +291,11 @@ def test_emergency_stop_until_the_reset() -> None:
         bench.session.command(ResetEmergency(), bench.clock.now_ns)
     bench.until(lambda: not bench.board.armed, 0.2)
     bench.run(2.0)
-    assert bench.feedback.state is FlightState.EMERGENCY
+    states = [bench.feedback.state]
     assert bench.session.command(Attitude(climb=0.5), bench.clock.now_ns) == Attitude()
     bench.session.command(ResetEmergency(), bench.clock.now_ns)
     bench.run(0.2)
-    assert bench.feedback.state is FlightState.LANDED
+    assert [*states, bench.feedback.state] == [FlightState.EMERGENCY, FlightState.LANDED]
 
 
 def test_a_crash_disarms_and_is_told() -> None:
@@ -326,3 +328,26 @@ def test_actions_that_it_does_not_name_are_no_surprise() -> None:
     bench = Bench()
     with pytest.raises(AssertionError):
         bench.session.command(Hover(), bench.clock.now_ns)
+
+
+def test_what_does_not_leave_the_ground_is_given_up() -> None:
+    bench = Bench()
+    bench.ready()
+    setpoints = bench.session.setpoints
+    setpoints.limits = replace(setpoints.limits, throttle=0.2)  # less than carries it
+    bench.fly(climb=0.5)
+    bench.until(lambda: bool(bench.texts("no_takeoff")), 5.0)
+    assert "did not leave the ground at 20% throttle" in bench.texts("no_takeoff")[0]
+    bench.until(lambda: not bench.board.armed, 0.2)
+    with pytest.raises(DriverError, match="did not leave the ground"):
+        bench.fly(climb=0.5)
+
+
+def test_a_climb_that_is_lost_before_the_lift_off_ends_the_take_off() -> None:
+    bench = Bench(BoardSettings(barometer=False, gps=False))
+    bench.ready()
+    bench.fly(climb=0.5)
+    bench.until(lambda: bench.board.armed, 2.0)
+    bench.poses = False
+    bench.until(lambda: bool(bench.texts("no_takeoff")), 2.0)
+    assert "no longer measured" in bench.texts("no_takeoff")[0]
