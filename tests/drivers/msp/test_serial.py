@@ -34,11 +34,11 @@ class Wire(threading.Thread):
 
     def run(self) -> None:
         while not self._ending.is_set():
-            for ready in select.select([self._master, self._line], [], [], 0.05)[0]:
-                if ready is self._line:
-                    os.write(self._master, self._line.recv(4096))
-                else:
+            for ready in select.select([self._master, self._line.fileno()], [], [], 0.05)[0]:
+                if ready == self._master:
                     self._line.sendall(os.read(self._master, 4096))
+                else:
+                    os.write(self._master, self._line.recv(4096))
 
     def cut(self) -> None:
         self._ending.set()
