@@ -266,7 +266,8 @@ def test_standing_is_disarmed_with_the_last_words() -> None:
     bench.until(lambda: bench.board.armed, 2.0)
     words = bench.session.last_words(bench.clock.now_ns)
     assert channels(words[5:-1])[4] == 1000, "the arm switch is off"
-    bench.until(lambda: bench.session.setpoints.report.armed is False, 1.0)
+    bench.until(lambda: not bench.board.armed, 1.0)
+    bench.run(0.2)
     bench.take_off()
     assert bench.session.last_words(bench.clock.now_ns) == b""
 
