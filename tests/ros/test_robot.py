@@ -162,6 +162,9 @@ class FakeRobot:
         self.answer: Callable[[bool, str], None] | None = None
         self.offers = True
 
+    def missing(self) -> str:
+        return "" if self.offers else "/robot/takeoff"
+
     def send(self, velocity: Velocity) -> None:
         self.sent.append(velocity)
 
@@ -292,6 +295,21 @@ def test_the_link_is_lost_with_a_reason_and_found_again() -> None:
     rig.tell()
     assert rig.sink.link_state is LinkState.UP
     assert not rig.sink.problems
+
+
+def test_a_robot_whose_services_nobody_offers_is_degraded() -> None:
+    rig = Rig()
+    rig.robot.offers = False
+    rig.tell()
+    assert rig.sink.links == []  # they may be found a little later than its topics
+    rig.clock.advance(6.0)
+    rig.tell()
+    rig.tell()
+    assert rig.sink.links == [(LinkState.DEGRADED, "nobody offers the service /robot/takeoff")]
+    assert "correct its name" in rig.sink.remedy
+    rig.robot.offers = True
+    rig.tell()
+    assert rig.sink.link_state is LinkState.UP
 
 
 def test_frames_have_the_cameras_intrinsics_and_other_sizes_are_named_once() -> None:

@@ -107,6 +107,7 @@ def test_a_program_of_ros_follows_the_marker_and_a_bag_reads_back(start: Any, py
     assert set(bag["/tf_static"]["children"]) >= {"alpha/front_optical_frame", "alpha/odom"}
     for rotation in (*bag["/tf"]["rotations"], *bag["/tf_static"]["rotations"]):
         assert math.hypot(*rotation) == pytest.approx(1.0)
+    assert bag["/tf_static"]["count"] >= 1
     for topic, read in bag.items():
         assert topic == "/tf_static" or 0.0 < read["age_s"] < 2.0, (topic, read)
 

@@ -91,6 +91,10 @@ class RobotLink:
         message.header.frame_id = "base_link"
         self._twists.publish(message)
 
+    def missing(self) -> str:
+        """Return a service that the address names and nobody offers; empty: there is none."""
+        return next((name for name, client in self._clients.items() if not client.service_is_ready()), "")
+
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
         """Call a ``std_srvs/Trigger``, without waiting for the answer.
 

@@ -34,6 +34,7 @@ from skyloop.wire.ros2.conversions import intrinsics_of, nanoseconds_of, pixels_
 
 PERIOD_S: Final = 0.05  #: a velocity is repeated so often, as robots stop when none comes
 AIRBORNE_M: Final = 0.1  #: a robot that flies is off the ground above this height of its odometry
+SERVICES_S: Final = 5.0  #: as long as the robot's services may take to be found
 ANSWER_S: Final = 30.0  #: as long as a service may take
 _FEEDBACK_NS: Final = nanoseconds(PERIOD_S)
 
@@ -43,6 +44,9 @@ class Robot(Protocol):
 
     def send(self, velocity: Velocity) -> None:
         """Publish a velocity."""
+
+    def missing(self) -> str:
+        """Return a service that the address names and nobody offers; empty: there is none."""
 
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
         """Call a ``std_srvs/Trigger``; ``answered`` gets success and message, on any thread.
@@ -176,7 +180,7 @@ class RobotSession:
         silent_s = seconds(now_ns - since_ns)
         if silent_s > self._options.timeout_s:
             self._lose(silent_s)
-        elif self._link is LinkState.UP and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
+        elif self._received_ns is not None and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
             self._publish(max(self._captured_ns, self._received_ns or 0), now_ns)
 
     def close(self) -> None:
@@ -232,9 +236,19 @@ class RobotSession:
         """Note that something came, and return the time."""
         self._received_ns = now_ns = self._clock()
         if self._link is not LinkState.UP:
+            self._find(now_ns)
+        return now_ns
+
+    def _find(self, now_ns: int) -> None:
+        """Report that the robot is there, once its services are found too, or that they are not."""
+        missing = self._robot.missing()
+        if not missing:
             self._link = LinkState.UP
             self._sink.link(LinkState.UP)
-        return now_ns
+        elif self._link is not LinkState.DEGRADED and seconds(now_ns - self._opened_ns) > SERVICES_S:
+            self._link = LinkState.DEGRADED
+            remedy = "start the node that does, or correct its name in the address"
+            self._sink.link(LinkState.DEGRADED, f"nobody offers the service {missing}", remedy)
 
     def _lose(self, silent_s: float) -> None:
         if self._link is LinkState.LOST:
