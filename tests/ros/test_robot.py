@@ -257,6 +257,18 @@ def test_without_odometry_the_services_tell_whether_it_flies() -> None:
     assert rig.sink.feedbacks[-1].position_m is None
 
 
+def test_late_odometry_after_images_alone_does_not_run_backwards() -> None:
+    rig = Rig()
+    rig.session.on_image(image(rig.system()))
+    rig.clock.advance(0.2)
+    rig.session.tick()
+    rig.session.on_odometry(odometry(rig.system() - 300_000_000))  # captured before the image
+    rig.clock.advance(0.2)
+    rig.session.tick()  # odometry that is late is not made up
+    assert rig.sink.feedback_count == 2
+    assert not rig.sink.problems
+
+
 def test_a_robot_on_the_ground_is_driven_between_take_off_and_landing() -> None:
     rig = Rig("ros2://robot?ground=1")
     assert rig.tell() is FlightState.LANDED

@@ -180,8 +180,8 @@ class RobotSession:
         silent_s = seconds(now_ns - since_ns)
         if silent_s > self._options.timeout_s:
             self._lose(silent_s)
-        elif self._received_ns is not None and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
-            self._publish(max(self._captured_ns, self._received_ns or 0), now_ns)
+        elif not self._fields and self._received_ns is not None and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
+            self._publish(self._received_ns, now_ns)  # no odometry tells how the robot is: its images show that it is
 
     def close(self) -> None:
         """Stop what moves: a robot must not go on with an old velocity."""
@@ -264,9 +264,9 @@ class RobotSession:
         )
 
     def _publish(self, captured_ns: int, now_ns: int) -> None:
-        self._captured_ns, self._fed_ns = captured_ns, now_ns
+        self._captured_ns, self._fed_ns = max(self._captured_ns, captured_ns), now_ns
         with self._lock:
-            feedback = Feedback(captured_ns=captured_ns, state=self._state, **self._fields, **self._battery)
+            feedback = Feedback(captured_ns=self._captured_ns, state=self._state, **self._fields, **self._battery)
         self._sink.feedback(feedback)
 
     def _complain(self, text: str) -> None:
