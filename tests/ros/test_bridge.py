@@ -218,6 +218,39 @@ def test_a_flight_and_the_dead_mans_hover(rig: Rig) -> None:
     until(lambda: rig.node.publishers["pilot"].newest.data == "", "nobody flies")
 
 
+def test_velocities_do_not_end_a_landing(rig: Rig) -> None:
+    from skyloop.ros.pilot import Pilot
+
+    sent: list[str] = []
+    landing, landed = threading.Event(), threading.Event()
+
+    def land() -> None:
+        landing.set()
+        assert landed.wait(WAIT_S)
+
+    names = ("takeoff", "hover", "return_to_start", "emergency_stop", "release_authority")
+    drone: Any = SimpleNamespace(
+        land=land, velocity=lambda **how: sent.append("velocity"), **dict.fromkeys(names, lambda: None)
+    )
+    topics: Any = Node("topics", "", [])
+    services: Any = Node("services", "", [])
+    pilot = Pilot(topics, services, drone, None, Frames("one"), priority=None, timeout_s=0.5)  # type: ignore[arg-type]
+    waiting = threading.Thread(target=services.call, args=("land",))
+    waiting.start()
+    assert landing.wait(WAIT_S)
+    topics.subscriptions["cmd_vel"](twist(x=0.5))
+    topics.subscriptions["goal_pose"](goal(1.0, 2.0, 3.0))
+    assert sent == []
+    assert "cmd_vel is ignored during land" in topics.logger.lines
+    landed.set()
+    waiting.join()
+    topics.subscriptions["cmd_vel"](twist(x=0.5))
+    assert sent == ["velocity"]
+    pilot.close()  # and nothing ends the landing at the end
+    topics.subscriptions["cmd_vel"](twist(x=0.5))
+    assert sent == ["velocity"]
+
+
 def test_stamped_velocities_of_others_or_of_long_ago_are_ignored(rig: Rig) -> None:
     assert rig.node.call("authority/request").success
     assert rig.node.call("takeoff").success

@@ -136,6 +136,7 @@ class Bridge:
         Telemetry(node, drone, time, frames)
         self._cameras += [CameraPublisher(node, drone, each, time, frames) for each in drone.capabilities.cameras]
         pilot = Pilot(topics, node, drone, time, frames, priority=settings.priority, timeout_s=settings.timeout_s)
+        self._stack.callback(pilot.close)  # before the drone is left, which lands it
         if settings.priority is not None:
             pilot.request_authority()
         return node, topics

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 from skyloop.client import Drone
@@ -52,6 +54,8 @@ class Pilot:
         self._priority = priority
         self._timeout_s = timeout_s
         self._log = topics.get_logger()
+        self._lock = threading.Lock()
+        self._under_way: list[str] = []  # services that wait until the drone has done it
         # The newest wins, whether its publisher is reliable or not.
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         topics.create_subscription(Twist, "cmd_vel", self.on_velocity, newest)
@@ -79,11 +83,18 @@ class Pilot:
         """
         self._drone.request_authority(self._priority)
 
+    def close(self) -> None:
+        """Ignore what still comes on topics, so that the landing at the end is not ended by it."""
+        with self._lock:
+            self._under_way.append("the end of the bridge")
+
     # Topics: never wait ----------------------------------------------------------------------------------------------
 
     def on_velocity(self, twist: Any) -> None:
         """Fly with the velocity of a ``geometry_msgs/Twist`` (levelled axes); rates of roll and pitch are ignored."""
         linear, angular = twist.linear, twist.angular
+        if self._is_occupied("cmd_vel"):
+            return
         try:
             self._drone.velocity(forward=linear.x, left=linear.y, up=linear.z, yaw_rate=angular.z)
         except SkyloopError as error:
@@ -104,11 +115,32 @@ class Pilot:
 
     def on_goal(self, pose: Any) -> None:
         """Fly to a pose, without waiting."""
+        if self._is_occupied("goal_pose"):
+            return
         try:
             place = self._place(pose)
             self._drone.go_to(x=place["x"], y=place["y"], z=place["z"], yaw=place.get("yaw"), wait=False)
         except SkyloopError as error:
             self._ignored("goal_pose", error)
+
+    def _is_occupied(self, topic: str) -> bool:
+        """Return whether a service is under way: programs go on to publish velocities while they wait for it."""
+        with self._lock:
+            service = self._under_way[-1] if self._under_way else ""
+        if service:
+            self._log.info(f"{topic} is ignored during {service}", throttle_duration_sec=WARN_AGAIN_S)
+        return bool(service)
+
+    @contextmanager
+    def _occupied(self, service: str) -> Iterator[None]:
+        """Ignore velocities and goals within the block."""
+        with self._lock:
+            self._under_way.append(service)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._under_way.remove(service)
 
     def _ignored(self, topic: str, error: SkyloopError) -> None:
         self._log.warning(f"{topic} is ignored: {_in_words_of_ros(error)}", throttle_duration_sec=WARN_AGAIN_S)
@@ -145,7 +177,8 @@ class Pilot:
     def _trigger(self, name: str, act: Callable[[], object]) -> Callable[[Any, Any], Any]:
         def call(_request: Any, response: Any) -> Any:
             try:
-                done = act()
+                with self._occupied(name):
+                    done = act()
             except SkyloopError as error:
                 response.success, response.message = False, _in_words_of_ros(error)
                 self._log.warning(f"{name} failed: {response.message}")
@@ -164,7 +197,8 @@ class Pilot:
             place = self._place(request.goal)
             start = self._drone.feedback().position_m
             near_m = request.tolerance if request.tolerance > 0.0 else NEAR_M
-            self._drone.go_to(x=place["x"], y=place["y"], z=place["z"], yaw=place.get("yaw"), tolerance_m=near_m)
+            with self._occupied("go_to"):
+                self._drone.go_to(x=place["x"], y=place["y"], z=place["z"], yaw=place.get("yaw"), tolerance_m=near_m)
         except SkyloopError as error:
             self._log.error(f"go_to failed: {_in_words_of_ros(error)}")
             return response
