@@ -5,6 +5,7 @@ While a simulated drone flies, every topic is decoded by the schema that the ser
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -97,14 +98,15 @@ def flown_and_seen(modules: Path, url: str) -> dict[str, Any]:
     }
     with skyloop.connect("alpha", name="pilot") as drone:
         drone.takeoff()
-        drone.config["alarms.battery_critical"] = 0.1
         environment = {**os.environ, "NODE_PATH": str(modules)}
         node = ["node", str(HERE / "look_foxglove.js"), json.dumps(order)]
         with subprocess.Popen(node, stdout=subprocess.PIPE, text=True, env=environment) as viewer:
             worker = drone._core.join_processor("detector", code="Detector 1")
-            while viewer.poll() is None:
+            for threshold in itertools.cycle((0.1, 0.2)):
+                if viewer.poll() is not None:
+                    break
                 drone.velocity(yaw_rate=0.3)
-                drone.config["alarms.battery_critical"] = 0.3 - drone.config["alarms.battery_critical"]  # is an event
+                drone.config["alarms.battery_critical"] = threshold  # is an event
                 frame = drone.next_frame(timeout_s=10.0)
                 drone.annotate(frame, [Polyline(((1.0, 1.0), (5.0, 5.0)))], source="tracker")
                 worker.publish(frame, {"score": 0.5})
