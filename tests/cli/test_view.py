@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import skyloop
+from skyloop.recording.live.parameters import ParameterDesk
 from tests.cli.conftest import Run
 from tests.processes.conftest import Process
 from tests.recording.live import fake_rerun
@@ -33,6 +35,23 @@ def test_a_file_of_rerun_for_a_time(run: Run, alpha: Process, tmp_path: Path, mo
     assert ended.out.splitlines() == [f"Rerun: {path}", "alpha: annotations, commands, events, feedback, logs"]
     assert streams[0].closed
     assert streams[0].of("world/drones/alpha", "Transform3D")
+
+
+def test_parameters_are_written_under_a_lease_that_is_held_for_that_moment(alpha: Process) -> None:
+    with skyloop.connect("alpha", access="observe") as observer:
+        desk = ParameterDesk([observer], 31)
+        try:
+            before = observer.config["limits.tilt"]
+            written = desk.write("alpha/limits.tilt", 0.1)
+            assert (written.value, written.refused) == (0.1, "")
+            assert observer.wait(lambda feedback: feedback.owner is None, timeout_s=10.0)
+            with skyloop.connect("alpha", name="pilot", on_exit="hover"):
+                refused = desk.write("alpha/limits.tilt", before)
+            assert refused.value == 0.1
+            assert "alpha/limits.tilt was not written: " in refused.refused
+            assert "pilot" in refused.refused
+        finally:
+            desk.write("alpha/limits.tilt", before)
 
 
 @pytest.mark.parametrize(

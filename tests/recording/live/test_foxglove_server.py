@@ -18,11 +18,13 @@ from skyloop.logfile import layout
 from skyloop.logfile.layout import FrameRecord
 from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Polyline
 from skyloop.recording import foxglove as schemas
+from skyloop.recording import taps
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.live import parameters as module
 from skyloop.recording.live.parameters import ParameterDesk
 from skyloop.recording.translation import Picture
 from tests.integration.fake_vehicle import PERIOD_S, FakeVehicle
+from tests.integration.test_fabric import Node, far
 from tests.recording.live.conftest import WAIT_S, Fly
 from tests.recording.live.viewer import Viewer
 from tests.recording.streams import film
@@ -34,6 +36,7 @@ import itertools
 from skyloop.recording.live.foxglove_server import WAITING, FoxgloveServer
 from skyloop.recording.live.view import View
 
+__all__ = ["far"]
 Show = Callable[..., tuple[View, FoxgloveServer]]
 VIDEO, IMAGE, FRAMES = (f"/alpha/{name}" for name in ("camera/front/video", "camera/front/image", "frames/front"))
 
@@ -169,6 +172,27 @@ def test_frames_in_another_form_than_expected_get_a_topic(fly: Fly, show: Show) 
         assert IMAGE not in viewer.topics
         server.show(frame_item(1, b"\xff\xd8"))
         viewer.until(lambda one: IMAGE in one.topics)
+
+
+def test_from_a_network_frames_come_as_h264_and_in_their_own_form_where_that_can_not_be_had(
+    far: Node, show: Show, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("av", reason="H.264 needs the extra 'video'")
+    with far.connected(access="observe") as drone:
+        video, image = (f"/{drone.name}/camera/front/{kind}" for kind in ("video", "image"))
+        _, server = show(drone)
+        with Viewer(server.url) as viewer:
+            viewer.subscribe(video)
+            viewer.until(lambda one: len(one.of(video)) > 5)
+            assert image not in viewer.topics
+            first = schemas.CompressedVideo.FromString(viewer.of(video)[0]).data
+            assert first.split(b"\x00\x00\x01")[1][0] & 31 == 7  # a key picture, with its parameters
+            viewer.unsubscribe(video)
+            # A proxy that can't encode sends nothing: JPEG is shown instead.
+            monkeypatch.setattr(taps, "_STREAM_GONE_NS", 1)
+            monkeypatch.setattr(drone._core.stream("front", subscriber="x").__class__, "receive", lambda *_: None)
+            viewer.subscribe(video)
+            viewer.until(lambda one: image in one.topics)
 
 
 # Slow viewers --------------------------------------------------------------------------------------------------------

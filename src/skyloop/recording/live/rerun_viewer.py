@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -117,7 +119,7 @@ def _start(host: str, port: int) -> None:
                 "--save FILE writes a file for the viewer elsewhere, --connect URL shows the drones in one elsewhere"
             )
         if time.monotonic() > end:
-            viewer.terminate()
+            os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of what was started
             raise NoAnswerError(f"Rerun's viewer does not listen on {host}:{port} after {_START_S:g} s")
         time.sleep(_LOOK_S)
 
