@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from skyloop.errors import UsageError
+from skyloop.sim.rotor_parameters import InstrumentParameters, RotorParameters
 
 GRAVITY_M_S2 = 9.80665
 
@@ -53,8 +55,8 @@ class VehicleParameters:
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s
     # By roll and pitch set-points near level, firmware may lean against the speed on its own: this deceleration per
-    # square of the speed when the set-point is level, less in proportion to it, and none at the full tilt.
-    level_brake_per_m: float = 0.0
+    # speed when the set-point is level, less in proportion to it, and none at the full tilt.
+    level_brake_per_s: float = 0.0
     climb_gain_per_s: float = 3.0  # estimate; the AR.Drone's whole response is softer, [E] c7 = 1.4 1/s
     altitude_gain_per_s: float = 1.2  # damps the altitude hold with ζ = 0.8 at the climb gain above
     velocity_gain_per_s: float = 2.0  # estimate
@@ -91,9 +93,15 @@ class VehicleParameters:
     restitution: float = 0.35  # share of the speed along the normal that is left after a bounce, estimate
     friction: float = 0.5  # Coulomb, estimate
 
+    #: For a vehicle that is modelled down to its rotors (``docs/rotors.md``); None models its response as a whole. With
+    #: rotors, drag, motor time constant and hover power above have no effect: the rotors' own count.
+    rotors: RotorParameters | None = None
+
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
+            if field.name == "rotors":
+                continue
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
                 raise UsageError(f"{field.name} must be a finite number of at least 0, not {value!r}")
             if value == 0 and field.name in _POSITIVE:
@@ -111,6 +119,11 @@ class VehicleParameters:
             raise UsageError(f"restitution must be from 0 to 1, not {self.restitution:g}: a bounce can't add energy")
         if self.battery_empty_v >= self.battery_full_v:
             raise UsageError("battery_empty_v must be below battery_full_v")
+        if self.rotors is not None and not self.most_thrust < self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):
+            raise UsageError(
+                f"most_thrust {self.most_thrust:g} of the weight must be below what the rotors give, "
+                f"{self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):.2f}: the attitude needs the rest"
+            )
 
 
 _POSITIVE = frozenset(
@@ -137,8 +150,25 @@ _POSITIVE = frozenset(
 
 def with_ideal_sensors(vehicle: VehicleParameters) -> VehicleParameters:
     """Return the same vehicle without sensor noise and biases."""
-    flaws = [field.name for field in fields(vehicle) if "_noise_" in field.name or "_bias_" in field.name]
-    return replace(vehicle, **dict.fromkeys(flaws, 0.0))
+    return with_scaled_flaws(vehicle, 0.0)
+
+
+def with_scaled_flaws(vehicle: VehicleParameters, factor: float) -> VehicleParameters:
+    """Return the same vehicle with the noise and biases of its sensors and instruments multiplied by a factor."""
+    scaled = replace(vehicle, **_scaled_flaws(vehicle, factor))
+    if scaled.rotors is None:
+        return scaled
+    instruments = scaled.rotors.instruments
+    instruments = replace(instruments, **_scaled_flaws(instruments, factor))
+    return replace(scaled, rotors=replace(scaled.rotors, instruments=instruments))
+
+
+def _scaled_flaws(parameters: VehicleParameters | InstrumentParameters, factor: float) -> dict[str, Any]:
+    return {
+        field.name: getattr(parameters, field.name) * factor
+        for field in fields(parameters)
+        if ("_noise_" in field.name or "_bias_" in field.name) and "time_constant" not in field.name
+    }
 
 
 @dataclass(frozen=True, slots=True)
