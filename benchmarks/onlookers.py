@@ -1,4 +1,4 @@
-"""Processes that watch while the pilot flies: observers, a recorder, pages of a cockpit, and a viewer of Foxglove's server."""
+"""Processes that watch while the pilot flies: observers, a recorder, pages of a cockpit, a viewer of Foxglove's."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import uuid
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -132,18 +133,30 @@ class RerunLog:
         """
         self._drones[drone].picture(record, data)
 
-    def close(self) -> None:
+    def taken(self, timeout_s: float) -> bool:
+        """Return whether the viewer, or the disk, has taken all that was added, waiting so long at most, above 0 [s]."""
+        try:
+            self._stream.flush(timeout_sec=timeout_s)
+        except Exception:  # noqa: BLE001  (Rerun's own, which has no common base)
+            return False
+        return True
+
+    def close(self, timeout_s: float = 5.0) -> None:
         """Finish the file, or send what is left.
 
+        Args:
+            timeout_s: How long the viewer may take.
+
         Raises:
-            LinkError: The viewer does not take it.
+            LinkError: The viewer does not take what is left, which is given up.
         """
-        try:
-            self._stream.flush(timeout_sec=5.0)
-        except Exception as error:  # noqa: BLE001  (Rerun's own, which has no common base)
-            raise LinkError(f"the viewer does not take what is left: {error}") from None
-        finally:
+        if self.taken(timeout_s):
             self._stream.disconnect()
+            return
+        # Disconnecting, now or when Python ends, would wait for the viewer for ever.
+        threading.Thread(target=self._stream.disconnect, name="skyloop-rerun-end", daemon=True).start()
+        self._rr.unregister_shutdown()
+        raise LinkError(f"the viewer does not take what is left: it stands still, or is closed ({timeout_s:g} s)")
 
     def _begin(self) -> None:
         self._stream.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

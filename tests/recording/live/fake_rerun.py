@@ -82,6 +82,8 @@ class Module(ModuleType):
         make.RDF = make.H264 = make.RIGHT_HAND_Z_UP = Made(kind)  # type: ignore[attr-defined]
         return make
 
+    def unregister_shutdown(self) -> None: ...
+
     def RecordingStream(self, application: str, *, recording_id: str) -> Stream:  # noqa: N802
         self.streams.append(Stream(application, recording_id=recording_id))
         return self.streams[-1]

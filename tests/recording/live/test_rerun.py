@@ -19,14 +19,30 @@ import pytest
 
 import skyloop
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
+from skyloop.logfile.layout import FrameRecord
 from skyloop.logfile.reader import Recording
-from skyloop.messages import Annotation, Applied, Feedback, LogEntry, Points, Polyline, Position, ReturnToStart
+from skyloop.messages import (
+    Annotation,
+    Applied,
+    Encoding,
+    Feedback,
+    FrameHeader,
+    LogEntry,
+    Points,
+    Polyline,
+    Position,
+    ReturnToStart,
+)
 from skyloop.messages.annotation import Text
+from skyloop.messages.encoded import H264
 from skyloop.recording import rerun_log
+from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.live import rerun_viewer
 from skyloop.recording.live.rerun_viewer import RerunViewer
 from skyloop.recording.live.view import View
 from skyloop.recording.rerun_log import RerunLog, Shown
 from skyloop.recording.review.rrd import export_rrd
+from skyloop.recording.translation import Picture
 from tests.cli.conftest import Ended
 from tests.recording.flights import CAPABILITIES, MS, UNIX_NS
 from tests.recording.live import fake_rerun
@@ -192,6 +208,30 @@ def test_a_viewer_that_runs_is_taken_and_one_that_does_not_start_is_an_error(
         RerunViewer([drone], port=0)
     with pytest.raises(UsageError, match="no address"):
         RerunViewer([drone], connect="here")
+
+
+def test_a_viewer_that_stands_still_is_given_nothing_until_it_goes_on(
+    fly: Fly, streams: list[Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rerun_viewer, "_ASK_NS", 0)
+    viewer = RerunViewer([fly()], save=tmp_path / "flight.rrd")
+    (stream,) = streams
+
+    def show(number: int) -> int:
+        unit = film()[number]
+        header = FrameHeader("front", number, 1, 2, 64, 48, Encoding.BGR8, 64 * 48 * 3)
+        picture = Picture(FrameRecord(header, 3, H264, unit.key), unit.data)
+        viewer.show(Item(0, "video.front", Rank.FRAME, 3, picture, 1000))
+        return len(stream.of(CAMERA, "VideoStream")) - 1  # the first is the codec
+
+    assert [show(0), show(1)] == [1, 2]
+    stream.broken = True
+    assert [show(2), show(3)] == [2, 2]
+    assert viewer.left_out == 2
+    stream.broken = False
+    assert [show(4), show(5), show(6)] == [2, 3, 4]  # goes on with the next key picture
+    viewer.close()
+    assert stream.closed
 
 
 def test_without_rerun_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,16 +15,22 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.client import Drone
+from skyloop.clock import nanoseconds
 from skyloop.errors import LinkError, NoAnswerError, SkyloopError
-from skyloop.logfile.layout import ClockPair
+from skyloop.logfile.layout import ClockPair, FrameRecord
+from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Item
 from skyloop.recording.live.view import Source, check_names
-from skyloop.recording.options import VIDEO
+from skyloop.recording.options import MB, VIDEO
 from skyloop.recording.rerun_log import RerunLog, Shown, rerun_sdk
 from skyloop.recording.translation import Picture
 
 PORT: Final = 9876  #: of Rerun's viewer
 _START_S: Final = 20.0
+_AHEAD: Final = 8 * MB  #: that the viewer may be behind
+_PATIENCE_S: Final = 0.5
+_ASK_NS: Final = nanoseconds(1.0)
+_LAST_S: Final = 5.0
 _LOOK_S: Final = 0.1
 _SHOWN: Final = ("feedback", "commands", "events", "annotations", "logs")
 _log = logging.getLogger(__name__)
@@ -59,6 +65,11 @@ class RerunViewer:
         """
         check_names(drones)
         rerun_sdk()
+        self.left_out = 0  #: samples for which the viewer was too slow
+        self._ahead = 0  # bytes that the viewer may not have taken yet
+        self._stalled = False
+        self._due_ns = 0
+        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 that was shown
         clock = ClockPair.now()
         self._channels = frozenset(
             (number, channel)
@@ -82,19 +93,41 @@ class RerunViewer:
         return self._channels
 
     def show(self, item: Item) -> None:
-        """Draw a sample."""
+        """Draw a sample, unless the viewer stands still: Rerun would keep everything for it."""
+        if not self._keeps_up(item):
+            self.left_out += 1
+            return
         sample = item.sample
-        if isinstance(sample, Picture):
-            self._shown.add_picture(item.drone, sample.record, sample.data)
-        else:
+        if not isinstance(sample, Picture):
             self._shown.add(item.drone, sample)
+        elif self._decodable(item, sample.record):
+            self._shown.add_picture(item.drone, sample.record, sample.data)
 
     def close(self) -> None:
         """Finish the file; the viewer stays open."""
         try:
-            self._shown.close()
+            self._shown.close(_PATIENCE_S if self._stalled else _LAST_S)
         except SkyloopError as error:
             _log.warning("%s", error)
+
+    def _keeps_up(self, item: Item) -> bool:
+        now_ns = time.monotonic_ns()
+        self._ahead += item.size
+        if now_ns < self._due_ns and (self._stalled or self._ahead < _AHEAD):
+            return not self._stalled
+        taken = self._shown.taken(_PATIENCE_S)
+        if taken == self._stalled:
+            self._stalled = not taken
+            _log.warning("Rerun's viewer %s", "goes on" if taken else "takes nothing: it stands still, or is closed")
+        self._ahead = 0
+        self._due_ns = now_ns + _ASK_NS
+        return taken
+
+    def _decodable(self, item: Item, record: FrameRecord) -> bool:
+        if record.format != H264:
+            return True
+        chain = self._chains.setdefault((item.drone, item.channel), Chain())
+        return chain.follows(record.header.seq, key=record.key)
 
 
 def _unix(clock: ClockPair, drone: Drone) -> Callable[[int], int]:
