@@ -18,6 +18,12 @@ from tests.recording.live import fake_rerun
 pytestmark = pytest.mark.process
 
 
+@pytest.fixture(autouse=True)
+def priority(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keeps that of the tests' own process."""
+    monkeypatch.setattr("skyloop.recording.live.view.give_way", lambda: None)
+
+
 def test_foxglove_until_it_is_interrupted(start: Callable[..., Process], alpha: Process) -> None:
     pytest.importorskip("foxglove")
     process = start("view", "alpha", "--foxglove", "--port", "0")

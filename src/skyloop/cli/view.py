@@ -62,8 +62,9 @@ def view(
         signal.signal(signal.SIGTERM, _interrupt)
     with ExitStack() as stack, suppress(KeyboardInterrupt):  # how it is meant to end
         from skyloop.client import connect as connect_to
-        from skyloop.recording.live.view import View
+        from skyloop.recording.live.view import View, give_way
 
+        give_way()
         known = [stack.enter_context(connect_to(name, access="observe", name="skyloop view")) for name in chosen]
         screen: Screen
         if foxglove:

@@ -32,6 +32,7 @@ _PATIENCE_S: Final = 0.5
 _ASK_NS: Final = nanoseconds(1.0)
 _LAST_S: Final = 5.0
 _LOOK_S: Final = 0.1
+_SETTLED_S: Final = 1.0
 _SHOWN: Final = ("feedback", "commands", "events", "annotations", "logs")
 _log = logging.getLogger(__name__)
 
@@ -145,16 +146,18 @@ def _start(host: str, port: int) -> None:
     except OSError as error:
         raise LinkError(f"Rerun's viewer can't be started: {error}") from None
     end = time.monotonic() + _START_S
-    while not _listens(host, port):
+    listening_s = 0.0  # a viewer that finds no display listens for a moment before it ends
+    while listening_s < _SETTLED_S:
         if viewer.poll() is not None:
             raise LinkError(
-                f"Rerun's viewer ended at once with code {viewer.returncode}: it needs a display. Without one, "
-                "--save FILE writes a file for the viewer elsewhere, --connect URL shows the drones in one elsewhere"
+                "Rerun's viewer ended at once: it needs a display. Without one, --save FILE writes a file for the viewer "
+                "elsewhere, --connect URL shows the drones in one elsewhere"
             )
         if time.monotonic() > end:
             os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of what was started
             raise NoAnswerError(f"Rerun's viewer does not listen on {host}:{port} after {_START_S:g} s")
         time.sleep(_LOOK_S)
+        listening_s = listening_s + _LOOK_S if _listens(host, port) else 0.0
 
 
 def _listens(host: str, port: int) -> bool:

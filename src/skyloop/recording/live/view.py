@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ _LIMIT: Final = 16 * MB  # what may wait for a slow screen; older pictures are o
 _RESERVE: Final = 16 * MB
 _QUALITY: Final = 80  # of JPEG: these pictures are looked at, and not kept
 _LOOK_NS: Final = nanoseconds(1.0)
+NICENESS: Final = 5
 
 #: A drone's index, and a channel of it as :data:`skyloop.recording.options.CHOICES` names them, or ``video.CAMERA``.
 Source = tuple[int, str]
@@ -141,6 +143,12 @@ class View:
             tap = Tap(number, self._drones[number], options, self._backlog, encoded_far=True)
             self._taps[source] = tap
             tap.start()
+
+
+def give_way() -> None:
+    """Lower this process's priority, and that of the threads that it starts from now on: who flies goes first."""
+    if hasattr(os, "nice"):
+        os.nice(NICENESS)
 
 
 def check_names(drones: Sequence[Drone]) -> None:
