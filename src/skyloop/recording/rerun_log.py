@@ -134,7 +134,11 @@ class RerunLog:
         self._drones[drone].picture(record, data)
 
     def taken(self, timeout_s: float) -> bool:
-        """Return whether the viewer, or the disk, has taken all that was added, waiting so long at most, above 0 [s]."""
+        """Return whether the viewer, or the disk, has taken all that was added.
+
+        Args:
+            timeout_s: How long to wait at most, above 0.
+        """
         try:
             self._stream.flush(timeout_sec=timeout_s)
         except Exception:  # noqa: BLE001  (Rerun's own, which has no common base)

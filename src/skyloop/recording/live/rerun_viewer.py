@@ -150,7 +150,7 @@ def _start(host: str, port: int) -> None:
     while listening_s < _SETTLED_S:
         if viewer.poll() is not None:
             raise LinkError(
-                "Rerun's viewer ended at once: it needs a display. Without one, --save FILE writes a file for the viewer "
+                "Rerun's viewer ended at once: it needs a display. Without one, --save FILE writes a file for a viewer "
                 "elsewhere, --connect URL shows the drones in one elsewhere"
             )
         if time.monotonic() > end:
