@@ -23,6 +23,7 @@ from skyloop.sim.control_loops import ControlLoops
 from skyloop.sim.flight_logic import Happening, next_state
 from skyloop.sim.parameters import Limits, VehicleParameters
 from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.sim.rotors import RotorBodies
 from skyloop.sim.sensors import Sensors
 
 LOW_BATTERY = 0.03  # share of the charge at which the vehicle lands by itself
@@ -53,6 +54,7 @@ class Autopilot:
         self._stood_s = [0.0 for _ in parameters]  # when each last had something under its feet
         self._rising: dict[int, float] = {}  # drones that are taking off, and the altitude that ends it
         self._warned: set[int] = set()
+        self.handed_over: set[int] = set()  #: drones that firmware flies
 
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change a drone's limits.
@@ -90,6 +92,26 @@ class Autopilot:
         """Hover where a flying drone was moved to; it has learnt nothing of the wind there."""
         self._loops.start(drone, altitude_m)
         self._advance(drone, Happening.HOVER, Hover(), time_s)
+
+    def hand_over(self, drone: int) -> None:
+        """Leave a drone that stands to firmware."""
+        if self.states[drone] is FlightState.EMERGENCY:
+            self._loops.stop(drone)
+        self.states[drone], self.reasons[drone] = FlightState.LANDED, ""
+        self.handed_over.add(drone)
+
+    def take_back(self, drone: int, time_s: float) -> None:
+        """Have a drone again whose rotors were stopped."""
+        self.handed_over.discard(drone)
+        flew, self.states[drone] = self.states[drone].airborne, FlightState.LANDED
+        if flew:
+            self._advance(drone, Happening.STOP, EmergencyStop(), time_s, "taken from its firmware in the air")
+
+    def watch_firmware(self, rotors: RotorBodies, time_s: float) -> None:
+        """Follow the states of the drones that firmware flies; called once per step."""
+        for drone in self.handed_over:
+            stands = time_s - self._stood_s[drone] <= _STANDING_S and rotors.idles(drone)
+            self.states[drone] = FlightState.LANDED if stands else FlightState.FLYING
 
     def supervise(self, time_s: float) -> None:
         """End the take-off of drones that have reached its height; called once per period of the loops."""
@@ -137,7 +159,7 @@ class Autopilot:
         self, drone: int, happening: Happening, action: AnyAction, time_s: float, reason: str = ""
     ) -> AnyAction:
         state = next_state(self.states[drone], happening)
-        if state is None:
+        if state is None or drone in self.handed_over:
             return Idle()
         before, self.states[drone] = self.states[drone], state
         if state is not before or not state.airborne or isinstance(action, Attitude | Velocity):

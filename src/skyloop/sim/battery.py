@@ -1,7 +1,4 @@
-"""Batteries: charge and voltage under the motors' power, which grows with thrust to the power 3/2.
-
-Source: momentum theory of a rotor in hover.
-"""
+"""Batteries: charge and voltage under the power that the drones take."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skyloop.sim.dynamics import column
-from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
+from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.streams import Floats
 
 
@@ -28,22 +25,20 @@ class Batteries:
         self._full = column(parameters, lambda p: p.battery_full_v)
         self._empty = column(parameters, lambda p: p.battery_empty_v)
         self._resistance = column(parameters, lambda p: p.battery_resistance_ohm)
-        self._hover = column(parameters, lambda p: p.hover_power_w)
-        self._electronics = column(parameters, lambda p: p.electronics_power_w)
-        self.voltage = self._open_voltage()
+        self.voltage = self.open_voltage()
 
-    def drain(self, thrust: Floats, period_s: float) -> None:
-        """Discharge by what ``thrust`` (per mass, (n,) [m/s²]) takes over a period."""
-        power = self._hover * (thrust / GRAVITY_M_S2) ** 1.5 + self._electronics
+    def drain(self, power: Floats, period_s: float) -> None:
+        """Discharge by ``power``, (n,) [W], over a period."""
         current = power / np.maximum(self.voltage, 1.0)
         np.maximum(self.charge - current * period_s / self._capacity, 0.0, out=self.charge)
-        self.voltage = self._open_voltage() - current * self._resistance
+        self.voltage = self.open_voltage() - current * self._resistance
 
     def strength(self) -> Floats:
         """Return the share of the full battery's thrust that is left, (n,): thrust grows with voltage squared."""
         share: Floats = np.clip(self.voltage / self._full, 0.0, 1.0) ** 2
         return share
 
-    def _open_voltage(self) -> Floats:
+    def open_voltage(self) -> Floats:
+        """Return the voltage without load, (n,) [V]."""
         voltage: Floats = self._empty + (self._full - self._empty) * self.charge
         return voltage

@@ -14,13 +14,12 @@ import numpy as np
 
 from skyloop.sim.broad_phase import Indices, overlapping
 from skyloop.sim.columns import ARRAYS, NUMBERS, N, Operations, few
-from skyloop.sim.dynamics import STEP_S, Bodies, column
+from skyloop.sim.dynamics import STEP_S, BodyTable, column
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.solids import Overlap, Solids
 from skyloop.sim.streams import Floats
 from skyloop.sim.world import Vec3
 
-_MOST_ACCELERATION_M_S2 = 60.0  # above what thrust, gravity and drag at 10 m/s of headwind give together
 _STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or things would never come to rest
 _PASSES = 6
 _TOUCH_M = 1e-9  # overlaps up to this are touching: rounding alone leaves some that no push ends
@@ -82,7 +81,7 @@ class _Near:
 class Collisions:
     """Keeps drones out of solids and of one another; called once per step."""
 
-    def __init__(self, parameters: Sequence[VehicleParameters], bodies: Bodies, solids: Solids) -> None:
+    def __init__(self, parameters: Sequence[VehicleParameters], bodies: BodyTable, solids: Solids) -> None:
         self._bodies = bodies
         self._solids = solids
         radius = column(parameters, lambda p: p.radius_m)
@@ -101,6 +100,7 @@ class Collisions:
         self._vx, self._vy, self._vz = bodies.velocity
         self._free = bodies.position.copy()  # where each drone last was clear of all that doesn't move
         self._look_steps = LOOK_STEPS_OF_FEW if few(len(parameters)) else LOOK_STEPS
+        self._span_m = _span(bodies.most_acceleration_m_s2, self._look_steps)
         self._next = 0  # the step of the next broad phase
         self._reach = np.zeros(len(parameters))  # how far each drone can get until then
         self._strayed = [0.0 for _ in parameters]  # how much further it may get, because it was pushed or hit
@@ -151,7 +151,7 @@ class Collisions:
         self._strayed = [0.0] * len(self._strayed)
         np.sqrt((velocity * velocity).sum(axis=0), out=self._reach)
         np.multiply(self._reach, seconds, out=self._reach)
-        np.add(self._reach, _span(self._look_steps) + _SLACK_M, out=self._reach)
+        np.add(self._reach, self._span_m + _SLACK_M, out=self._reach)
         low, high = position - self._reach, position + self._reach
         walled = ((low < self._low) | (high > self._high)).any(axis=0).nonzero()[0]
         bounds = solids.bounds(seconds, self._widest)
@@ -313,8 +313,7 @@ class Collisions:
         """
         most = self._friction[drone] * impulse_m_s * (4 / 3) / self._radii[drone]
         change = max(-most, min(most, spin_rad_s - float(self._bodies.rates[2, drone])))
-        self._bodies.rates[2, drone] += change
-        self._bodies.angles[2, drone] += change * STEP_S
+        self._bodies.turn(drone, change)
 
     # Drones ----------------------------------------------------------------------------------------------------
 
@@ -389,6 +388,6 @@ def _off_floor(do: Operations, velocity: N, bounce: N, friction: N) -> tuple[N, 
     return vx * left, vy * left, do.most(vz, back), falling
 
 
-def _span(steps: int) -> float:
+def _span(acceleration_m_s2: float, steps: int) -> float:
     """Return how far a drone gets from rest in so many steps at most [m]."""
-    return _MOST_ACCELERATION_M_S2 * STEP_S * STEP_S * steps * (steps + 1) / 2
+    return acceleration_m_s2 * STEP_S * STEP_S * steps * (steps + 1) / 2

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skyloop.sim.columns import ARRAYS, NUMBERS, Fields, N, Operations, columns, few
-from skyloop.sim.dynamics import Bodies, column
+from skyloop.sim.dynamics import BodyTable, column
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.sensors import Sensors
 from skyloop.sim.streams import Floats
@@ -46,7 +46,7 @@ class ControlLoops:
     """Set-points and state of the loops, one column per drone. Written by the flight logic between updates."""
 
     def __init__(
-        self, parameters: Sequence[VehicleParameters], limits: Sequence[Limits], bodies: Bodies, period_s: float
+        self, parameters: Sequence[VehicleParameters], limits: Sequence[Limits], bodies: BodyTable, period_s: float
     ) -> None:
         n = len(parameters)
         self._bodies = bodies

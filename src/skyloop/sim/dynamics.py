@@ -6,6 +6,7 @@ Both ways give the same bits, to which ``tests/sim/test_columns.py`` holds them.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -28,14 +29,17 @@ def column(parameters: Sequence[VehicleParameters], value: Callable[[VehiclePara
     return np.array([value(p) for p in parameters], dtype=np.float64)
 
 
-class Bodies:
-    """State and inputs of the bodies. Rows are axes, columns drones.
+class BodyTable(ABC):
+    """State and inputs of the bodies, whatever moves them. Rows are axes, columns drones.
 
     Attributes:
         position: Of the body's centre, world axes, (3, n) [m].
         velocity: Of the body's centre, world axes, (3, n) [m/s].
+        velocity_before: The same before the last step.
         angles: Roll, pitch, yaw, (3, n) [rad]; yaw is not wrapped.
         rates: Derivatives of the angles.
+        sin: Sines of the angles.
+        cos: Cosines of the angles.
         thrust: Per mass, (n,) [m/s²].
         attitude_command: Input: roll, pitch [rad] and yaw rate [rad/s], (3, n).
         thrust_command: Input: per mass, (n,).
@@ -43,11 +47,15 @@ class Bodies:
         commands: Of a few drones: the inputs attitude_command and thrust_command.
         turned: Of a few drones: sine of yaw; cosines of roll, pitch, yaw.
         moved: Of a few drones: height of the centre [m], velocity [m/s].
+        most_acceleration_m_s2: What no body exceeds unless it hits something.
     """
 
-    def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
-        n = len(parameters)
+    most_acceleration_m_s2 = 60.0  # above what thrust, gravity and drag at 10 m/s of headwind give together
+
+    def __init__(self, positions: Floats, yaws: Floats) -> None:
+        n = len(yaws)
         table = columns(_ROWS, n)
+        self._table = table
         self.angles, self.rates, self._stiff, self.attitude_command = (table[row : row + 3] for row in (0, 3, 6, 9))
         self.thrust_command, self.thrust = table[12], table[22]
         self.sin, self.cos, self.air = (table[row : row + 3] for row in (13, 16, 19))
@@ -56,10 +64,69 @@ class Bodies:
         self.angles[2] = yaws
         np.sin(self.angles, out=self.sin)
         np.cos(self.angles, out=self.cos)
-        self._set_constants(parameters)
         self._few = few(n)
         if self._few:
             self.commands, self.turned, self.moved = Fields(table, 9, 4), Fields(table, 15, 4), Fields(table, 25, 4)
+
+    @abstractmethod
+    def cut(self, drone: int) -> None:
+        """Stop the motors: nothing holds the attitude any more."""
+
+    @abstractmethod
+    def steady(self, drone: int) -> None:
+        """Hold the attitude again, by running motors or by legs on the ground."""
+
+    @abstractmethod
+    def step(self) -> None:
+        """Advance by :data:`STEP_S`, without collisions."""
+
+    @abstractmethod
+    def turn(self, drone: int, change_rad_s: float) -> None:
+        """Turn a body faster about the vertical by so much, counter-clockwise from above, from this step on."""
+
+    @abstractmethod
+    def power(self) -> Floats:
+        """Return what each drone takes from its battery now, (n,) [W]."""
+
+    def put(self, drone: int, position_m: Floats, yaw_rad: float, thrust: float) -> None:
+        """Move a body, level and at rest; ``position_m`` has shape (3,), ``thrust`` is an acceleration [m/s²]."""
+        self.position[:, drone] = position_m
+        for still in (self.velocity, self.velocity_before, self.angles, self.rates):
+            still[:, drone] = 0.0
+        self.angles[2, drone] = yaw_rad
+        self.thrust[drone] = self.thrust_command[drone] = thrust
+        np.sin(self.angles, out=self.sin)
+        np.cos(self.angles, out=self.cos)
+
+    def body_rates(self) -> Floats:
+        """Return the angular velocities about the bodies' axes, (3, n) [rad/s]."""
+        return np.array(body_rates(self.rates, self.sin, self.cos))
+
+    def body_rates_of(self, drone: int) -> tuple[float, float, float]:
+        """Return the angular velocity of one drone about its body's axes [rad/s]."""
+        p, q, r = body_rates(*(rows[:, drone].tolist() for rows in (self.rates, self.sin, self.cos)))
+        return p, q, r
+
+    def rotations(self) -> Floats:
+        """Return world-from-body rotations, (n, 3, 3)."""
+        return rotations(self.sin, self.cos)
+
+    def specific_force(self) -> Floats:
+        """Return what ideal accelerometers on the drones measure, body axes, (3, n) [m/s²]: at rest, +g along z."""
+        change = (self.velocity - self.velocity_before) / STEP_S
+        change[2] += GRAVITY_M_S2
+        force: Floats = np.einsum("nji,jn->in", self.rotations(), change)
+        return force
+
+
+class Bodies(BodyTable):
+    """Bodies that follow their attitude as a second-order response to the command, with Euler angles as their state."""
+
+    def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
+        super().__init__(positions, yaws)
+        n, table = len(parameters), self._table
+        self._set_constants(parameters)
+        if self._few:
             self._turning, self._turned = Fields(table, 0, 12), Fields(table, 0, 6)
             self._moving, self._moved = Fields(table, 12, 17), Fields(table, 22, 10)
             self._each = list(enumerate(self._constants()))
@@ -97,6 +164,8 @@ class Bodies:
         self._rotor_height = column(parameters, lambda p: p.rotor_height_m)
         self._rotor_offset = column(parameters, lambda p: p.rotor_height_m - p.half_height_m)
         self._ground_effect = column(parameters, lambda p: p.ground_effect**0.5 * p.rotor_radius_m / 4)
+        self._hover_power = column(parameters, lambda p: p.hover_power_w)
+        self._electronics_power = column(parameters, lambda p: p.electronics_power_w)
 
     def _constants(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
         """Return each drone's constants as plain floats, of turning and of moving."""
@@ -116,15 +185,15 @@ class Bodies:
         """Hold the attitude again, by running motors or by legs on the ground."""
         self._stiff[:, drone] = self._stiff_running[:, drone]
 
-    def put(self, drone: int, position_m: Floats, yaw_rad: float, thrust: float) -> None:
-        """Move a body, level and at rest; ``position_m`` has shape (3,), ``thrust`` is an acceleration [m/s²]."""
-        self.position[:, drone] = position_m
-        for still in (self.velocity, self.velocity_before, self.angles, self.rates):
-            still[:, drone] = 0.0
-        self.angles[2, drone] = yaw_rad
-        self.thrust[drone] = self.thrust_command[drone] = thrust
-        np.sin(self.angles, out=self.sin)
-        np.cos(self.angles, out=self.cos)
+    def turn(self, drone: int, change_rad_s: float) -> None:
+        """Turn a body faster about the vertical by so much."""
+        self.rates[2, drone] += change_rad_s
+        self.angles[2, drone] += change_rad_s * STEP_S
+
+    def power(self) -> Floats:
+        """Return what each drone takes from its battery now, (n,) [W]: P ~ T^1.5, by momentum theory in hover."""
+        power: Floats = self._hover_power * (self.thrust / GRAVITY_M_S2) ** 1.5 + self._electronics_power
+        return power
 
     def step(self) -> None:
         """Advance by :data:`STEP_S`, without collisions."""
@@ -276,14 +345,6 @@ class Bodies:
         np.subtract(_ONE, shortfall, out=shortfall)
         np.divide(self.thrust, shortfall, out=lift)
         return lift
-
-
-def specific_force(bodies: Bodies) -> Floats:
-    """Return what ideal accelerometers on the drones measure, body axes, shape (3, n) [m/s²]: at rest, +g along z."""
-    change = (bodies.velocity - bodies.velocity_before) / STEP_S
-    change[2] += GRAVITY_M_S2
-    force: Floats = np.einsum("nji,jn->in", rotations(bodies.sin, bodies.cos), change)
-    return force
 
 
 def body_rates(rates: N, sin: N, cos: N) -> tuple[N, N, N]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 from skyloop.messages import ACTION_NAMES
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
-from skyloop.sim.parameters import VehicleParameters
+from skyloop.sim.parameters import VehicleParameters, with_scaled_flaws
 from skyloop.sim.world import Wind, World
 from skyloop.sim.world_file import load_world
 
@@ -71,9 +71,4 @@ class SimOptions:
 
     def vehicle(self) -> VehicleParameters:
         """Return the vehicle, with its sensors' noise and biases multiplied by the factor :attr:`noise`."""
-        flaws = {
-            field.name: getattr(self.parameters, field.name) * self.noise
-            for field in fields(self.parameters)
-            if ("_noise_" in field.name or "_bias_" in field.name) and "time_constant" not in field.name
-        }
-        return replace(self.parameters, **flaws)
+        return with_scaled_flaws(self.parameters, self.noise)

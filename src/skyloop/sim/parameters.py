@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from skyloop.errors import UsageError
+from skyloop.sim.rotor_parameters import InstrumentParameters, RotorParameters
 
 GRAVITY_M_S2 = 9.80665
 
@@ -91,9 +93,15 @@ class VehicleParameters:
     restitution: float = 0.35  # share of the speed along the normal that is left after a bounce, estimate
     friction: float = 0.5  # Coulomb, estimate
 
+    #: For a vehicle that is modelled down to its rotors (``docs/rotors.md``); None models its response as a whole. With
+    #: rotors, drag, motor time constant and hover power above have no effect: the rotors' own count.
+    rotors: RotorParameters | None = None
+
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
+            if field.name == "rotors":
+                continue
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
                 raise UsageError(f"{field.name} must be a finite number of at least 0, not {value!r}")
             if value == 0 and field.name in _POSITIVE:
@@ -111,6 +119,11 @@ class VehicleParameters:
             raise UsageError(f"restitution must be from 0 to 1, not {self.restitution:g}: a bounce can't add energy")
         if self.battery_empty_v >= self.battery_full_v:
             raise UsageError("battery_empty_v must be below battery_full_v")
+        if self.rotors is not None and not self.most_thrust < self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):
+            raise UsageError(
+                f"most_thrust {self.most_thrust:g} of the weight must be below what the rotors give, "
+                f"{self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):.2f}: the attitude needs the rest"
+            )
 
 
 _POSITIVE = frozenset(
@@ -137,8 +150,25 @@ _POSITIVE = frozenset(
 
 def with_ideal_sensors(vehicle: VehicleParameters) -> VehicleParameters:
     """Return the same vehicle without sensor noise and biases."""
-    flaws = [field.name for field in fields(vehicle) if "_noise_" in field.name or "_bias_" in field.name]
-    return replace(vehicle, **dict.fromkeys(flaws, 0.0))
+    return with_scaled_flaws(vehicle, 0.0)
+
+
+def with_scaled_flaws(vehicle: VehicleParameters, factor: float) -> VehicleParameters:
+    """Return the same vehicle with the noise and biases of its sensors and instruments multiplied by a factor."""
+    scaled = replace(vehicle, **_scaled_flaws(vehicle, factor))
+    if scaled.rotors is None:
+        return scaled
+    instruments = scaled.rotors.instruments
+    instruments = replace(instruments, **_scaled_flaws(instruments, factor))
+    return replace(scaled, rotors=replace(scaled.rotors, instruments=instruments))
+
+
+def _scaled_flaws(parameters: VehicleParameters | InstrumentParameters, factor: float) -> dict[str, Any]:
+    return {
+        field.name: getattr(parameters, field.name) * factor
+        for field in fields(parameters)
+        if ("_noise_" in field.name or "_bias_" in field.name) and "time_constant" not in field.name
+    }
 
 
 @dataclass(frozen=True, slots=True)

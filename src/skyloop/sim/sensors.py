@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from skyloop.sim.columns import Fields, N, columns, few
-from skyloop.sim.dynamics import Bodies, body_rates, column, specific_force
+from skyloop.sim.dynamics import BodyTable, column
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.streams import Floats, NormalBlocks, Purpose, stream
 
@@ -41,7 +41,7 @@ class Sensors:
     """
 
     def __init__(
-        self, parameters: Sequence[VehicleParameters], bodies: Bodies, seed: int, bias_period_s: float
+        self, parameters: Sequence[VehicleParameters], bodies: BodyTable, seed: int, bias_period_s: float
     ) -> None:
         n = len(parameters)
         self._bodies = bodies
@@ -98,8 +98,7 @@ class Sensors:
             bodies = self._bodies
             # Drone after drone from one stream of the step, so that the first ones' noise isn't changed by more drones.
             normals = stream(self._seed, Purpose.INERTIAL, step).standard_normal(self._inertial_noise.shape[::-1]).T
-            rates = body_rates(bodies.rates, bodies.sin, bodies.cos)
-            truth = np.concatenate([rates, specific_force(bodies), bodies.angles])
+            truth = np.concatenate([bodies.body_rates(), bodies.specific_force(), bodies.angles])
             self._inertial = truth + self._bias[:9] + self._inertial_noise * normals
             self._inertial_step = step
         return self._inertial

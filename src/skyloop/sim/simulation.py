@@ -20,10 +20,13 @@ from skyloop.sim.autopilot import Autopilot
 from skyloop.sim.battery import Batteries
 from skyloop.sim.collisions import Collisions
 from skyloop.sim.control_loops import ControlLoops
-from skyloop.sim.dynamics import STEP_S, Bodies, body_rates, rotations
+from skyloop.sim.dynamics import STEP_S, Bodies, BodyTable
+from skyloop.sim.firmware import Firmware
+from skyloop.sim.instruments import Instruments
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.placement import place
 from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
+from skyloop.sim.rotors import RotorBodies
 from skyloop.sim.sensors import Sensors
 from skyloop.sim.solids import Solids
 from skyloop.sim.streams import Floats
@@ -73,7 +76,8 @@ class Simulation:
             wind: Replaces the world's.
 
         Raises:
-            UsageError: An argument is out of its range, or the world has no place for so many drones.
+            UsageError: An argument is out of its range, some vehicles have rotors and others not, or the world has no
+                place for so many drones.
         """
         if isinstance(drones, bool) or not isinstance(drones, int) or not 1 <= drones <= 1000:
             raise UsageError(f"drones must be a whole number from 1 to 1000, not {drones!r}")
@@ -87,11 +91,13 @@ class Simulation:
         self._lock = threading.RLock()
         self._step = 0
         self._tracks = tuple(TargetTrack(target, world.seed, n) for n, target in enumerate(world.targets))
-        solids = Solids(world, self._tracks)
+        self._solids = solids = Solids(world, self._tracks)
         spawns = place(world, self.parameters, solids)
         starts = np.array([spawn.position_m for spawn in spawns]).T
         starts[2] += [p.half_height_m for p in self.parameters]
-        self._bodies = Bodies(self.parameters, starts, np.array([spawn.yaw_rad for spawn in spawns]))
+        yaws = np.array([spawn.yaw_rad for spawn in spawns])
+        self._rotors = RotorBodies(self.parameters, starts, yaws) if _have_rotors(self.parameters) else None
+        self._bodies: BodyTable = self._rotors or Bodies(self.parameters, starts, yaws)
         self._collisions = Collisions(self.parameters, self._bodies, solids)
         self._wind = WindField(world.wind if wind is None else wind, self.seed, drones, LOOP_STEPS * STEP_S)
         self._sensors = Sensors(self.parameters, self._bodies, self.seed, SLOW_STEPS * STEP_S)
@@ -100,6 +106,7 @@ class Simulation:
         loops = ControlLoops(self.parameters, all_limits, self._bodies, LOOP_STEPS * STEP_S)
         self._loops = loops
         self._autopilot = Autopilot(self.parameters, all_limits, loops, self._sensors, self._batteries)
+        self._supply()
 
     # Time ------------------------------------------------------------------------------------------------------
 
@@ -132,13 +139,21 @@ class Simulation:
             self._loops.update(self._sensors)
         if self._step % SLOW_STEPS == 0:
             self._sensors.wander()
-            self._batteries.drain(self._bodies.thrust, SLOW_STEPS * STEP_S)
+            self._batteries.drain(self._bodies.power(), SLOW_STEPS * STEP_S)
             self._autopilot.watch_batteries(self.time_s)
+            self._supply()
         self._bodies.step()
         contacts = self._collisions.resolve(self._step)
         self._step += 1
         if contacts is not None:
             self._autopilot.feel(contacts, self.time_s)
+        if self._rotors is not None:
+            self._autopilot.watch_firmware(self._rotors, self.time_s)
+
+    def _supply(self) -> None:
+        """Give the rotors the batteries' present voltage."""
+        if self._rotors is not None:
+            self._rotors.set_unloaded_voltage(self._batteries.open_voltage())
 
     # Flying ----------------------------------------------------------------------------------------------------
 
@@ -154,14 +169,15 @@ class Simulation:
             drone ignores it in its present state (as firmware does): set-points before it hovers, a reset in the air.
 
         Raises:
-            UsageError: There is no such drone, or a number is not finite.
+            UsageError: There is no such drone, firmware flies it, or a number is not finite.
         """
         if not isinstance(action, Action):
             raise UsageError(f"an action from skyloop.messages is wanted, not {action!r}")
         if not action.finite:
             raise UsageError(f"a set-point must be finite: {action!r}")
         with self._lock:
-            return self._autopilot.command(self._number(drone), action, self.time_s)
+            self._require_built_in(drone)
+            return self._autopilot.command(drone, action, self.time_s)
 
     def limits(self, drone: int) -> Limits:
         """Return the limits in force of a drone."""
@@ -171,6 +187,59 @@ class Simulation:
         """Change a drone's limits from the next command on; the ceiling applies at once."""
         with self._lock:
             self._autopilot.set_limits(self._number(drone), limits)
+
+    def fly_by(self, drone: int, firmware: Firmware) -> None:
+        """Let firmware fly a drone from now on, in place of the built-in autopilot, which refuses commands meanwhile.
+
+        The drone counts as landed while it stands and no rotor is commanded to be faster than idle, and as flying
+        otherwise. Collisions are reported as always, and stop no rotor.
+
+        Args:
+            drone: Its number. It stands on the ground; a drone in an emergency is reset.
+            firmware: Called once per millisecond of the simulation, on the thread that steps it.
+
+        Raises:
+            UsageError: There is no such drone, it has no rotors, firmware flies it already, or it is in the air.
+        """
+        with self._lock:
+            self._require_built_in(drone)
+            if self._rotors is None:
+                raise UsageError(
+                    "firmware needs a drone that is modelled down to its rotors: "
+                    "one of RACER, IRIS and CRAZYFLIE of skyloop.sim.vehicles, or parameters with rotors"
+                )
+            if self._autopilot.states[drone].airborne:
+                raise UsageError(f"drone {drone} is {self._autopilot.states[drone]}: firmware takes over on the ground")
+            solids, rotors = self._solids, self._rotors
+
+            def ranging(point: Vec3, direction: Vec3) -> float:
+                return solids.distance_along(point, direction, rotors.time_s)
+
+            instruments = Instruments(self.parameters[drone], drone, self.seed, ranging)
+            self._autopilot.hand_over(drone)
+            rotors.fly_by(drone, firmware, instruments)
+
+    def release(self, drone: int) -> None:
+        """Take a drone away from its firmware: its rotors stop, and the built-in autopilot has it again.
+
+        In the air it falls, in an emergency.
+
+        Raises:
+            UsageError: There is no such drone, or no firmware flies it.
+        """
+        with self._lock:
+            if self._rotors is None or self._number(drone) not in self._autopilot.handed_over:
+                raise UsageError(f"no firmware flies drone {drone}")
+            self._rotors.release(drone)
+            self._autopilot.take_back(drone, self.time_s)
+
+    def flown_by_firmware(self, drone: int) -> bool:
+        """Whether firmware flies a drone; see :meth:`fly_by`."""
+        return self._number(drone) in self._autopilot.handed_over
+
+    def _require_built_in(self, drone: int) -> None:
+        if self._number(drone) in self._autopilot.handed_over:
+            raise UsageError(f"firmware flies drone {drone}: command that, or release the drone from it first")
 
     # Conditions ------------------------------------------------------------------------------------------------
 
@@ -207,7 +276,8 @@ class Simulation:
             raise UsageError(f"a place is three finite numbers and a heading, not {position_m!r}, {yaw_rad!r}")
         self.set_charge(drone, charge)
         with self._lock:
-            if self._autopilot.states[self._number(drone)] not in (FlightState.HOVERING, FlightState.FLYING):
+            self._require_built_in(drone)
+            if self._autopilot.states[drone] not in (FlightState.HOVERING, FlightState.FLYING):
                 raise UsageError(f"drone {drone} is {self._autopilot.states[drone]}: only one that flies can be put")
             self._bodies.put(drone, place, wrap_angle(yaw_rad), GRAVITY_M_S2)
             self._collisions.moved(drone)
@@ -230,7 +300,7 @@ class Simulation:
                 state=self._autopilot.states[i],
                 emergency_reason=self._autopilot.reasons[i],
                 battery=float(self._batteries.charge[i]),
-                battery_v=float(self._batteries.voltage[i]),
+                battery_v=float((self._batteries if self._rotors is None else self._rotors).voltage[i]),
                 roll_rad=inertial[6],
                 pitch_rad=inertial[7],
                 yaw_rad=wrap_angle(inertial[8]),
@@ -254,9 +324,7 @@ class Simulation:
                 pitch_rad=pitch,
                 yaw_rad=wrap_angle(yaw),
                 quaternion=quaternion_from_euler(roll, pitch, yaw),
-                angular_velocity_rad_s=body_rates(
-                    *(rows[:, i].tolist() for rows in (bodies.rates, bodies.sin, bodies.cos))
-                ),
+                angular_velocity_rad_s=bodies.body_rates_of(i),
                 thrust=float(bodies.thrust[i]) / GRAVITY_M_S2,
                 wind_m_s=_vec3(bodies.air[:, i]),
                 battery=float(self._batteries.charge[i]),
@@ -269,7 +337,7 @@ class Simulation:
             Positions in world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3).
         """
         with self._lock:
-            return self._bodies.position.T.copy(), rotations(self._bodies.sin, self._bodies.cos)
+            return self._bodies.position.T.copy(), self._bodies.rotations()
 
     def motions(self) -> tuple[Floats, Floats, Floats]:
         """Return how all drones move, as new arrays: what a task needs of many at once.
@@ -324,6 +392,14 @@ def _one_each(given: T | Sequence[T], drones: int, what: str) -> list[T]:
     if len(given) != drones:
         raise UsageError(f"{what}: {len(given)} given for {drones} drones; give one for all or one for each")
     return list(given)
+
+
+def _have_rotors(parameters: Sequence[VehicleParameters]) -> bool:
+    """Whether the vehicles are modelled down to their rotors."""
+    have = {vehicle.rotors is not None for vehicle in parameters}
+    if len(have) > 1:
+        raise UsageError("vehicles with rotors (VehicleParameters.rotors) and without fly in simulations of their own")
+    return have.pop()
 
 
 def _vec3(values: Floats) -> Vec3:

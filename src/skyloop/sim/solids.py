@@ -55,6 +55,7 @@ class Solids:
         self.room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
         self.room_high = np.array([[size_x / 2], [size_y / 2], [height]])
         self._room = size_x / 2, size_y / 2, height
+        self._enclosed = world.room.enclosed
         self.top_speed_m_s = max((_top_speed(target) for _, target in movers), default=0.0)
         self.move(0.0)
 
@@ -180,6 +181,40 @@ class Solids:
                 deepest, found = min(inside_x, inside_y, inside_z), number
                 local, inside = (ahead, left, up), (inside_x, inside_y, inside_z)
         return worst if found < 0 else self._way_out(found, local, inside)
+
+    def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
+        """Return how far it is to the first solid thing, the floor included; infinite without any [m].
+
+        Args:
+            point: Where a beam starts; from below the floor it goes no way.
+            direction: Where it goes, a unit vector.
+            time_s: Of the simulation, at which moving solids are where they are.
+        """
+        if self._movers:
+            self.move(time_s)
+        nearest = math.inf
+        bounds = zip(
+            point, direction, (*self._room[:2], self._room[2]), (-self._room[0], -self._room[1], 0.0), strict=True
+        )
+        for axis, (start, way, high, low) in enumerate(bounds):
+            if way < 0.0 and (axis == 2 or self._enclosed):
+                nearest = min(nearest, max(0.0, (low - start) / way))
+            elif way > 0.0 and self._enclosed:
+                nearest = min(nearest, max(0.0, (high - start) / way))
+        if not self._boxes:
+            return nearest
+        away = np.array(point)[:, None] - self._centre[:, :, 0]
+        c, s = self._cos[:, 0], self._sin[:, 0]
+        x, y, z = direction
+        starts = np.array([c * away[0] + s * away[1], c * away[1] - s * away[0], away[2]])
+        ways = np.array([c * x + s * y, c * y - s * x, np.full_like(c, z)])
+        # A beam along a face is taken as one that all but goes along it.
+        ways[np.abs(ways) < 1e-12] = 1e-12
+        half = self._half[:, :, 0]
+        one, other = (-half - starts) / ways, (half - starts) / ways
+        enters, leaves = np.minimum(one, other).max(axis=0), np.maximum(one, other).min(axis=0)
+        hit = (enters <= leaves) & (leaves >= 0.0)
+        return min(nearest, float(np.maximum(enters[hit], 0.0).min())) if hit.any() else nearest
 
     def _way_out(self, number: int, local: Vec3, inside: Vec3) -> Overlap:
         axis = inside.index(min(inside))

@@ -25,6 +25,7 @@ class Purpose(IntEnum):
     CAMERA = 6
     LIGHT = 7
     LABELS = 8
+    INSTRUMENTS = 9
 
 
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:

@@ -8,7 +8,8 @@ charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar`
 itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its position, as with an
 indoor positioning system (1; ``none`` for one without); ``velocity`` whether it reports its velocity (1;
 ``none`` for one that does not); ``truth`` whether feedback carries the true state too (1); ``rate`` of feedback [1/s]
-(40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified (``quadrotor``).
+(40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified, or that is modelled
+down to its rotors, ``racer``, ``iris`` or ``crazyflie`` (``quadrotor``).
 """
 
 from __future__ import annotations
@@ -21,12 +22,18 @@ from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
 from skyloop.sim.options import EVERY_ACTION, STANDARD_VEHICLE, SimOptions
-from skyloop.sim.vehicles import AR_DRONE
+from skyloop.sim.vehicles import AR_DRONE, CRAZYFLIE, IRIS, RACER
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
 RENDERERS: Final = ("planar", "mujoco")
-VEHICLES: Final = {"quadrotor": STANDARD_VEHICLE, "ardrone": AR_DRONE}
+VEHICLES: Final = {
+    "quadrotor": STANDARD_VEHICLE,
+    "ardrone": AR_DRONE,
+    "racer": RACER,
+    "iris": IRIS,
+    "crazyflie": CRAZYFLIE,
+}
 ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
 KNOWN: Final = {
     *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),

@@ -1,0 +1,209 @@
+"""The instruments of one rotor-level drone, as its firmware reads them: each with its noise, bias, rate and delay."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from skyloop.sim.earth import MAGNETIC_FIELD_GAUSS, geodetic, pressure_pa
+from skyloop.sim.firmware import FlowSample, GpsFix, Readings
+from skyloop.sim.parameters import VehicleParameters
+from skyloop.sim.rotor_dynamics import PLANT_STEP_S, rotation, rotors_of
+from skyloop.sim.streams import Purpose, stream
+from skyloop.sim.world import Vec3
+
+#: Distance from a point along a unit vector, both in world axes, to the first solid thing; infinite without any.
+Ranging = Callable[[Vec3, Vec3], float]
+
+_AHEAD = 256  # samples whose noise is drawn at once
+_WANDER_STEPS = 100  # biases change at 10 Hz
+_LEAST_FLOW_M = 0.08  # nearer, the image is out of focus
+_GPS_VERTICAL = 1.7  # how much worse a receiver is vertically
+_SATELLITES = 14
+
+
+class Instruments:
+    """One drone's instruments. Random numbers of each are a stream of its own.
+
+    Args:
+        vehicle: The drone, with rotors.
+        drone: Its number.
+        seed: Of the simulation.
+        ranging: What is below.
+    """
+
+    def __init__(self, vehicle: VehicleParameters, drone: int, seed: int, ranging: Ranging) -> None:
+        errors = self._errors = rotors_of(vehicle).instruments
+        self._ranging = ranging
+        self._feet_m = vehicle.half_height_m
+        self._inertial_noise = _rows(seed, drone, 0, 6)
+        self._slow_noise = {
+            kind: _rows(seed, drone, kind, count) for kind, count in ((1, 3), (2, 1), (3, 6), (4, 1), (5, 2))
+        }
+        deviations = (
+            *[errors.gyro_bias_rad_s] * 3,
+            *[errors.accelerometer_bias_m_s2] * 3,
+            *[errors.magnetometer_bias_gauss] * 3,
+            errors.barometer_bias_pa,
+            errors.gps_bias_m,
+            errors.gps_bias_m,
+            errors.gps_bias_m * _GPS_VERTICAL,
+        )
+        self._wandering = _wandering(seed, drone, np.array(deviations), errors.bias_time_constant_s)
+        self._bias = next(self._wandering)
+        self._magnetometer_steps, self._barometer_steps, self._gps_steps, self._range_steps, self._flow_steps = (
+            _steps(period_s)
+            for period_s in (
+                errors.magnetometer_period_s,
+                errors.barometer_period_s,
+                errors.gps_period_s,
+                errors.range_period_s,
+                errors.flow_period_s,
+            )
+        )
+        self._delay_steps = round(errors.gps_delay_s / PLANT_STEP_S)
+        self._fixes: deque[tuple[int, GpsFix]] = deque()  # each with the step in which it comes
+        self._magnetic: Vec3 = (0.0, 0.0, 0.0)
+        self._pressure_pa = 0.0
+        self._below_m = math.inf
+        self._range_m: float | None = None
+        self._turned = (0.0, 0.0, 0.0, 0.0)  # since the last flow sample, about forward and left: truly, by the gyro
+        self._first = -1
+
+    def read(
+        self,
+        step: int,
+        position: Vec3,
+        velocity: Vec3,
+        quaternion: tuple[float, float, float, float],
+        rates: Vec3,
+        force: Vec3,
+        battery_v: float,
+        battery_a: float,
+    ) -> Readings:
+        """Return the readings of a step of the plant; called for each step in turn."""
+        if step % _WANDER_STEPS == 0:
+            self._bias = next(self._wandering)
+        errors, bias = self._errors, self._bias
+        n1, n2, n3, n4, n5, n6 = next(self._inertial_noise)
+        turning, pushing = errors.gyro_noise_rad_s, errors.accelerometer_noise_m_s2
+        p, q, r = rates
+        gyro = (p + bias[0] + turning * n1, q + bias[1] + turning * n2, r + bias[2] + turning * n3)
+        fx, fy, fz = force
+        acceleration = (fx + bias[3] + pushing * n4, fy + bias[4] + pushing * n5, fz + bias[5] + pushing * n6)
+        if self._first < 0:
+            self._first = step
+        age = step - self._first
+        if age % self._magnetometer_steps == 0:
+            self._magnetic = self._sample_magnetic(quaternion)
+        if age % self._barometer_steps == 0:
+            noise = errors.barometer_noise_pa * next(self._slow_noise[2])[0]
+            self._pressure_pa = pressure_pa(position[2]) + bias[9] + noise
+        if age % self._gps_steps == 0:
+            self._fixes.append((step + self._delay_steps, self._locate(step, position, velocity)))
+        gps = self._fixes.popleft()[1] if self._fixes and self._fixes[0][0] <= step else None
+        if age % self._range_steps == 0:
+            self._range_m = self._sample_range(position, quaternion)
+        true_p, true_q, gyro_p, gyro_q = self._turned
+        self._turned = true_p + p, true_q + q, gyro_p + gyro[0], gyro_q + gyro[1]
+        flow = self._sample_flow(velocity, quaternion) if (age + 1) % self._flow_steps == 0 else None
+        return Readings(
+            step * PLANT_STEP_S,
+            gyro,
+            acceleration,
+            self._pressure_pa,
+            errors.temperature_c,
+            self._magnetic,
+            gps,
+            self._range_m,
+            flow,
+            battery_v,
+            battery_a,
+            position,
+            velocity,
+            quaternion,
+            rates,
+        )
+
+    def _sample_magnetic(self, quaternion: tuple[float, float, float, float]) -> Vec3:
+        x, y, z = _to_body(quaternion, MAGNETIC_FIELD_GAUSS)
+        n1, n2, n3 = next(self._slow_noise[1])
+        noise, bias = self._errors.magnetometer_noise_gauss, self._bias
+        return x + bias[6] + noise * n1, y + bias[7] + noise * n2, z + bias[8] + noise * n3
+
+    def _locate(self, step: int, position: Vec3, velocity: Vec3) -> GpsFix:
+        errors, bias = self._errors, self._bias
+        n1, n2, n3, n4, n5, n6 = next(self._slow_noise[3])
+        noise, faster = errors.gps_noise_m, errors.gps_velocity_noise_m_s
+        x, y, z = position
+        latitude, longitude, altitude = geodetic(
+            (x + bias[10] + noise * n1, y + bias[11] + noise * n2, z + bias[12] + noise * _GPS_VERTICAL * n3)
+        )
+        vx, vy, vz = velocity
+        stated = math.hypot(noise, errors.gps_bias_m)
+        return GpsFix(
+            step * PLANT_STEP_S,
+            latitude,
+            longitude,
+            altitude,
+            (vx + faster * n4, vy + faster * n5, vz + faster * _GPS_VERTICAL * n6),
+            stated,
+            stated * _GPS_VERTICAL,
+            _SATELLITES,
+        )
+
+    def _sample_range(self, position: Vec3, quaternion: tuple[float, float, float, float]) -> float | None:
+        (_, _, x), (_, _, y), (_, _, z) = rotation(*quaternion)
+        feet = self._feet_m
+        px, py, pz = position
+        self._below_m = self._ranging((px - x * feet, py - y * feet, pz - z * feet), (-x, -y, -z))
+        errors = self._errors
+        if not errors.range_least_m <= self._below_m <= errors.range_most_m:
+            return None
+        return max(0.0, self._below_m + errors.range_noise_m * next(self._slow_noise[4])[0])
+
+    def _sample_flow(self, velocity: Vec3, quaternion: tuple[float, float, float, float]) -> FlowSample:
+        errors = self._errors
+        interval = self._flow_steps * PLANT_STEP_S
+        true_p, true_q, gyro_p, gyro_q = (turned * PLANT_STEP_S for turned in self._turned)
+        self._turned = 0.0, 0.0, 0.0, 0.0
+        if not _LEAST_FLOW_M <= self._below_m <= errors.range_most_m:
+            return FlowSample(interval, 0.0, 0.0, gyro_p, gyro_q, 0.0)
+        forward, left, _ = _to_body(quaternion, velocity)
+        n1, n2 = next(self._slow_noise[5])
+        noise, moved = errors.flow_noise_rad_s * interval, interval / self._below_m
+        about_forward, about_left = true_p + left * moved + noise * n1, true_q - forward * moved + noise * n2
+        return FlowSample(interval, about_forward, about_left, gyro_p, gyro_q, 1.0)
+
+
+def _to_body(quaternion: tuple[float, float, float, float], vector: Vec3) -> Vec3:
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation(*quaternion)
+    x, y, z = vector
+    return r00 * x + r10 * y + r20 * z, r01 * x + r11 * y + r21 * z, r02 * x + r12 * y + r22 * z
+
+
+def _rows(seed: int, drone: int, instrument: int, count: int) -> Iterator[tuple[float, ...]]:
+    """Yield standard normal numbers for ever, so many at a time."""
+    generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + instrument)
+    while True:
+        yield from map(tuple, generator.standard_normal((_AHEAD, count)).tolist())
+
+
+def _wandering(
+    seed: int, drone: int, deviations: np.typing.NDArray[np.float64], constant_s: float
+) -> Iterator[list[float]]:
+    """Yield biases for ever: a first-order Gauss-Markov process, every :data:`_WANDER_STEPS`."""
+    generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + 7)
+    keep = math.exp(-_WANDER_STEPS * PLANT_STEP_S / constant_s)
+    fresh = math.sqrt(1.0 - keep * keep)
+    bias = deviations * generator.standard_normal(len(deviations))
+    while True:
+        yield bias.tolist()
+        bias = bias * keep + deviations * fresh * generator.standard_normal(len(deviations))
+
+
+def _steps(period_s: float) -> int:
+    return max(1, round(period_s / PLANT_STEP_S))

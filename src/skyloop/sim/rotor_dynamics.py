@@ -1,0 +1,341 @@
+"""Formulas of the rotor-level model, written once for the numbers of one drone and for arrays of all. Pure.
+
+Body axes: forward x, left y, up z. Sums, products, quotients and square roots only, which give the same bits for
+numbers and arrays.
+
+Sources: [M] R. Mahony, V. Kumar, P. Corke, "Multirotor Aerial Vehicles: Modeling, Estimation, and Control of
+Quadrotor", IEEE Robotics & Automation Magazine 19(3), 2012: thrust and torque, blade flapping as a force that grows
+with airspeed and rotor speed. [S] J. Svacha, K. Mohta, V. Kumar, "Improving quadrotor trajectory tracking by
+compensating for aerodynamic effects", ICUAS 2017: thrust lost to inflow grows with rotor speed times axial airspeed.
+[C] I. C. Cheeseman, W. E. Bennett, "The Effect of the Ground on a Helicopter Rotor in Forward Flight", ARC R&M 3021,
+1955.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from skyloop.errors import UsageError
+from skyloop.sim.columns import N, Operations
+from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
+from skyloop.sim.rotor_parameters import YAW_SIGNS, RotorParameters
+
+PLANT_STEP_S = 0.001  #: of the rotor-level model and its instruments
+
+_HALF_STEP_S = PLANT_STEP_S / 2
+_LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, within a tenth of a second
+_YAW_SHARE = 0.25  # of the rotors' range of thrust that yaw may take from roll and pitch
+
+Four: TypeAlias = tuple[N, N, N, N]
+Three: TypeAlias = tuple[N, N, N]
+
+
+@dataclass(frozen=True, slots=True)
+class Constants:
+    """Constants of one drone, or arrays with those of all. Forces and torques are per mass and per inertia."""
+
+    thrust: N
+    idle_speed: N
+    full_speed: N
+    up_share: N
+    down_share: N
+    inflow: N
+    rotor_drag: N
+    drag_x: N
+    drag_y: N
+    drag_z: N
+    per_mass: N
+    rotor_offset: N
+    rotor_height: N
+    ground_effect: N
+    x1: N
+    x2: N
+    x3: N
+    x4: N
+    y1: N
+    y2: N
+    y3: N
+    y4: N
+    roll_per_torque: N
+    pitch_per_torque: N
+    yaw_per_thrust: N
+    gyroscopic_x: N
+    gyroscopic_y: N
+    gyroscopic_z: N
+    leg_roll: N
+    leg_pitch: N
+    leg_yaw: N
+    rate_gain: N
+    yaw_gain: N
+    most_turning: N
+    collective: N
+    roll1: N
+    roll2: N
+    roll3: N
+    roll4: N
+    pitch1: N
+    pitch2: N
+    pitch3: N
+    pitch4: N
+    yaw1: N
+    yaw2: N
+    yaw3: N
+    yaw4: N
+    shaft_power: N
+    electronics_power: N
+    full_voltage: N
+    resistance: N
+
+
+def rotors_of(vehicle: VehicleParameters) -> RotorParameters:
+    """Return a vehicle's rotors.
+
+    Raises:
+        UsageError: It has none: it is modelled by its response as a whole.
+    """
+    if vehicle.rotors is None:
+        raise UsageError("this vehicle has no rotors: it is modelled by its response as a whole; see docs/rotors.md")
+    return vehicle.rotors
+
+
+def constants_of(vehicle: VehicleParameters) -> Constants:
+    """Return one vehicle's constants."""
+    rotors = rotors_of(vehicle)
+    ix, iy, iz = rotors.inertia_kg_m2
+    mass, k = vehicle.mass_kg, rotors.thrust_n_s2
+    (x1, y1), (x2, y2), (x3, y3), (x4, y4) = rotors.places_m
+    # What each rotor must give for a sum of thrusts and torques about x, y and z.
+    rows = [[1.0] * 4, [y1, y2, y3, y4], [-x1, -x2, -x3, -x4], [rotors.torque_m * sign for sign in YAW_SIGNS]]
+    share = np.linalg.inv(np.array(rows))
+    roll, pitch, yaw = (share[:, 1] * ix).tolist(), (share[:, 2] * iy).tolist(), (share[:, 3] * iz).tolist()
+    collective = mass / 4
+    return Constants(
+        thrust=k,
+        idle_speed=rotors.idle_speed_rad_s,
+        full_speed=rotors.full_speed_rad_s,
+        up_share=1.0 - math.exp(-PLANT_STEP_S / rotors.speed_up_s),
+        down_share=1.0 - math.exp(-PLANT_STEP_S / rotors.speed_down_s),
+        inflow=rotors.rotor_inflow_kg,
+        rotor_drag=rotors.rotor_drag_kg,
+        drag_x=rotors.body_drag_kg_m[0],
+        drag_y=rotors.body_drag_kg_m[1],
+        drag_z=rotors.body_drag_kg_m[2],
+        per_mass=1.0 / mass,
+        rotor_offset=vehicle.rotor_height_m - vehicle.half_height_m,
+        rotor_height=vehicle.rotor_height_m,
+        ground_effect=vehicle.ground_effect**0.5 * vehicle.rotor_radius_m / 4,
+        x1=x1,
+        x2=x2,
+        x3=x3,
+        x4=x4,
+        y1=y1,
+        y2=y2,
+        y3=y3,
+        y4=y4,
+        roll_per_torque=1.0 / ix,
+        pitch_per_torque=1.0 / iy,
+        yaw_per_thrust=rotors.torque_m / iz,
+        gyroscopic_x=(iz - iy) / ix,
+        gyroscopic_y=(ix - iz) / iy,
+        gyroscopic_z=(iy - ix) / iz,
+        leg_roll=mass * vehicle.radius_m / ix,
+        leg_pitch=mass * vehicle.radius_m / iy,
+        leg_yaw=vehicle.friction * mass * vehicle.radius_m * (2 / 3) / iz,
+        rate_gain=2 * vehicle.attitude_damping * vehicle.attitude_frequency_rad_s,
+        yaw_gain=1.0 / vehicle.yaw_time_constant_s,
+        most_turning=vehicle.most_angular_acceleration_rad_s2,
+        collective=collective,
+        roll1=roll[0],
+        roll2=roll[1],
+        roll3=roll[2],
+        roll4=roll[3],
+        pitch1=pitch[0],
+        pitch2=pitch[1],
+        pitch3=pitch[2],
+        pitch4=pitch[3],
+        yaw1=yaw[0],
+        yaw2=yaw[1],
+        yaw3=yaw[2],
+        yaw4=yaw[3],
+        shaft_power=rotors.torque_m * k / rotors.efficiency,
+        electronics_power=vehicle.electronics_power_w,
+        full_voltage=vehicle.battery_full_v,
+        resistance=vehicle.battery_resistance_ohm,
+    )
+
+
+def all_constants(each: Sequence[Constants]) -> Constants:
+    """Return the constants of all drones as arrays, each (n,)."""
+    return Constants(*np.array([astuple(one) for one in each]).T)
+
+
+def rotation(w: N, x: N, y: N, z: N) -> tuple[Three, Three, Three]:
+    """Return the rows of the world-from-body rotation of a quaternion."""
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    wx, wy, wz = w * x, w * y, w * z
+    return (
+        (1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)),
+        (2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)),
+        (2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)),
+    )
+
+
+def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> Four:
+    """Return the speeds of the rotors after a step of :data:`PLANT_STEP_S` towards other ones."""
+    (one, two, three, four), (to_one, to_two, to_three, to_four) = speeds, targets
+    up, down = c.up_share, c.down_share
+    return (
+        one + (to_one - one) * do.choose(to_one > one, up, down),
+        two + (to_two - two) * do.choose(to_two > two, up, down),
+        three + (to_three - three) * do.choose(to_three > three, up, down),
+        four + (to_four - four) * do.choose(to_four > four, up, down),
+    )
+
+
+def advance(
+    do: Operations, c: Constants, turning: Sequence[N], speeds: Four, motion: Sequence[N], knock: Three, legs: bool
+) -> tuple[tuple[N, ...], tuple[N, ...], Three, N]:
+    """Advance a rigid body by a step of :data:`PLANT_STEP_S`.
+
+    Args:
+        do: The operations.
+        c: The constants.
+        turning: Quaternion (w, x, y, z; world from body) and body rates.
+        speeds: Of the rotors, which hold through the step.
+        motion: Velocity of the air, position, velocity; world axes.
+        knock: Acceleration, world axes, by which what the body touches changed its velocity in the last step.
+        legs: Whether anything may stand, or lie, on something: then that turns it onto its feet.
+
+    Returns:
+        Quaternion and body rates; position and velocity; the specific force along the body's axes in the step; and the
+        rotors' thrust per mass.
+    """
+    w, x, y, z, p, q, r = turning
+    s1, s2, s3, s4 = speeds
+    air_x, air_y, air_z, px, py, pz, vx, vy, vz = motion
+    knock_x, knock_y, knock_z = knock
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation(w, x, y, z)
+
+    # The air along the body's axes, and at each rotor along its own: the force of a rotor is [M], less inflow [S].
+    east, north, up = vx - air_x, vy - air_y, vz - air_z
+    ahead = r00 * east + r10 * north + r20 * up
+    aside = r01 * east + r11 * north + r21 * up
+    along = r02 * east + r12 * north + r22 * up
+    airspeed = do.root(east * east + north * north + up * up)
+    k, inflow = c.thrust, c.inflow
+    t1, t2, t3, t4 = k * s1 * s1, k * s2 * s2, k * s3 * s3, k * s4 * s4
+    yaw = (t1 - t2 - t3 + t4) * c.yaw_per_thrust
+    t1 = t1 - inflow * s1 * (along + p * c.y1 - q * c.x1)
+    t2 = t2 - inflow * s2 * (along + p * c.y2 - q * c.x2)
+    t3 = t3 - inflow * s3 * (along + p * c.y3 - q * c.x3)
+    t4 = t4 - inflow * s4 * (along + p * c.y4 - q * c.x4)
+    thrust = t1 + t2 + t3 + t4
+
+    # Near the floor it is raised by 1 / (1 - (R / 4h)²) [C], as far as the rotors blow down.
+    shortfall = c.ground_effect / do.most(pz + c.rotor_offset, c.rotor_height)
+    lift = thrust / (1.0 - shortfall * shortfall * do.most(r22, 0.0))
+    flapping = c.rotor_drag * (s1 + s2 + s3 + s4)
+    fx = -ahead * (flapping + c.drag_x * airspeed) * c.per_mass
+    fy = -aside * (flapping + c.drag_y * airspeed) * c.per_mass
+    fz = (lift - along * c.drag_z * airspeed) * c.per_mass
+
+    dp = (t1 * c.y1 + t2 * c.y2 + t3 * c.y3 + t4 * c.y4) * c.roll_per_torque - c.gyroscopic_x * q * r
+    dq = (t1 * c.x1 + t2 * c.x2 + t3 * c.x3 + t4 * c.x4) * -c.pitch_per_torque - c.gyroscopic_y * p * r
+    dr = yaw - c.gyroscopic_z * p * q
+    if legs:
+        # They push with what carries the body, at arm's length at most.
+        load = do.most(knock_z, 0.0)
+        roll, pitch = load * c.leg_roll, load * c.leg_pitch
+        dp = dp + _within(do, -_LEG_STIFFNESS_PER_S2 * r21 - _LEG_DAMPING_PER_S * p, roll)
+        dq = dq + _within(do, _LEG_STIFFNESS_PER_S2 * r20 - _LEG_DAMPING_PER_S * q, pitch)
+        dr = dr + _within(do, -_LEG_DAMPING_PER_S * r, load * c.leg_yaw)
+
+    p, q, r = p + dp * PLANT_STEP_S, q + dq * PLANT_STEP_S, r + dr * PLANT_STEP_S
+    new_w = w - _HALF_STEP_S * (x * p + y * q + z * r)
+    new_x = x + _HALF_STEP_S * (w * p + y * r - z * q)
+    new_y = y + _HALF_STEP_S * (w * q + z * p - x * r)
+    new_z = z + _HALF_STEP_S * (w * r + x * q - y * p)
+    size = do.root(new_w * new_w + new_x * new_x + new_y * new_y + new_z * new_z)
+
+    ax = r00 * fx + r01 * fy + r02 * fz
+    ay = r10 * fx + r11 * fy + r12 * fz
+    az = r20 * fx + r21 * fy + r22 * fz - GRAVITY_M_S2
+    new_vx, new_vy, new_vz = vx + ax * PLANT_STEP_S, vy + ay * PLANT_STEP_S, vz + az * PLANT_STEP_S
+    px, py, pz = px + (vx + new_vx) * _HALF_STEP_S, py + (vy + new_vy) * _HALF_STEP_S, pz + (vz + new_vz) * _HALF_STEP_S
+    force = (
+        fx + r00 * knock_x + r10 * knock_y + r20 * knock_z,
+        fy + r01 * knock_x + r11 * knock_y + r21 * knock_z,
+        fz + r02 * knock_x + r12 * knock_y + r22 * knock_z,
+    )
+    turned = (new_w / size, new_x / size, new_y / size, new_z / size, p, q, r)
+    return turned, (px, py, pz, new_vx, new_vy, new_vz), force, thrust * c.per_mass
+
+
+def mix(do: Operations, c: Constants, rates: Three, wanted: Three, thrust: N, sag: N) -> Four:
+    """Return the speeds of the rotors that turn the body as wanted, and lift it.
+
+    Where the rotors cannot do all, roll and pitch come first, then the thrust, and yaw has a share.
+
+    Args:
+        do: The operations.
+        c: The constants.
+        rates: About the body's axes.
+        wanted: What they should be.
+        thrust: Per mass; at 0 the rotors stand.
+        sag: Voltage of the battery, as a share of a full one's.
+    """
+    p, q, r = rates
+    want_p, want_q, want_r = wanted
+    most = c.most_turning
+    dp = _within(do, (want_p - p) * c.rate_gain, most) + c.gyroscopic_x * q * r
+    dq = _within(do, (want_q - q) * c.rate_gain, most) + c.gyroscopic_y * p * r
+    dr = _within(do, (want_r - r) * c.yaw_gain, most) + c.gyroscopic_z * p * q
+    k, slowest, fastest = c.thrust, c.idle_speed * sag, c.full_speed * sag
+    least, range_n = k * slowest * slowest, k * (fastest * fastest - slowest * slowest)
+    # All four take the same share of yaw, so that one of them tells whether it is too much.
+    yaw = _within(do, dr * c.yaw1, range_n * _YAW_SHARE) / c.yaw1
+    d1 = dp * c.roll1 + dq * c.pitch1 + yaw * c.yaw1
+    d2 = dp * c.roll2 + dq * c.pitch2 + yaw * c.yaw2
+    d3 = dp * c.roll3 + dq * c.pitch3 + yaw * c.yaw3
+    d4 = dp * c.roll4 + dq * c.pitch4 + yaw * c.yaw4
+    low = do.least(do.least(d1, d2), do.least(d3, d4))
+    high = do.most(do.most(d1, d2), do.most(d3, d4))
+    scale = do.least(1.0, range_n / do.most(high - low, 1e-12))
+    base = do.least(do.most(thrust * c.collective, least - low * scale), least + range_n - high * scale)
+    runs = thrust > 0.0
+    return (
+        do.choose(runs, do.root(do.most(base + d1 * scale, 0.0) / k), 0.0),
+        do.choose(runs, do.root(do.most(base + d2 * scale, 0.0) / k), 0.0),
+        do.choose(runs, do.root(do.most(base + d3 * scale, 0.0) / k), 0.0),
+        do.choose(runs, do.root(do.most(base + d4 * scale, 0.0) / k), 0.0),
+    )
+
+
+def electric_power(c: Constants, speeds: Four) -> N:
+    """Return what the rotors at these speeds and the electronics take from the battery [W]."""
+    s1, s2, s3, s4 = speeds
+    return (s1 * s1 * s1 + s2 * s2 * s2 + s3 * s3 * s3 + s4 * s4 * s4) * c.shaft_power + c.electronics_power
+
+
+def load(do: Operations, c: Constants, power: N, unloaded: N, voltage: N) -> tuple[N, N]:
+    """Return voltage and current of a battery.
+
+    Args:
+        do: The operations.
+        c: The constants.
+        power: That is taken [W].
+        unloaded: Its voltage without load [V].
+        voltage: Its voltage before.
+    """
+    current = power / do.most(voltage, 1.0)
+    # No battery gives more power than at half its voltage.
+    return do.most(unloaded - current * c.resistance, unloaded * 0.5), current
+
+
+def _within(do: Operations, value: N, limit: N) -> N:
+    return do.least(do.most(value, -limit), limit)

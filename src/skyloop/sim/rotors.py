@@ -1,0 +1,296 @@
+"""Bodies at the level of rotors: any attitude, four rotors each, in steps of 1 ms; flown by firmware or built-in loops.
+
+As in :mod:`skyloop.sim.dynamics`, many drones are computed in arrays and a few one by one, with the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from skyloop.errors import UsageError
+from skyloop.sim.columns import ARRAYS, NUMBERS, Fields, columns
+from skyloop.sim.dynamics import STEP_S, BodyTable, body_rates, column
+from skyloop.sim.firmware import Firmware
+from skyloop.sim.instruments import Instruments
+from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
+from skyloop.sim.rotor_dynamics import (
+    PLANT_STEP_S,
+    Constants,
+    advance,
+    all_constants,
+    constants_of,
+    electric_power,
+    load,
+    mix,
+    rotation,
+    rotors_of,
+    spin,
+)
+from skyloop.sim.streams import Floats
+
+PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: steps of the plant in one of the simulation
+
+# Rows of the table of a body's state and inputs beside those of BodyTable.
+_TURNING, _SPEEDS, _FORCE, _VOLTAGE, _CURRENT = 0, 7, 11, 14, 15
+_TARGETS, _WANTED, _THRUST, _KNOCK, _SAG, _OPEN = 16, 20, 23, 24, 27, 28
+_ROWS = 29
+_AIR, _LEAST_COS = 19, 1e-6  # first row of BodyTable's air, thrust, position, velocity; near the vertical
+_ROTOR_MARGIN_M_S2 = 60.0  # of gravity, ground effect, and drag in a fast dive
+
+
+class RotorBodies(BodyTable):
+    """Bodies with four rotors each.
+
+    Their state is a quaternion, body rates and rotor speeds; angles, their sines, cosines and derivatives follow from
+    it at the end of each step. The inputs ``attitude_command`` and ``thrust_command`` are followed by an attitude loop
+    (250 Hz), a rate loop and a mixer (1 kHz), except for drones that firmware flies.
+
+    Attributes:
+        quaternion: World from body, w, x, y, z, (4, n).
+        turning: Body rates, (3, n) [rad/s].
+        speeds: Of the rotors, (4, n) [rad/s].
+        voltage: Of the batteries under load, (n,) [V].
+        current: That the batteries give, (n,) [A].
+    """
+
+    def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
+        super().__init__(positions, yaws)
+        n = len(parameters)
+        self.count = 0  #: steps of the plant
+        rows = columns(_ROWS, n)
+        self.quaternion, self.turning, self.speeds = rows[0:4], rows[4:7], rows[7:11]
+        self._force, self.voltage, self.current = rows[11:14], rows[14], rows[15]
+        self._targets, self._wanted, self._thrust_wanted = rows[16:20], rows[20:23], rows[23]
+        self._knock, self._sag, self._open_voltage = rows[24:27], rows[27], rows[28]
+        self._force[2] = GRAVITY_M_S2
+        full = column(parameters, lambda p: p.battery_full_v)
+        self.voltage[:] = self._open_voltage[:] = full
+        self._full_voltage = full
+        self._sag[:] = 1.0
+        self.quaternion[0], self.quaternion[3] = np.cos(yaws / 2), np.sin(yaws / 2)
+        each = [constants_of(vehicle) for vehicle in parameters]
+        self._constants = each
+        self._all = all_constants(each)
+        self._attitude_gain = column(parameters, lambda p: p.attitude_frequency_rad_s / (2 * p.attitude_damping))
+        self._after = self.velocity.copy()  # the velocity at the end of the last step, before collisions
+        self._flown = np.zeros(n, dtype=np.bool_)
+        self._pilots: dict[int, _Pilot] = {}
+        thrusts = (rotors_of(p).full_thrust_n / p.mass_kg for p in parameters)
+        self.most_acceleration_m_s2 = max(thrusts) + _ROTOR_MARGIN_M_S2
+        if self._few:
+            self._turning_of, self._speeds_of = Fields(rows, _TURNING, 7), Fields(rows, _SPEEDS, 4)
+            self._inputs_of = Fields(rows, _TARGETS, 12)
+            self._motion_of, self._moved_of = Fields(self._table, _AIR, 10), Fields(self._table, _AIR + 3, 7)
+            self._forced = Fields(rows, _SPEEDS, 7)
+        self._derive()
+
+    # Inputs ----------------------------------------------------------------------------------------------------
+
+    def cut(self, drone: int) -> None:
+        """Stop the rotors: nothing holds the attitude any more."""
+        self.attitude_command[:, drone] = 0.0
+        self.thrust_command[drone] = 0.0
+
+    def steady(self, drone: int) -> None:
+        """Do nothing: rotors that run hold the attitude, and so does what a drone stands on."""
+
+    def fly_by(self, drone: int, firmware: Firmware, instruments: Instruments) -> None:
+        """Let firmware fly a drone, from the next step on."""
+        self._pilots = {**self._pilots, drone: _Pilot(self, drone, firmware, instruments)}
+        self._flown[drone] = True
+        self._targets[:, drone] = 0.0
+
+    def release(self, drone: int) -> None:
+        """Stop the rotors of a drone that firmware flew; the built-in loops fly it."""
+        self._pilots = {number: pilot for number, pilot in self._pilots.items() if number != drone}
+        self._flown[drone] = False
+        self._targets[:, drone] = 0.0
+        self.cut(drone)
+
+    def command(self, drone: int, commands: Sequence[float]) -> None:
+        """Set the commands of a flown drone's rotors, 0 to 1, in the order of the rotors.
+
+        Raises:
+            UsageError: They are not four finite numbers.
+        """
+        if len(commands) != 4 or not all(map(math.isfinite, commands)):
+            raise UsageError(f"firmware must return 4 finite rotor commands, front left first, got {commands!r}")
+        constants = self._constants[drone]
+        idle, span = constants.idle_speed, constants.full_speed - constants.idle_speed
+        self._targets[:, drone] = [idle + span * min(one, 1.0) if one > 0.0 else 0.0 for one in commands]
+
+    def idles(self, drone: int) -> bool:
+        """Whether no rotor of a flown drone is commanded to be faster than idle."""
+        return bool((self._targets[:, drone] <= self._constants[drone].idle_speed).all())
+
+    def set_unloaded_voltage(self, voltage: Floats) -> None:
+        """Set the batteries' voltage without load, (n,) [V]; empty ones have none."""
+        self._open_voltage[:] = voltage
+
+    def turn(self, drone: int, change_rad_s: float) -> None:
+        """Turn a body faster about the vertical by so much."""
+        up = self.rotations()[drone, 2]
+        self.turning[:, drone] += up * change_rad_s
+        self.rates[2, drone] += change_rad_s
+
+    def put(self, drone: int, position_m: Floats, yaw_rad: float, thrust: float) -> None:
+        """Move a body, level and at rest; ``position_m`` has shape (3,), ``thrust`` is an acceleration [m/s²]."""
+        super().put(drone, position_m, yaw_rad, thrust)
+        constants = self._constants[drone]
+        self._after[:, drone] = 0.0
+        self.quaternion[:, drone] = math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2)
+        self.turning[:, drone] = 0.0
+        self.speeds[:, drone] = math.sqrt(thrust * constants.collective / constants.thrust)
+        self._derive()
+
+    # Looking ---------------------------------------------------------------------------------------------------
+
+    def power(self) -> Floats:
+        """Return what each drone takes from its battery now, (n,) [W]."""
+        power: Floats = electric_power(self._all, tuple(self.speeds))
+        return power
+
+    def body_rates(self) -> Floats:
+        """Return the angular velocities about the bodies' axes, (3, n) [rad/s]."""
+        return self.turning.copy()
+
+    def body_rates_of(self, drone: int) -> tuple[float, float, float]:
+        """Return the angular velocity of one drone about its body's axes [rad/s]."""
+        return _three(self.turning[:, drone])
+
+    @property
+    def time_s(self) -> float:
+        """Time of the simulation, with the steps of the plant that are done."""
+        return self.count * PLANT_STEP_S
+
+    def rotations(self) -> Floats:
+        """Return world-from-body rotations, (n, 3, 3)."""
+        return np.moveaxis(np.array(rotation(*self.quaternion)), 2, 0)
+
+    # Steps -----------------------------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """Advance by :data:`~skyloop.sim.dynamics.STEP_S`, without collisions."""
+        self._begin()
+        for _ in range(PLANT_STEPS):
+            for pilot in self._pilots.values():
+                pilot.exchange()
+            if self._few:
+                for drone, constants in enumerate(self._constants):
+                    self._advance_one(drone, constants)
+            else:
+                self._advance_all()
+            self.count += 1
+        np.copyto(self._after, self.velocity)
+        self._derive()
+
+    def _begin(self) -> None:
+        """Prepare the inputs of a step: what collisions did, the attitude loop, the batteries."""
+        np.subtract(self.velocity, self._after, out=self._knock)
+        np.divide(self._knock, STEP_S, out=self._knock)
+        np.copyto(self.velocity_before, self.velocity)
+        roll_rate, pitch_rate = (self.attitude_command[:2] - self.angles[:2]) * self._attitude_gain
+        wanted = body_rates((roll_rate, pitch_rate, self.attitude_command[2]), self.sin, self.cos)
+        self._wanted[0], self._wanted[1], self._wanted[2] = wanted
+        self._thrust_wanted[:] = self.thrust_command
+        self.voltage[:], self.current[:] = load(ARRAYS, self._all, self.power(), self._open_voltage, self.voltage)
+        np.divide(self.voltage, self._full_voltage, out=self._sag)
+
+    def _advance_one(self, drone: int, constants: Constants) -> None:
+        turning = self._turning_of.read[drone]()
+        s1, s2, s3, s4 = self._speeds_of.read[drone]()
+        t1, t2, t3, t4, p, q, r, thrust, knock_x, knock_y, knock_z, sag = self._inputs_of.read[drone]()
+        air_x, air_y, air_z, _, *moving = self._motion_of.read[drone]()
+        if drone in self._pilots:
+            targets = (t1 * sag, t2 * sag, t3 * sag, t4 * sag)
+        else:
+            targets = mix(NUMBERS, constants, (turning[4], turning[5], turning[6]), (p, q, r), thrust, sag)
+        speeds = spin(NUMBERS, constants, (s1, s2, s3, s4), targets)
+        knock = knock_x, knock_y, knock_z
+        turned, moved, force, lift = advance(
+            NUMBERS, constants, turning, speeds, (air_x, air_y, air_z, *moving), knock, knock_z > 0.0
+        )
+        self._turning_of.write[drone](*turned)
+        self._forced.write[drone](*speeds, *force)
+        self._moved_of.write[drone](lift, *moved)
+
+    def _advance_all(self) -> None:
+        do, constants = ARRAYS, self._all
+        speeds, knock = tuple(self.speeds), tuple(self._knock)
+        targets = mix(do, constants, tuple(self.turning), tuple(self._wanted), self._thrust_wanted, self._sag)
+        if self._pilots:
+            targets = tuple(np.where(self._flown, self._targets * self._sag, targets))
+        speeds = spin(do, constants, speeds, targets)
+        motion = (*self.air, *self.position, *self.velocity)
+        legs = bool((knock[2] > 0.0).any())
+        turning = (*self.quaternion, *self.turning)
+        turned, moved, force, lift = advance(do, constants, turning, speeds, motion, knock, legs)
+        for rows, values in (
+            (self.quaternion, turned[:4]),
+            (self.turning, turned[4:]),
+            (self.speeds, speeds),
+            (self._force, force),
+            (self.position, moved[:3]),
+            (self.velocity, moved[3:]),
+        ):
+            for row, value in zip(rows, values, strict=True):
+                row[:] = value
+        self.thrust[:] = lift
+
+    def _derive(self) -> None:
+        """Derive angles, their sines, cosines and derivatives from the quaternions."""
+        # In arrays of their own, for a function of NumPy's need not give the same bits for other strides.
+        quaternion = np.ascontiguousarray(self.quaternion)
+        (r00, r01, _), (r10, r11, _), (r20, r21, r22) = rotation(*quaternion)
+        level = np.sqrt(r21 * r21 + r22 * r22)
+        sin, cos = np.empty((3, len(level))), np.empty((3, len(level)))
+        some = np.maximum(level, _LEAST_COS)
+        sin[0], sin[1], sin[2] = r21 / some, -r20, r10 / some
+        cos[0], cos[1], cos[2] = r22 / some, level, r00 / some
+        steep = level < _LEAST_COS
+        if steep.any():  # roll and yaw turn about the same axis: all of it counts as yaw
+            sin[0, steep], sin[2, steep] = 0.0, -r01[steep]
+            cos[0, steep], cos[1, steep], cos[2, steep] = 1.0, _LEAST_COS, r11[steep]
+        cos[0, cos[0] == 0.0] = _LEAST_COS  # thrust is divided by it
+        self.angles[:] = np.arctan2(sin, cos)
+        self.sin[:], self.cos[:] = sin, cos
+        p, q, r = self.turning
+        about = (q * sin[0] + r * cos[0]) / cos[1]
+        self.rates[0], self.rates[1], self.rates[2] = p + about * sin[1], q * cos[0] - r * sin[0], about
+
+
+class _Pilot:
+    """Exchanges readings and commands with the firmware of one drone."""
+
+    def __init__(self, bodies: RotorBodies, drone: int, firmware: Firmware, instruments: Instruments) -> None:
+        self._bodies = bodies
+        self._drone = drone
+        self._firmware = firmware
+        self._instruments = instruments
+
+    def exchange(self) -> None:
+        bodies, drone = self._bodies, self._drone
+        w, x, y, z = bodies.quaternion[:, drone].tolist()
+        # What it stands on carries it at the end of each step of the simulation only: in between it falls.
+        velocity = bodies.velocity_before if bodies._knock[2, drone] > 0.0 else bodies.velocity
+        readings = self._instruments.read(
+            bodies.count,
+            _three(bodies.position[:, drone]),
+            _three(velocity[:, drone]),
+            (w, x, y, z),
+            _three(bodies.turning[:, drone]),
+            _three(bodies._force[:, drone]),
+            float(bodies.voltage[drone]),
+            float(bodies.current[drone]),
+        )
+        commands = self._firmware.exchange(readings)
+        if commands is not None:
+            bodies.command(drone, commands)
+
+
+def _three(values: Floats) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
