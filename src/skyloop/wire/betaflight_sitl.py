@@ -5,10 +5,11 @@ To port 9003 comes the state: 18 little-endian doubles, 144 bytes.
 ======  =====  =========================================================================================
 offset  count  meaning
 ======  =====  =========================================================================================
-0       1      time [s]. Its differences, by the clock of the computer, set how fast Betaflight's own goes
+0       1      time [s]. The difference to the packet before, by the time between both, is how fast Betaflight's
+               clock goes until the next; 0 leaves it as it is
 8       3      gyro, about forward, right, down [rad/s]
-32      3      specific force, each axis negative: backward, right, down [m/s²]; at rest (0, 0, -g)
-56      4      quaternion w, x, y, z: from body (forward, left, up) to world (north, west, up)
+32      3      specific force along backward, right, down [m/s²]; at rest (0, 0, -g)
+56      4      quaternion w, x, y, z: from body (forward, right, down) to world (north, east, down)
 88      3      velocity east, north, up [m/s]
 112     3      longitude, latitude [°], altitude [m]
 136     1      air pressure [Pa]

@@ -1,0 +1,30 @@
+"""Stands in for ArduCopter's program: its JSON interface, without anything that flies.
+
+Its rotors get 0.1, 0.2, 0.3 and 0.4 in ArduCopter's order. What it is told goes to ``states.jsonl`` where it runs.
+STANDIN in the environment: ``garbage`` sends other things between, ``dies`` ends after the third state.
+"""
+
+import argparse
+import os
+import socket
+from pathlib import Path
+
+from skyloop.wire.ardupilot_json import ServoPacket, encode_servos
+
+parser = argparse.ArgumentParser()
+for option in ("model", "instance", "sim-port-out", "serial0", "sysid", "home", "defaults"):
+    parser.add_argument(f"--{option}", required=True)
+options = parser.parse_args()
+print("starting with", Path(options.defaults).read_text().split("\n")[0], flush=True)
+manner = os.environ.get("STANDIN", "")
+simulator = "127.0.0.1", int(options.sim_port_out)
+link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+with Path("states.jsonl").open("a", buffering=1) as states:
+    for frame in range(1_000_000):
+        if manner == "garbage":
+            for junk in (b"", b"\x1aH", bytes(40), os.urandom(72)):
+                link.sendto(junk, simulator)
+        link.sendto(encode_servos(ServoPacket(400, frame, (1100, 1200, 1300, 1400, *[0] * 12))), simulator)
+        states.write(link.recv(4096).decode().strip() + "\n")
+        if manner == "dies" and frame == 2:
+            raise SystemExit("something went wrong in it")
