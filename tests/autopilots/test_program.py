@@ -71,7 +71,7 @@ def test_what_was_killed_is_started_again() -> None:
     with Watched(SLEEPS) as watched:
         watched.next(FirmwareEventKind.STARTED)
         os.kill(watched.program.pid, signal.SIGKILL)
-        assert watched.next(FirmwareEventKind.DIED) == "Testware was killed by SIGKILL; its output ends with:\nawake"
+        assert watched.next(FirmwareEventKind.DIED).startswith("Testware was killed by SIGKILL")
         watched.next(FirmwareEventKind.STARTED)
         assert watched.program.starts == 2
 
