@@ -29,6 +29,7 @@ PLANT_STEP_S = 0.001  #: of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, within a tenth of a second
+_ROTOR_RESPONSE_S = 0.02  # the mixer asks slower rotors for more than it wants, to have it with this time constant
 _YAW_SHARE = 0.25  # of the rotors' range of thrust that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]
@@ -44,6 +45,7 @@ class Constants:
     full_speed: N
     up_share: N
     down_share: N
+    lead: N
     inflow: N
     rotor_drag: N
     drag_x: N
@@ -64,6 +66,7 @@ class Constants:
     roll_per_torque: N
     pitch_per_torque: N
     yaw_per_thrust: N
+    yaw_per_spin: N
     gyroscopic_x: N
     gyroscopic_y: N
     gyroscopic_z: N
@@ -120,6 +123,7 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
         full_speed=rotors.full_speed_rad_s,
         up_share=1.0 - math.exp(-PLANT_STEP_S / rotors.speed_up_s),
         down_share=1.0 - math.exp(-PLANT_STEP_S / rotors.speed_down_s),
+        lead=max(1.0, rotors.speed_up_s / _ROTOR_RESPONSE_S),
         inflow=rotors.rotor_inflow_kg,
         rotor_drag=rotors.rotor_drag_kg,
         drag_x=rotors.body_drag_kg_m[0],
@@ -140,6 +144,7 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
         roll_per_torque=1.0 / ix,
         pitch_per_torque=1.0 / iy,
         yaw_per_thrust=rotors.torque_m / iz,
+        yaw_per_spin=rotors.rotor_inertia_kg_m2 / iz / PLANT_STEP_S,
         gyroscopic_x=(iz - iy) / ix,
         gyroscopic_y=(ix - iz) / iy,
         gyroscopic_z=(iy - ix) / iz,
@@ -185,20 +190,31 @@ def rotation(w: N, x: N, y: N, z: N) -> tuple[Three, Three, Three]:
     )
 
 
-def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> Four:
-    """Return the speeds of the rotors after a step of :data:`PLANT_STEP_S` towards other ones."""
+def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> tuple[Four, N]:
+    """Spin the rotors towards other speeds for a step of :data:`PLANT_STEP_S`.
+
+    Returns:
+        Their speeds, and by how much the body turns faster about z for that, per time.
+    """
     (one, two, three, four), (to_one, to_two, to_three, to_four) = speeds, targets
     up, down = c.up_share, c.down_share
-    return (
-        one + (to_one - one) * do.choose(to_one > one, up, down),
-        two + (to_two - two) * do.choose(to_two > two, up, down),
-        three + (to_three - three) * do.choose(to_three > three, up, down),
-        four + (to_four - four) * do.choose(to_four > four, up, down),
-    )
+    more_one = (to_one - one) * do.choose(to_one > one, up, down)
+    more_two = (to_two - two) * do.choose(to_two > two, up, down)
+    more_three = (to_three - three) * do.choose(to_three > three, up, down)
+    more_four = (to_four - four) * do.choose(to_four > four, up, down)
+    twist = (more_one - more_two - more_three + more_four) * c.yaw_per_spin
+    return (one + more_one, two + more_two, three + more_three, four + more_four), twist
 
 
 def advance(
-    do: Operations, c: Constants, turning: Sequence[N], speeds: Four, motion: Sequence[N], knock: Three, legs: bool
+    do: Operations,
+    c: Constants,
+    turning: Sequence[N],
+    speeds: Four,
+    twist: N,
+    motion: Sequence[N],
+    knock: Three,
+    legs: bool,
 ) -> tuple[tuple[N, ...], tuple[N, ...], Three, N]:
     """Advance a rigid body by a step of :data:`PLANT_STEP_S`.
 
@@ -207,6 +223,7 @@ def advance(
         c: The constants.
         turning: Quaternion (w, x, y, z; world from body) and body rates.
         speeds: Of the rotors, which hold through the step.
+        twist: See :func:`spin`.
         motion: Velocity of the air, position, velocity; world axes.
         knock: Acceleration, world axes, by which what the body touches changed its velocity in the last step.
         legs: Whether anything may stand, or lie, on something: then that turns it onto its feet.
@@ -246,7 +263,7 @@ def advance(
 
     dp = (t1 * c.y1 + t2 * c.y2 + t3 * c.y3 + t4 * c.y4) * c.roll_per_torque - c.gyroscopic_x * q * r
     dq = (t1 * c.x1 + t2 * c.x2 + t3 * c.x3 + t4 * c.x4) * -c.pitch_per_torque - c.gyroscopic_y * p * r
-    dr = yaw - c.gyroscopic_z * p * q
+    dr = yaw + twist - c.gyroscopic_z * p * q
     if legs:
         # They push with what carries the body, at arm's length at most.
         load = do.most(knock_z, 0.0)
@@ -276,8 +293,8 @@ def advance(
     return turned, (px, py, pz, new_vx, new_vy, new_vz), force, thrust * c.per_mass
 
 
-def mix(do: Operations, c: Constants, rates: Three, wanted: Three, thrust: N, sag: N) -> Four:
-    """Return the speeds of the rotors that turn the body as wanted, and lift it.
+def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three, thrust: N, sag: N) -> Four:
+    """Return the speeds to command to the rotors, so that they turn the body as wanted, and lift it.
 
     Where the rotors cannot do all, roll and pitch come first, then the thrust, and yaw has a share.
 
@@ -285,6 +302,7 @@ def mix(do: Operations, c: Constants, rates: Three, wanted: Three, thrust: N, sa
         do: The operations.
         c: The constants.
         rates: About the body's axes.
+        speeds: Of the rotors.
         wanted: What they should be.
         thrust: Per mass; at 0 the rotors stand.
         sag: Voltage of the battery, as a share of a full one's.
@@ -307,12 +325,17 @@ def mix(do: Operations, c: Constants, rates: Three, wanted: Three, thrust: N, sa
     high = do.most(do.most(d1, d2), do.most(d3, d4))
     scale = do.least(1.0, range_n / do.most(high - low, 1e-12))
     base = do.least(do.most(thrust * c.collective, least - low * scale), least + range_n - high * scale)
-    runs = thrust > 0.0
+    runs, lead = thrust > 0.0, c.lead
+    s1, s2, s3, s4 = speeds
+    one = s1 + (do.root(do.most(base + d1 * scale, 0.0) / k) - s1) * lead
+    two = s2 + (do.root(do.most(base + d2 * scale, 0.0) / k) - s2) * lead
+    three = s3 + (do.root(do.most(base + d3 * scale, 0.0) / k) - s3) * lead
+    four = s4 + (do.root(do.most(base + d4 * scale, 0.0) / k) - s4) * lead
     return (
-        do.choose(runs, do.root(do.most(base + d1 * scale, 0.0) / k), 0.0),
-        do.choose(runs, do.root(do.most(base + d2 * scale, 0.0) / k), 0.0),
-        do.choose(runs, do.root(do.most(base + d3 * scale, 0.0) / k), 0.0),
-        do.choose(runs, do.root(do.most(base + d4 * scale, 0.0) / k), 0.0),
+        do.choose(runs, do.least(do.most(one, slowest), fastest), 0.0),
+        do.choose(runs, do.least(do.most(two, slowest), fastest), 0.0),
+        do.choose(runs, do.least(do.most(three, slowest), fastest), 0.0),
+        do.choose(runs, do.least(do.most(four, slowest), fastest), 0.0),
     )
 
 

@@ -77,6 +77,7 @@ class RotorParameters:
             rotors' speeds: blades flap, and their own drag is lopsided.
         rotor_inflow_kg: The same along the rotors' axes: air from above takes thrust away.
         body_drag_kg_m: Force per square of the airspeed, along the body's axes.
+        rotor_inertia_kg_m2: Of one rotor about its axis: a rotor that gets faster turns the body the other way.
         efficiency: Share of the battery's power that the rotors' shafts give to the air as torque times speed.
         instruments: Errors of the instruments.
 
@@ -96,10 +97,11 @@ class RotorParameters:
     rotor_inflow_kg: float
     body_drag_kg_m: Vec3
     efficiency: float
+    rotor_inertia_kg_m2: float = 0.0
     instruments: InstrumentParameters = field(default_factory=InstrumentParameters)
 
     def __post_init__(self) -> None:
-        may_be_zero = ("rotor_drag_kg", "rotor_inflow_kg", "idle_speed_rad_s")
+        may_be_zero = ("rotor_drag_kg", "rotor_inflow_kg", "rotor_inertia_kg_m2")
         _check(self, positive=lambda name: name not in may_be_zero)
         for name, count in (("places_m", 4), ("inertia_kg_m2", 3), ("body_drag_kg_m", 3)):
             values = getattr(self, name)

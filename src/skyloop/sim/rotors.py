@@ -204,30 +204,37 @@ class RotorBodies(BodyTable):
         s1, s2, s3, s4 = self._speeds_of.read[drone]()
         t1, t2, t3, t4, p, q, r, thrust, knock_x, knock_y, knock_z, sag = self._inputs_of.read[drone]()
         air_x, air_y, air_z, _, *moving = self._motion_of.read[drone]()
+        speeds = (s1, s2, s3, s4)
         if drone in self._pilots:
             targets = (t1 * sag, t2 * sag, t3 * sag, t4 * sag)
         else:
-            targets = mix(NUMBERS, constants, (turning[4], turning[5], turning[6]), (p, q, r), thrust, sag)
-        speeds = spin(NUMBERS, constants, (s1, s2, s3, s4), targets)
+            rates = turning[4], turning[5], turning[6]
+            targets = mix(NUMBERS, constants, rates, speeds, (p, q, r), thrust, sag)
+        speeds, twist = spin(NUMBERS, constants, speeds, targets)
         knock = knock_x, knock_y, knock_z
-        turned, moved, force, lift = advance(
-            NUMBERS, constants, turning, speeds, (air_x, air_y, air_z, *moving), knock, knock_z > 0.0
-        )
+        motion = (air_x, air_y, air_z, *moving)
+        turned, moved, force, lift = advance(NUMBERS, constants, turning, speeds, twist, motion, knock, knock_z > 0.0)
         self._turning_of.write[drone](*turned)
         self._forced.write[drone](*speeds, *force)
         self._moved_of.write[drone](lift, *moved)
 
     def _advance_all(self) -> None:
         do, constants = ARRAYS, self._all
-        speeds, knock = tuple(self.speeds), tuple(self._knock)
-        targets = mix(do, constants, tuple(self.turning), tuple(self._wanted), self._thrust_wanted, self._sag)
+        s1, s2, s3, s4 = self.speeds
+        p, q, r = self.turning
+        want_p, want_q, want_r = self._wanted
+        knock_x, knock_y, knock_z = self._knock
+        speeds, wanted = (s1, s2, s3, s4), (want_p, want_q, want_r)
+        targets = mix(do, constants, (p, q, r), speeds, wanted, self._thrust_wanted, self._sag)
         if self._pilots:
-            targets = tuple(np.where(self._flown, self._targets * self._sag, targets))
-        speeds = spin(do, constants, speeds, targets)
+            t1, t2, t3, t4 = np.where(self._flown, self._targets * self._sag, targets)
+            targets = (t1, t2, t3, t4)
+        speeds, twist = spin(do, constants, speeds, targets)
         motion = (*self.air, *self.position, *self.velocity)
-        legs = bool((knock[2] > 0.0).any())
-        turning = (*self.quaternion, *self.turning)
-        turned, moved, force, lift = advance(do, constants, turning, speeds, motion, knock, legs)
+        legs = bool((knock_z > 0.0).any())
+        turned, moved, force, lift = advance(
+            do, constants, (*self.quaternion, p, q, r), speeds, twist, motion, (knock_x, knock_y, knock_z), legs
+        )
         for rows, values in (
             (self.quaternion, turned[:4]),
             (self.turning, turned[4:]),
