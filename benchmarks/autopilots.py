@@ -1,4 +1,4 @@
-"""Real firmware in the simulated world: it flies a square and follows a marker, and its state is held against the truth.
+"""Real firmware in the simulated world: it flies a square and follows a marker, and is held against the truth.
 
 ``SKYLOOP_ARDUCOPTER=… python -m benchmarks.autopilots ardupilot`` prints the figures of ``docs/autopilots.md``.
 """
