@@ -16,11 +16,12 @@ from skyloop.errors import UsageError
 if TYPE_CHECKING:
     from skyloop.emulators.ardrone import ArdroneFirmware, Ports
     from skyloop.emulators.mavlink import MavlinkFirmware
+    from skyloop.emulators.msp import BetaflightFirmware
     from skyloop.emulators.tello import TelloFirmware
     from skyloop.faults import Faults
     from skyloop.sim.options import SimOptions
 
-    Emulated: TypeAlias = ArdroneFirmware | MavlinkFirmware | TelloFirmware
+    Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | MavlinkFirmware | TelloFirmware
 
 PORT_BASE: Final = 5550
 PORTS_APART: Final = 10
@@ -33,6 +34,7 @@ class Firmware(StrEnum):
     ARDRONE1 = "ardrone1"
     ARDRONE2 = "ardrone2"
     ARDUCOPTER = "arducopter"
+    BETAFLIGHT = "betaflight"
     PX4 = "px4"
     TELLO = "tello"
 
@@ -64,6 +66,8 @@ def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving
         _run(_autopilots(options, drones, firmware, serving))
     elif serving.video_port is not None:
         raise UsageError("--video-port is for --firmware arducopter and px4: the others have a port of their own")
+    elif firmware is Firmware.BETAFLIGHT:
+        _run(_racers(options, drones, serving))
     elif firmware is Firmware.TELLO:
         _run(_tellos(options, drones, serving))
     else:
@@ -110,6 +114,22 @@ def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: S
             video=None if video is None else ("127.0.0.1", video + drone),
         )
         for drone, ports in enumerate(all_ports)
+    ]
+
+
+def _racers(options: SimOptions, drones: int, serving: Serving) -> list[BetaflightFirmware]:
+    from skyloop.emulators.msp import BetaflightFirmware, with_racers
+    from skyloop.emulators.msp.settings import PORT
+    from skyloop.sim.host import SimHost
+
+    if serving.faults.drop or serving.delay_s:
+        raise UsageError(
+            "--lose and --delay are for datagrams: --firmware betaflight speaks over TCP, which loses none"
+        )
+    base = PORT if serving.port_base is None else serving.port_base
+    host = SimHost(with_racers(options), drones)
+    return [
+        BetaflightFirmware(host, drone, bind=serving.bind, port=base + drone if base else 0) for drone in range(drones)
     ]
 
 

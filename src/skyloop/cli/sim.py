@@ -73,7 +73,7 @@ def sim(
         Firmware | None,
         typer.Option(
             metavar="KIND",
-            help="Be a real drone for other programs instead: ardrone1, ardrone2, arducopter, px4 or tello",
+            help="Be a real drone for other programs instead: ardrone1, ardrone2, arducopter, betaflight, px4 or tello",
         ),
     ] = None,
     bind: Annotated[

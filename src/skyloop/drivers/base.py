@@ -288,6 +288,19 @@ class Driver(ABC):
         """
         return self._apply(action) if new else self._repeat(action)
 
+    def check(self, action: AnyAction) -> None:  # noqa: B027  most vehicles refuse nothing
+        """Refuse what the software autopilot is asked for, where the vehicle is sure not to do it.
+
+        Called before the software autopilot begins with an action that the vehicle does not take itself; a vehicle that
+        can't be armed refuses the take-off. Returns at once.
+
+        Args:
+            action: Take-off, hover, land, velocity or position.
+
+        Raises:
+            DriverError: The vehicle would not do it; the text is shown to people.
+        """
+
     def left_to(self) -> str:
         """Return what others made of the vehicle since it was last commanded from here, such as ``RTL``.
 

@@ -6,6 +6,7 @@ Not thread-safe: the command handler's lock is held around every call, which kee
 from __future__ import annotations
 
 from skyloop.drivers.base import Driver
+from skyloop.errors import DriverError
 from skyloop.messages import (
     ACTION_NAMES,
     Action,
@@ -86,6 +87,7 @@ class ActionExecutor:
             if self.autopilot is not None:
                 self.autopilot.stop(action.name)
         else:
+            self._driver.check(action)
             self._start(action, now_ns)
             applied = action
         self._in_force = applied
@@ -134,6 +136,8 @@ class ActionExecutor:
             return self._driver.apply(action)
         except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
             self._vehicle.driver_failed("autopilot", error)
+            if isinstance(error, DriverError):
+                self.autopilot.refused(feedback)
             return None
 
     def _start(self, action: AnyAction, now_ns: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import select
 import socket
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,17 +11,16 @@ from typing import Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import ServedLink
+from skyloop.drivers.byte_stream import SerialStream, TcpStream
 from skyloop.drivers.mavlink.options import Address, ConnectionKind, Peer
 from skyloop.drivers.mavlink.protocol import MavlinkSession
 from skyloop.drivers.vehicle_link import VehicleLink
 from skyloop.drivers.vehicle_session import SinkCallback
-from skyloop.errors import MissingExtraError
 from skyloop.messages import AnyAction
 from skyloop.wire.mavlink.codec import Message
 
 MAX_DATAGRAM: Final = 65_536
 BURST: Final = 64  #: datagrams that are read before others get their turn
-CONNECT_S: Final = 1.0
 
 
 class MavlinkConnection(Protocol):
@@ -116,23 +114,17 @@ class UdpSender(UdpListener):
         super().send(data, peer or self._to)
 
 
-class TcpClient:
+class TcpClient(TcpStream):
     """A client of the autopilot's TCP server, which serves one client at a time: connected is not yet served.
 
     Raises:
-        OSError: It can't be reached within :data:`CONNECT_S`.
+        OSError: It can't be reached within :data:`skyloop.drivers.byte_stream.CONNECT_S`.
     """
 
     whole = False
 
     def __init__(self, address: Address) -> None:
-        self._socket = socket.create_connection((address.place, address.number), CONNECT_S)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.setblocking(False)
-
-    def fileno(self) -> int:
-        """Return the descriptor."""
-        return self._socket.fileno()
+        super().__init__(address.place, address.number)
 
     def receive(self) -> list[tuple[bytes, Peer]]:
         """Return what came.
@@ -140,13 +132,7 @@ class TcpClient:
         Raises:
             OSError: The connection ended.
         """
-        try:
-            data = self._socket.recv(MAX_DATAGRAM)
-        except BlockingIOError:
-            return []
-        if not data:
-            raise ConnectionError("the vehicle ended the connection")
-        return [(data, None)]
+        return _piece(self.read())
 
     def send(self, data: bytes, peer: Peer) -> None:  # noqa: ARG002
         """Send a packet, or drop it where there is no room.
@@ -154,19 +140,10 @@ class TcpClient:
         Raises:
             OSError: It was sent in part: what follows half a frame would be noise.
         """
-        try:
-            sent = self._socket.send(data)
-        except BlockingIOError:
-            return
-        if sent < len(data):
-            raise ConnectionError("the vehicle no longer reads what is sent")
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._socket.close()
+        self.write(data)
 
 
-class SerialPort:
+class SerialPort(SerialStream):
     """A serial port, through pyserial, opened for this process alone.
 
     Raises:
@@ -177,16 +154,7 @@ class SerialPort:
     whole = False
 
     def __init__(self, address: Address) -> None:
-        try:
-            import serial
-        except ImportError as error:
-            raise MissingExtraError("mavlink://serial:", "mavlink", cause=str(error)) from error
-        self._port = serial.Serial(address.place, address.number, timeout=0, write_timeout=0, exclusive=True)
-
-    def fileno(self) -> int:
-        """Return the descriptor."""
-        number: int = self._port.fileno()
-        return number
+        super().__init__(address.place, address.number, "mavlink://serial:", "mavlink")
 
     def receive(self) -> list[tuple[bytes, Peer]]:
         """Return what came.
@@ -194,18 +162,15 @@ class SerialPort:
         Raises:
             OSError: It was unplugged.
         """
-        if not select.select([self], [], [], 0)[0]:
-            return []
-        data: bytes = self._port.read(MAX_DATAGRAM)  # raises SerialException, an OSError, once it is unplugged
-        return [(data, None)] if data else []
+        return _piece(self.read())
 
     def send(self, data: bytes, peer: Peer) -> None:  # noqa: ARG002
         """Send a packet."""
-        self._port.write(data)
+        self.write(data)
 
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()
+
+def _piece(data: bytes) -> list[tuple[bytes, Peer]]:
+    return [(data, None)] if data else []
 
 
 _KINDS: Final[dict[ConnectionKind, type[UdpListener | TcpClient | SerialPort]]] = {
@@ -217,7 +182,7 @@ _KINDS: Final[dict[ConnectionKind, type[UdpListener | TcpClient | SerialPort]]] 
 
 
 def open_connection(address: Address) -> MavlinkConnection:
-    """Open a connection. Takes up to :data:`CONNECT_S`.
+    """Open a connection. Takes a second at most.
 
     Args:
         address: With a numeric host.

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from typing import ClassVar, Final
 
+from skyloop.emulators.flight import GO_M_S, SINK_M_S, Speeds
 from skyloop.emulators.mavlink import parameters
 from skyloop.emulators.mavlink.autopilot import (
     ACCEPTED,
@@ -17,7 +18,6 @@ from skyloop.emulators.mavlink.autopilot import (
     Autopilot,
     whole,
 )
-from skyloop.emulators.mavlink.flight import GO_M_S, SINK_M_S, Speeds
 from skyloop.emulators.mavlink.links import Port
 from skyloop.emulators.mavlink.manoeuvres import Turn
 from skyloop.emulators.mavlink.parameters import ParameterTable

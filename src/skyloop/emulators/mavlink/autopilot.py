@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Final
 
-from skyloop.emulators.mavlink.flight import FlightControl
+from skyloop.emulators.flight import FlightControl
 from skyloop.emulators.mavlink.links import Port
 from skyloop.emulators.mavlink.manoeuvres import Manoeuvres
 from skyloop.emulators.mavlink.parameters import ParameterTable

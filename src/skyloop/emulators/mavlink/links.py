@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable
 from typing import Final, Protocol
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.emulators.datagrams import Address, DatagramPort, bound
+from skyloop.emulators.byte_server import ByteServer
+from skyloop.emulators.datagrams import Address, DatagramPort
 from skyloop.emulators.loop import Loop
 from skyloop.emulators.mavlink.settings import Settings
 from skyloop.emulators.mavlink.streams import Streams
@@ -17,7 +17,6 @@ OnMessage = Callable[["Port", Message], None]
 
 AUTOPILOT_COMPONENT: Final = 1
 PEER_NS: Final = nanoseconds(3.0)  #: a peer that is silent for so long may be replaced by another
-_BUFFER: Final = 1 << 16
 
 
 class Port(Protocol):
@@ -102,19 +101,17 @@ class TcpPort:
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
-        self._loop = loop
         self._settings = settings
         self._on_message = on_message
         self._codec = _codec(settings)
-        self._client: socket.socket | None = None
-        self._server = bound(socket.SOCK_STREAM, (settings.bind, settings.ports.tcp or 0), "MAVLink")
-        self._server.listen(4)
-        loop.watch(self._server, self._accept)
+        self._server = ByteServer(
+            loop, (settings.bind, settings.ports.tcp or 0), self._receive, self._begin, name="MAVLink"
+        )
 
     @property
     def port(self) -> int:
         """The real port, where 0 was asked for."""
-        return int(self._server.getsockname()[1])
+        return self._server.port
 
     def send(self, message: Message) -> None:
         """Send a message to the client, if there is one.
@@ -122,49 +119,15 @@ class TcpPort:
         Raises:
             OSError: The client is gone.
         """
-        if self._client is None:
-            return
-        try:
-            self._client.send(self._codec.encode(message, version=self._settings.version))
-        except BlockingIOError:
-            return  # what does not fit is lost, as on a serial line
-        except OSError:
-            self._drop()
-            raise
+        self._server.send(self._codec.encode(message, version=self._settings.version))
 
     def close(self) -> None:
         """Close the server and the connection."""
-        self._loop.forget(self._server)
         self._server.close()
-        if self._client is not None:
-            self._loop.forget(self._client)
-            self._client.close()
 
-    def _accept(self) -> None:
-        self._client, _ = self._server.accept()
-        self._client.setblocking(False)
-        self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    def _begin(self) -> None:
         self._codec = _codec(self._settings)
-        self._loop.forget(self._server)
-        self._loop.watch(self._client, self._receive)
 
-    def _drop(self) -> None:
-        if self._client is not None:
-            self._loop.forget(self._client)
-            self._client.close()
-            self._client = None
-            self._loop.watch(self._server, self._accept)
-
-    def _receive(self) -> None:
-        assert self._client is not None
-        try:
-            data = self._client.recv(_BUFFER)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if not data:
-            self._drop()
-            return
+    def _receive(self, data: bytes) -> None:
         for message in self._codec.decode(data):
             self._on_message(self, message)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final
 
-from skyloop.emulators.mavlink.flight import USUAL, YAW_GAIN_PER_S, FlightControl, Speeds
+from skyloop.emulators.flight import USUAL, YAW_GAIN_PER_S, FlightControl, Speeds
 from skyloop.emulators.mavlink.setpoints import AttitudeTarget, Target
 from skyloop.messages.geometry import wrap_angle
 from skyloop.wire.mavlink.axes import Vector

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Final
 
+from skyloop.emulators.flight import USUAL, Speeds
 from skyloop.emulators.mavlink import parameters
 from skyloop.emulators.mavlink.autopilot import (
     ACCEPTED,
@@ -17,7 +18,6 @@ from skyloop.emulators.mavlink.autopilot import (
     Autopilot,
     whole,
 )
-from skyloop.emulators.mavlink.flight import USUAL, Speeds
 from skyloop.emulators.mavlink.links import Port
 from skyloop.emulators.mavlink.parameters import ParameterTable
 from skyloop.emulators.mavlink.places import ORIGIN, place_of

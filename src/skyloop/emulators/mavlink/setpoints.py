@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.emulators.mavlink.flight import USUAL, FlightControl, Speeds
+from skyloop.emulators.flight import USUAL, FlightControl, Speeds
 from skyloop.emulators.mavlink.places import on_earth, place_of
 from skyloop.wire.mavlink.axes import Vector, angles_of, flip, from_wire, swap, yaw_between
 from skyloop.wire.mavlink.codec import Message

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import ClassVar, Final, Protocol
 
-from skyloop.emulators.mavlink.flight import FlightControl
+from skyloop.emulators.flight import FlightControl
 from skyloop.emulators.mavlink.places import ORIGIN, geodetic
 from skyloop.messages import FlightState
 from skyloop.messages.geometry import quaternion_from_euler

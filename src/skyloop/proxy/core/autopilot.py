@@ -37,6 +37,7 @@ AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle first seen above it is taken to be 
 STALL_ALTITUDE: Final = 0.5  #: below it a descent that makes no headway has met the ground [m]
 STALL_NS: Final = NS_PER_S
 STALL_HEADWAY: Final = 0.02  #: [m]
+REFUSED_NS: Final = 15 * NS_PER_S  #: a vehicle that reports to stand so long after the take-off began does not rise
 BLIND_LANDING_NS: Final = 15 * NS_PER_S  #: how long a landing takes where the altitude is not known
 
 SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position", "return_to_start"})
@@ -97,6 +98,7 @@ class Autopilot:
         self._integral = (0.0, 0.0)  # forward, left [rad]
         self._stepped_ns: int | None = None
         self._begun_ns = 0
+        self._was_up = False  # the vehicle reported to be in the air since this began
         self._hold_altitude: float | None = None
         self._hold_position: tuple[float, float] | None = None
         self._hold_yaw: float | None = None
@@ -131,6 +133,7 @@ class Autopilot:
             return
         if self.mode is Mode.OFF:
             self._integral, self._stepped_ns = (0.0, 0.0), None
+            self._was_up = False
         self.mode, self._state, self._begun_ns = mode, _STATES[mode], now_ns
         self._hold_position = self._hold_yaw = None
         self._hold_altitude = feedback.altitude_m if feedback is not None else None
@@ -146,11 +149,19 @@ class Autopilot:
         elif self._state not in _STANDING:
             self._state = FlightState.HOVERING if action_name == "hover" else FlightState.FLYING
 
+    def refused(self, feedback: Feedback | None) -> None:
+        """The vehicle refused what it was sent: a take-off of one that stands is over."""
+        if self.mode is Mode.TAKEOFF and feedback is not None and feedback.state is FlightState.LANDED:
+            self.mode, self._state = Mode.OFF, FlightState.LANDED
+
     def step(self, now_ns: int, feedback: Feedback | None) -> Attitude | Velocity | None:
         """What to send to the vehicle now; None while off. To be called every :data:`PERIOD_S`."""
         if self.mode is Mode.OFF:
             return None
         known = feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
+        if known is not None and self._stands(known.state, now_ns):
+            self.mode, self._state = Mode.OFF, FlightState.LANDED
+            return None
         wanted = self._wanted(now_ns, known)
         dt = PERIOD_S if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
         self._stepped_ns = now_ns
@@ -158,6 +169,13 @@ class Autopilot:
             return wanted
         roll, pitch = self._tilt(wanted, known, dt)
         return Attitude(roll, pitch, wanted.up, wanted.yaw_rate)
+
+    def _stands(self, reported: FlightState, now_ns: int) -> bool:
+        """Whether a vehicle that is flown from here stopped to fly by itself, or never began: it disarmed."""
+        self._was_up = self._was_up or reported.airborne
+        if reported is not FlightState.LANDED or not self._owns_state or self.mode is Mode.LAND:
+            return False
+        return self._was_up or (self.mode is Mode.TAKEOFF and now_ns - self._begun_ns >= REFUSED_NS)
 
     def _wanted(self, now_ns: int, known: Feedback | None) -> Velocity:
         altitude = known.altitude_m if known is not None else None

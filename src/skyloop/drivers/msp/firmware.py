@@ -1,0 +1,238 @@
+"""What a flight controller is set up to do: its switches, its sticks, and whether it may be flown by MSP. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
+
+from skyloop.messages.checkup import Diagnostic
+from skyloop.wire.msp.curves import Curve, Rates, inav_curve, rate_curve, share_of
+from skyloop.wire.msp.messages import (
+    BETAFLIGHT,
+    INAV,
+    RX_MSP,
+    USUAL_MAP,
+    CellVoltages,
+    FailsafeConfig,
+    Identity,
+    ModeRange,
+    OnLoss,
+    RxConfig,
+)
+from skyloop.wire.msp.names import ANGLE, ARM, MSP_OVERRIDE, PREARM
+
+SUPPORTED: Final = (BETAFLIGHT, INAV)
+LEAST_AUX: Final = 4  #: channels beside the sticks that are always sent
+MOST_AUX: Final = 14
+USUAL_AUX_US: Final = 1000
+LONG_DELAY_S: Final = 2.0  #: a failsafe that begins later is warned of
+CURVED_API: Final = (1, 46)  #: from Betaflight 4.5 on a stick leans along the curve of its rates
+_PROCEDURES: Final = {
+    BETAFLIGHT: ("it lands with failsafe_throttle", "it drops", "it returns by GPS rescue"),
+    INAV: ("it lands", "it drops", "it returns home", "it does nothing"),
+}
+_NOTHING: Final = 3
+_DOCS: Final = 'see docs/msp.md, "What to set"'
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What was read of a flight controller. None: it did not tell."""
+
+    identity: Identity = field(default_factory=Identity)
+    boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status' bits
+    ranges: tuple[ModeRange, ...] = ()
+    sticks: tuple[int, ...] = USUAL_MAP  #: where roll, pitch, yaw and throttle are
+    rx: RxConfig = field(default_factory=RxConfig)
+    failsafe: FailsafeConfig | None = None
+    on_loss: tuple[tuple[int, int], ...] = ()
+    features: int | None = None
+    rates: Rates | None = None
+    inav_yaw_rate_deg_s: float | None = None
+    inav_expo: tuple[int, int] = (0, 0)  #: of roll and pitch, and of yaw
+    angle_limit_deg: float | None = None
+    cells: CellVoltages = field(default_factory=CellVoltages)
+    receiver_is_msp: bool | None = None  #: of INAV
+
+    # Modes -------------------------------------------------------------------------------------------------------
+
+    def number(self, name: str) -> int | None:
+        """Return a mode's permanent number; None if this firmware does not have it."""
+        return next((number for number, known in self.boxes if known == name), None)
+
+    def mode_names(self, active: int) -> list[str]:
+        """Return the names of the modes whose bit is set."""
+        return [name for bit, (_, name) in enumerate(self.boxes) if active >> bit & 1]
+
+    def is_active(self, active: int, *names: str) -> bool:
+        """Return whether one of these modes is active."""
+        return any(name in names for name in self.mode_names(active))
+
+    def ranges_of(self, *names: str) -> list[ModeRange]:
+        """Return the ranges of modes."""
+        numbers = {self.number(name) for name in names}
+        return [each for each in self.ranges if each.mode in numbers]
+
+    @property
+    def aux_channels(self) -> int:
+        """How many AUX channels are sent: one that is not would take a value of the firmware's own choice."""
+        used = max((each.aux + 1 for each in self.ranges), default=0)
+        return min(MOST_AUX, max(LEAST_AUX, used))
+
+    def aux_us(self, *, arm: bool, given: Mapping[int, int]) -> list[int]:
+        """Return the AUX channels that switch on what is wanted, and as little else as can be.
+
+        Args:
+            arm: Whether it is to be armed.
+            given: Pulse widths [µs] that a person set, by channel from 0; that of the arm switch is left out.
+        """
+        wanted = {self.number(ANGLE)}
+        if arm:
+            wanted |= {self.number(ARM), self.number(PREARM)}
+        switch = {each.aux for each in self.ranges_of(ARM)}
+        chosen = []
+        for aux in range(self.aux_channels):
+            if aux in given and aux not in switch:
+                chosen.append(given[aux])
+            else:
+                chosen.append(self._best(aux, wanted))
+        return chosen
+
+    def _best(self, aux: int, wanted: set[int | None]) -> int:
+        ranges = [each for each in self.ranges if each.aux == aux]
+        edges = sorted({1000, 2000, *(edge for each in ranges for edge in (each.low_us, each.high_us))})
+        edges = [edge for edge in edges if 1000 <= edge <= 2000]
+        candidates = [USUAL_AUX_US, 2000, *((low + high) // 2 for low, high in pairwise(edges))]
+        arm = self.number(ARM)
+
+        def cost(width: int) -> tuple[int, int, int, int]:
+            on = {each.mode for each in ranges if each.low_us <= width < each.high_us}
+            asked = {each.mode for each in ranges} & wanted
+            # The arm switch goes before everything, then what is wanted, then what is not.
+            return (
+                int((arm in on) is not (arm in asked)),
+                len(asked - on),
+                len(on - wanted),
+                0 if width == USUAL_AUX_US else 1,
+            )
+
+        return min(candidates, key=cost)
+
+    # Sticks ------------------------------------------------------------------------------------------------------
+
+    @property
+    def full_tilt_rad(self) -> float | None:
+        """Return what a full stick leans; None if it is not known."""
+        return None if self.angle_limit_deg is None else math.radians(self.angle_limit_deg)
+
+    def tilt_curves(self) -> tuple[Curve, Curve]:
+        """Return the shares of the full tilt that roll and pitch sticks come to."""
+        if self.identity.variant == INAV:
+            curve = inav_curve(self.inav_expo[0], 1.0)
+            return curve, curve
+        if self.rates is None or self.identity.api < CURVED_API:
+            return _straight, _straight
+        kind = self.rates.kind
+        return share_of(rate_curve(kind, self.rates.roll)), share_of(rate_curve(kind, self.rates.pitch))
+
+    def yaw_curve(self) -> Curve:
+        """Return how fast a yaw stick turns [rad/s]."""
+        if self.identity.variant == INAV:
+            return inav_curve(self.inav_expo[1], math.radians(self.inav_yaw_rate_deg_s or 200.0))
+        if self.rates is None:
+            return lambda stick: math.radians(200.0) * stick
+        curve = rate_curve(self.rates.kind, self.rates.yaw)
+        return lambda stick: math.radians(curve(stick))
+
+    # Whether it may be flown -------------------------------------------------------------------------------------
+
+    def diagnose(self, *, override: bool) -> list[Diagnostic]:
+        """Return what its settings mean for a flight. What is severe keeps it from being armed.
+
+        Args:
+            override: Whether a pilot keeps a real receiver.
+        """
+        name = Diagnostic("firmware", True, str(self.identity))
+        return [name, *self._modes(override), *self._receiver(override), *self._failsafe(override)]
+
+    def _modes(self, override: bool) -> list[Diagnostic]:
+        found = []
+        if not override:
+            armed = bool(self.ranges_of(ARM))
+            detail = "an AUX channel arms it" if armed else "no AUX channel arms it"
+            advice = "" if armed else "aux 0 0 0 1700 2100 0 0 (ARM on AUX 1)"
+            found.append(Diagnostic("arm switch", armed, detail, advice, severe=True))
+        level = bool(self.ranges_of(ANGLE))
+        detail = "an AUX channel switches ANGLE mode on" if level else "no AUX channel switches ANGLE mode on"
+        advice = "" if level else "aux 1 1 1 900 2100 0 0 (ANGLE always, by AUX 2)"
+        found.append(Diagnostic("ANGLE mode", level, detail, advice, severe=True))
+        if override:
+            there = bool(self.ranges_of(*MSP_OVERRIDE))
+            detail = "a switch of the receiver gives the sticks away" if there else "no switch gives the sticks away"
+            advice = "" if there else "give the mode MSP OVERRIDE a switch of the receiver"
+            found.append(Diagnostic("MSP override", there, detail, advice, severe=True))
+        return found
+
+    def _receiver(self, override: bool) -> list[Diagnostic]:
+        is_msp = self.receiver_is_msp
+        if self.identity.variant == BETAFLIGHT and self.features is not None:
+            is_msp = bool(self.features & RX_MSP)
+        if is_msp is None:
+            return []
+        if override:
+            detail = "its receiver is MSP: there is no pilot's" if is_msp else "a pilot's receiver is connected"
+            advice = "leave override= out of the address, or connect a receiver" if is_msp else ""
+            return [Diagnostic("receiver", not is_msp, detail, advice, severe=True)]
+        detail = "sticks come by MSP" if is_msp else "sticks do not come by MSP"
+        advice = "feature RX_MSP (INAV: set receiver_type = MSP), or override=1 with a pilot's receiver"
+        return [Diagnostic("receiver", is_msp, detail, "" if is_msp else advice, severe=True)]
+
+    def _failsafe(self, override: bool) -> list[Diagnostic]:
+        if override:
+            detail = (
+                "while the pilot's switch overrides, Betaflight holds the last sticks for ever if MSP falls silent: "
+                "only the pilot's switch ends that"
+            )
+            fine = self.identity.variant == INAV
+            return [] if fine else [Diagnostic("silence", False, detail, "keep a thumb on the switch")]
+        if self.failsafe is None:
+            return [Diagnostic("failsafe", False, "its failsafe is not known", _DOCS, severe=True)]
+        found = []
+        config, names = self.failsafe, _PROCEDURES[self.identity.variant]
+        what = names[config.procedure] if config.procedure < len(names) else f"procedure {config.procedure}"
+        nothing = self.identity.variant == INAV and config.procedure == _NOTHING
+        detail = f"{config.delay_s:g} s after the sticks stop {what}"
+        advice = "set failsafe_procedure = LAND or DROP" if nothing else ""
+        found.append(Diagnostic("failsafe", not nothing, detail, advice, severe=True))
+        if config.delay_s > LONG_DELAY_S:
+            advice = f"set failsafe_delay = {LONG_DELAY_S * 10:g} or less"
+            found.append(
+                Diagnostic("failsafe delay", False, f"failsafe begins after {config.delay_s:g} s only", advice)
+            )
+        return found + self._held()
+
+    def _held(self) -> list[Diagnostic]:
+        """Judge what the sticks are set to between the loss of the receiver and the failsafe."""
+        held = [
+            name
+            for name, (mode, _) in zip(("roll", "pitch", "yaw", "throttle"), self.on_loss, strict=False)
+            if mode == OnLoss.HOLD
+        ]
+        if held:
+            detail = f"without sticks it holds the last {', '.join(held)}: it would fly on by itself"
+            advice = "rxfail 0 a, rxfail 1 a, rxfail 2 a, rxfail 3 a"
+            return [Diagnostic("held sticks", False, detail, advice, severe=True)]
+        return []
+
+
+def _straight(stick: float) -> float:
+    return stick
+
+
+def hindrances(diagnostics: list[Diagnostic]) -> str:
+    """Return why it must not be armed, with what to do; empty if nothing is severe."""
+    bad = [each for each in diagnostics if each.severe and not each.good]
+    return "; ".join(f"{each.detail} ({each.advice})" if each.advice else each.detail for each in bad)

@@ -1,0 +1,142 @@
+"""Parameters of the driver: limits, scales, gains and AUX channels. Pure; they are the driver's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+from skyloop.drivers.msp.firmware import MOST_AUX
+from skyloop.drivers.msp.setpoints import Gains, Limits, SetpointController
+from skyloop.errors import ParameterError, UnknownNameError
+from skyloop.messages import Parameter, ParameterType, Refusal, Value
+
+AUTOMATIC: Final = 0  #: of an AUX channel: as the modes need it
+_LIMITS: Final = (
+    ("tilt", 0.02, 1.2, "rad", "greatest roll and pitch together; never more than a full stick"),
+    ("climb", 0.05, 10.0, "m/s", "greatest climb and descent"),
+    ("yaw_rate", 0.05, 10.0, "rad/s", "greatest yaw rate; never more than a full stick"),
+    ("throttle", 0.1, 1.0, "", "greatest throttle, as a share of the full one"),
+)
+_GAINS: Final = (
+    ("climb_p", 0.0, 10.0, "1/s", "acceleration that is asked for per error of the climb"),
+    ("climb_i", 0.0, 10.0, "1/s²", "how fast the throttle that carries the vehicle is learnt"),
+)
+TILT: Final = "msp.full_stick.tilt"
+HOVER: Final = "msp.hover_throttle"
+AUX: Final = "msp.aux"
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    parameter: Parameter
+    write: Callable[[float], None]
+
+
+class DriverParameters:
+    """The driver's own parameters.
+
+    Args:
+        setpoints: That they are of. The caller holds the lock that guards them.
+    """
+
+    def __init__(self, setpoints: SetpointController) -> None:
+        self._setpoints = setpoints
+
+    def parameters(self) -> list[Parameter]:
+        """Return all parameters with their present values."""
+        return [entry.parameter for entry in self._entries().values()]
+
+    def write(self, name: str, value: Value) -> Value:
+        """Write a parameter and return the value in force.
+
+        Raises:
+            UnknownNameError: There is no such parameter.
+            ParameterError: The value is no number, or out of range.
+        """
+        entries = self._entries()
+        if name not in entries:
+            raise UnknownNameError("parameter of msp://", name, entries)
+        entry = entries[name]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ParameterError(f"{name} takes a number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
+        low, high = entry.parameter.minimum, entry.parameter.maximum
+        assert low is not None
+        assert high is not None
+        if not low <= value <= high:
+            raise ParameterError(f"{name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+        entry.write(value)
+        return value
+
+    def _entries(self) -> dict[str, _Entry]:
+        made = [*self._limits(), *self._gains(), self._tilt(), self._hover(), *self._aux()]
+        return {entry.parameter.name: entry for entry in made}
+
+    def _limits(self) -> list[_Entry]:
+        def writing(field: str) -> Callable[[float], None]:
+            def write(value: float) -> None:
+                self._setpoints.limits = replace(self._setpoints.limits, **{field: float(value)})
+
+            return write
+
+        now, usual = self._setpoints.limits, Limits()
+        return [
+            _Entry(
+                _number(f"limits.{field}", getattr(now, field), low, high, unit, text, getattr(usual, field)),
+                writing(field),
+            )
+            for field, low, high, unit, text in _LIMITS
+        ]
+
+    def _gains(self) -> list[_Entry]:
+        def writing(field: str) -> Callable[[float], None]:
+            def write(value: float) -> None:
+                self._setpoints.gains = replace(self._setpoints.gains, **{field: float(value)})
+
+            return write
+
+        now, usual = self._setpoints.gains, Gains()
+        return [
+            _Entry(
+                _number(f"msp.{field}", getattr(now, field), low, high, unit, text, getattr(usual, field)),
+                writing(field),
+            )
+            for field, low, high, unit, text in _GAINS
+        ]
+
+    def _tilt(self) -> _Entry:
+        def write(value: float) -> None:
+            self._setpoints.full_tilt_rad = float(value) or None
+
+        text = "what a full stick leans in ANGLE mode; 0: as the flight controller says (angle_limit)"
+        return _Entry(_number(TILT, self._setpoints.full_tilt_rad or 0.0, 0.0, 1.5, "rad", text, 0.0), write)
+
+    def _hover(self) -> _Entry:
+        def write(value: float) -> None:
+            self._setpoints.hover = float(value) or None
+
+        text = "throttle that carries it, as a share of the full one: learnt in flight; 0: not known"
+        return _Entry(_number(HOVER, self._setpoints.hover or 0.0, 0.0, 0.9, "", text, 0.0), write)
+
+    def _aux(self) -> list[_Entry]:
+        def writing(channel: int) -> Callable[[float], None]:
+            def write(value: float) -> None:
+                if value == AUTOMATIC:
+                    self._setpoints.given_aux.pop(channel, None)
+                else:
+                    self._setpoints.given_aux[channel] = int(value)
+
+            return write
+
+        text = "pulse width sent on this AUX channel; 0: as arming and ANGLE mode need it; never the arm switch's"
+        made = []
+        for channel in range(MOST_AUX):
+            value = self._setpoints.given_aux.get(channel, AUTOMATIC)
+            name = f"{AUX}{channel + 1}"
+            parameter = Parameter(name, ParameterType.INT, value, "µs", 0, 2100, default=AUTOMATIC, description=text)
+            made.append(_Entry(parameter, writing(channel)))
+        return made
+
+
+def _number(name: str, value: float, low: float, high: float, unit: str, text: str, default: float) -> Parameter:
+    return Parameter(name, ParameterType.FLOAT, value, unit, low, high, default=default, description=text)

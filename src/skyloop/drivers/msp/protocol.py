@@ -1,0 +1,401 @@
+"""The protocol of one flight controller: replies in, requests and sticks out. No socket, no clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.base import ExternalPose
+from skyloop.drivers.link_reasons import LinkTrouble, serial_trouble
+from skyloop.drivers.msp.firmware import SUPPORTED, Setup, hindrances
+from skyloop.drivers.msp.identification import Identification
+from skyloop.drivers.msp.motion import MotionEstimate
+from skyloop.drivers.msp.options import MspOptions
+from skyloop.drivers.msp.requests import Questions, Telemetry
+from skyloop.drivers.msp.setpoints import Phase, Report, SetpointController
+from skyloop.drivers.msp.telemetry import Reported, feedback_of
+from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
+from skyloop.errors import DecodeError
+from skyloop.messages import AnyAction, LinkState, Severity, Value
+from skyloop.messages.checkup import Diagnostic
+from skyloop.wire.msp import messages as msp
+from skyloop.wire.msp.frames import Direction, Frame, Parser, encode
+from skyloop.wire.msp.messages import BETAFLIGHT, INAV, Function, Sensor
+from skyloop.wire.msp.names import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
+
+DEGRADED_NS: Final = nanoseconds(0.4)
+LOST_NS: Final = nanoseconds(1.0)
+FIRST_WORD_NS: Final = nanoseconds(2.0)
+IDLE_NS: Final = nanoseconds(0.05)  #: the latest next poll
+MOST_STICKS: Final = 4  #: frames of sticks that may be without an acknowledgement
+STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older one is taken for lost
+COUNT_NS: Final = nanoseconds(1.0)  #: over which acknowledged sticks are counted
+LEAST_STICKS_HZ: Final = 25.0  #: fewer are warned of
+BUNDLING_API: Final = (1, 42)  #: of Betaflight: it knows MULTIPLE
+AGAIN_NS: Final = nanoseconds(1.0)  #: between two tries to find out who it is
+
+ATTITUDE_HZ: Final = 50.0
+ALTITUDE_HZ: Final = 25.0
+STATUS_HZ: Final = 20.0
+GPS_HZ: Final = 10.0
+BATTERY_HZ: Final = 2.0
+PILOT_HZ: Final = 10.0
+
+
+class MspSession(VehicleSession):
+    """The protocol of one opened driver with its flight controller. Not thread-safe.
+
+    Args:
+        options: Of the vehicle's address.
+        now_ns: The time of opening.
+        setpoints: Kept by the driver from one opening to the next.
+    """
+
+    TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
+
+    def __init__(self, options: MspOptions, now_ns: int, setpoints: SetpointController | None = None) -> None:
+        super().__init__(now_ns)
+        self.options = options
+        self.setpoints = setpoints or SetpointController(options.override)
+        self.motion = MotionEstimate()
+        self.setup: Setup | None = None  #: None until it was read
+        self.reported = Reported()
+        self.sticks_hz: float | None = None  #: acknowledged
+        self.unknown = 0  #: frames that answer nothing
+        self._parser = Parser()
+        self._questions = Questions()
+        self._identification: Identification | None = None
+        self._telemetry: Telemetry | None = None
+        self._refused_variant = ""
+        self._asked_ns: int | None = None
+        self._sticks_due_ns = now_ns
+        self._sticks: deque[int] = deque()  # when those without an acknowledgement were sent
+        self._acknowledged = 0
+        self._counted_ns = now_ns
+        self._slow = False
+        self._may_steer = False  # its state is known: what is sent does not disarm a flying one
+        self._armed_throttle: float | None = None
+        self._set_link_state(LinkState.CONNECTING, f"waiting for the flight controller on {options}")
+
+    # From the driver -----------------------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction, now_ns: int) -> AnyAction:
+        """Accept an action.
+
+        Raises:
+            DriverError: It can't be done now; see :meth:`SetpointController.apply`.
+        """
+        self.setpoints.on_motion(self.motion.at(now_ns))
+        applied = self.setpoints.apply(action, now_ns)
+        self.due_ns = min(self.due_ns, self._sticks_due_ns)
+        return applied
+
+    def why_not(self, now_ns: int) -> str:
+        """Return why a take-off is sure to be refused; empty if it is not."""
+        self.setpoints.on_motion(self.motion.at(now_ns))
+        return self.setpoints.why_not(now_ns)
+
+    def on_pose(self, pose: ExternalPose) -> None:
+        """Take in a pose from outside."""
+        self.motion.on_pose(pose)
+
+    def close(self) -> None:
+        """End the session."""
+        self._questions.clear()
+
+    def last_words(self, now_ns: int) -> bytes:
+        """Return what is sent before the connection is closed: one that stands is disarmed.
+
+        One that flies gets nothing: the silence that follows is what its failsafe is set up for.
+        """
+        if not self._may_steer or self.options.override or self.setpoints.phase is Phase.FLYING:
+            return b""
+        self.setpoints.phase = Phase.STANDING
+        return self._stick_frame(now_ns)
+
+    def diagnose(self) -> list[Diagnostic]:
+        """Return what its settings and its state say about a flight."""
+        if self.setup is None:
+            unread = "the flight controller's settings were not read: they are not known"
+            return [Diagnostic("settings", False, unread, "wait until its link is up, then check again", severe=True)]
+        found = self.setup.diagnose(override=self.options.override)
+        names = self.setpoints.report.hindrances
+        if names:
+            found.append(Diagnostic("arming", False, f"it can't be armed: {explained(names)}", severe=True))
+        elif self.setpoints.report.armed is False:
+            found.append(Diagnostic("arming", True, "it reports nothing that keeps it from being armed"))
+        if self.sticks_hz is not None:
+            found.append(_pace(self.sticks_hz, self.setup.identity.variant))
+        return found
+
+    # From the connection -------------------------------------------------------------------------------------------
+
+    def connected(self) -> None:
+        """Handle that a new connection was opened: nothing of an older one follows."""
+        self._parser.reset()
+        self._sticks.clear()
+        self.due_ns = 0
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """Handle bytes that came, whatever they hold. Never raises."""
+        for frame in self._parser.feed(data):
+            if frame.direction is not Direction.REQUEST:
+                self._on_frame(frame, now_ns)
+
+    def _on_frame(self, frame: Frame, now_ns: int) -> None:
+        begins, self._received_ns = self._received_ns is None, now_ns
+        self._unreachable = ""
+        if begins:
+            self.due_ns = 0
+        if frame.function == Function.SET_RAW_RC:
+            if self._sticks:
+                self._sticks.popleft()
+                self._acknowledged += 1
+            return
+        if self._questions.on_frame(frame):
+            self.due_ns = 0
+            return
+        answers = [] if self._telemetry is None else self._telemetry.on_frame(frame)
+        if not answers:
+            self.unknown += 1
+        for function, payload in answers:
+            if payload is None:
+                assert self._telemetry is not None
+                self._telemetry.drop(function)
+                continue
+            with suppress(DecodeError):  # damaged in a way that its checksum did not show
+                self._on_state(function, payload, now_ns)
+
+    def _on_state(self, function: int, payload: bytes, now_ns: int) -> None:
+        reported = self.reported
+        if function == Function.ATTITUDE:
+            reported.attitude = msp.Attitude.decode(payload)
+            self.motion.on_attitude(reported.attitude)
+            self._publish(now_ns)
+        elif function == Function.ALTITUDE:
+            reported.altitude = msp.Altitude.decode(payload)
+            if reported.status is None or _has_height(reported.status):
+                self.motion.on_altitude(reported.altitude, now_ns)
+        elif function in (Function.STATUS_EX, Function.STATUS):
+            self._on_status(msp.Status.of_betaflight(payload), now_ns)
+        elif function == Function.INAV_STATUS:
+            self._on_status(msp.Status.of_inav(payload), now_ns)
+        elif function == Function.RAW_GPS:
+            self.motion.on_gps(msp.Gps.decode(payload), now_ns)
+        elif function == Function.BATTERY_STATE:
+            reported.battery = msp.Battery.of_state(payload)
+        elif function == Function.INAV_ANALOG:
+            reported.battery = msp.Battery.of_inav(payload)
+        elif function == Function.RC:
+            self._on_pilot(msp.channels(payload), now_ns)
+
+    def _on_status(self, status: msp.Status, now_ns: int) -> None:
+        assert self.setup is not None
+        self.reported.status = status
+        variant = self.setup.identity.variant
+        flags = status.flags or 0
+        names = flag_names(variant, flags, status.count)
+        armed = bool(flags & ARMED_OF_INAV) if variant == INAV else self.setup.is_active(status.modes, ARM)
+        overridden = self.setup.is_active(status.modes, *MSP_OVERRIDE)
+        if not self._may_steer:
+            if armed and not self.options.override and self._armed_throttle is None:
+                return  # what flies must not be sent anything before its throttle is known
+            self._may_steer = True
+            if armed and self._armed_throttle is not None and not self.options.override:
+                self.setpoints.report = Report(armed, names, overridden)
+                self.setpoints.adopt(self._armed_throttle, now_ns)
+        self.setpoints.on_report(Report(armed, names, overridden), now_ns)
+        if not armed:
+            self.motion.stands()
+
+    def _on_pilot(self, widths: list[int], now_ns: int) -> None:
+        if len(widths) < 4:
+            return
+        throttle = max(0.0, min(1.0, (widths[3] - 1000) / 1000))
+        self._armed_throttle = throttle
+        if self.options.override and not self.setpoints.report.overridden:
+            self.setpoints.on_motion(self.motion.at(now_ns))
+            self.setpoints.on_pilot_throttle(throttle)
+
+    def _publish(self, now_ns: int) -> None:
+        if self.setpoints.report.armed is None or self.reported.altitude is None:
+            return  # what it does is not known yet
+        if self.link_state is not LinkState.UP:
+            self._set_link_state(LinkState.UP)
+        motion = self.motion.at(now_ns)
+        self.setpoints.on_motion(motion)
+        flight = self.setpoints.flight_state()
+        feedback = feedback_of(self.reported, motion, flight, now_ns, self._native())
+        self._pending.append(lambda sink: sink.feedback(feedback))
+
+    def _native(self) -> dict[str, Value]:
+        setpoints, reported, setup = self.setpoints, self.reported, self.setup
+        native: dict[str, Value] = {
+            "armed": bool(setpoints.report.armed),
+            "arming.flags": ", ".join(setpoints.report.hindrances),
+            "phase": setpoints.phase.name.lower(),
+            "throttle": setpoints.throttle,
+            "frames.damaged": self._parser.damaged,
+            "frames.unknown": self.unknown,
+        }
+        if self._telemetry is not None:
+            native["requests.unanswered"] = self._telemetry.unanswered
+        if self.sticks_hz is not None:
+            native["sticks.rate_hz"] = self.sticks_hz
+        if setpoints.hover is not None:
+            native["throttle.hover"] = setpoints.hover
+        if reported.status is not None and setup is not None:
+            native["modes"] = ", ".join(setup.mode_names(reported.status.modes))
+            native["load_percent"] = reported.status.load
+        if reported.altitude is not None:
+            native["altitude_m"], native["climb_m_s"] = reported.altitude.height_m, reported.altitude.climb_m_s
+        if reported.attitude is not None:
+            native["heading_deg"] = reported.attitude.heading_deg
+        if reported.battery is not None:
+            native["current_a"] = reported.battery.current_a
+        if self.motion.satellites is not None:
+            native["gps.satellites"] = self.motion.satellites
+        origin = self.motion.origin
+        return native if origin is None else {**native, **origin.native()}
+
+    # Time ----------------------------------------------------------------------------------------------------------
+
+    def poll(self, now_ns: int) -> bytes:
+        """Return the bytes that are due now."""
+        self._check_silence(now_ns)
+        made = self._due_sticks(now_ns)
+        if self._telemetry is not None:
+            made += b"".join(encode(frame) for frame in self._telemetry.requests(now_ns))
+        else:
+            self._begin(now_ns)
+        question = self._questions.due(now_ns)
+        if question is not None:
+            made += encode(question)
+        self.due_ns = now_ns + IDLE_NS
+        if self._may_steer:
+            self.due_ns = min(self.due_ns, self._sticks_due_ns)
+        wanted = None if self._telemetry is None else self._telemetry.due_ns()
+        if wanted is not None:
+            self.due_ns = min(self.due_ns, max(wanted, now_ns + nanoseconds(0.005)))
+        return made
+
+    def _due_sticks(self, now_ns: int) -> bytes:
+        if not self._may_steer or self.setup is None or now_ns < self._sticks_due_ns:
+            return b""
+        while self._sticks and now_ns - self._sticks[0] >= STICKS_LOST_NS:
+            self._sticks.popleft()
+        period = nanoseconds(1 / self.options.rate_hz)
+        self._sticks_due_ns = max(self._sticks_due_ns + period, now_ns + period // 2)
+        self._count(now_ns)
+        self.setpoints.on_motion(self.motion.at(now_ns))
+        made = self._stick_frame(now_ns)
+        if len(self._sticks) >= MOST_STICKS:
+            return b""  # it is behind: what is sent now would be obeyed late
+        self._sticks.append(now_ns)
+        return made
+
+    def _stick_frame(self, now_ns: int) -> bytes:
+        return encode(Frame(Function.SET_RAW_RC, msp.pack_channels(self.setpoints.channels(now_ns))))
+
+    def _count(self, now_ns: int) -> None:
+        """Measure how many sticks a second are taken."""
+        since_ns = now_ns - self._counted_ns
+        if since_ns < COUNT_NS:
+            return
+        self.sticks_hz = self._acknowledged / seconds(since_ns)
+        self._counted_ns, self._acknowledged = now_ns, 0
+        slow = self.sticks_hz < LEAST_STICKS_HZ
+        if slow and not self._slow and self._received_ns is not None:
+            assert self.setup is not None
+            pace = _pace(self.sticks_hz, self.setup.identity.variant)
+            self._publish_event(message(f"{pace.detail}: {pace.advice}", "slow", Severity.WARNING, rate=self.sticks_hz))
+        self._slow = slow
+
+    def _begin(self, now_ns: int) -> None:
+        """Ask who it is, if nothing is asked already."""
+        if not self._questions.idle or (self._asked_ns is not None and now_ns - self._asked_ns < AGAIN_NS):
+            return
+        self._asked_ns = now_ns
+        self._identification = Identification(self._questions, self._on_setup)
+        self._questions.ask(Function.STATUS, self._on_identity)
+
+    def _on_identity(self, _status: bytes | None) -> None:
+        assert self._identification is not None
+        identity = self._identification.setup.identity
+        if identity.variant in SUPPORTED:
+            self._identification.ask_settings()
+        elif identity.variant and identity.variant != self._refused_variant:
+            self._refused_variant = identity.variant
+            known = "Betaflight (BTFL) and INAV"
+            text = f"the firmware is {identity.variant!r}, of which MSP is not known well enough to fly it: {known} are"
+            self._publish_event(message(text, "firmware", Severity.ERROR))
+            self._set_link_state(LinkState.DEGRADED, text)
+
+    def _on_setup(self, setup: Setup) -> None:
+        self.setup = setup
+        self.reported.cells = setup.cells
+        diagnostics = setup.diagnose(override=self.options.override)
+        self.setpoints.set_up(setup, hindrances(diagnostics))
+        self._publish_event(message(str(setup.identity), "firmware"))
+        for each in diagnostics:
+            if not each.good:
+                text = f"{each.detail}: {each.advice}" if each.advice else each.detail
+                severity = Severity.ERROR if each.severe else Severity.WARNING
+                self._publish_event(message(text, "setup", severity, what=each.what))
+        betaflight = setup.identity.variant == BETAFLIGHT
+        streams: dict[int, float] = {
+            Function.RC: PILOT_HZ if self.options.override else 1.0,
+            Function.ATTITUDE: ATTITUDE_HZ,
+            Function.ALTITUDE: ALTITUDE_HZ,
+            Function.STATUS_EX if betaflight else Function.INAV_STATUS: STATUS_HZ,
+            Function.RAW_GPS: GPS_HZ,
+            Function.BATTERY_STATE if betaflight else Function.INAV_ANALOG: BATTERY_HZ,
+        }
+        self._telemetry = Telemetry(streams, bundled=betaflight and setup.identity.api >= BUNDLING_API)
+
+    def _new_events(self) -> list[VehicleEvent]:
+        return self.setpoints.pop_events()
+
+    # Losing --------------------------------------------------------------------------------------------------------
+
+    def _lose(self, reason: str, now_ns: int) -> None:
+        """Ask who it is anew; sticks go on as they were, for what flies may still hear them."""
+        del now_ns
+        self._received_ns = self._asked_ns = self._identification = None
+        self._telemetry, self._refused_variant = None, ""
+        self._questions.clear()
+        self._sticks.clear()
+        self.motion.lost()
+        self.setpoints.lost()
+        self.reported = replace(self.reported, attitude=None, altitude=None, status=None)
+        self._set_link_state(LinkState.LOST, reason)
+
+    def _describe_silence(self, since: str, why: str) -> str:
+        return f"no reply{since} from the flight controller on {self.options}{why}"
+
+    def _advice(self) -> str:
+        if self.options.serial:
+            return "connect it, give the baud rate of its MSP port in the address, and close the configurator"
+        if self.options.place.startswith("127."):
+            return "start the firmware's simulation, or the emulated one: skyloop sim --firmware betaflight"
+        return "check host and port in the address, and that no other program is connected to that port"
+
+    def _trouble(self, error: OSError) -> LinkTrouble:
+        if self.options.serial:
+            return serial_trouble(error, self.options.place, self._advice())
+        return super()._trouble(error)
+
+
+def _has_height(status: msp.Status) -> bool:
+    return any(status.has(sensor) for sensor in (Sensor.BAROMETER, Sensor.GPS, Sensor.RANGEFINDER))
+
+
+def _pace(sticks_hz: float, variant: str) -> Diagnostic:
+    detail = f"it takes {sticks_hz:.0f} sticks a second"
+    if sticks_hz >= LEAST_STICKS_HZ:
+        return Diagnostic("pace", True, detail)
+    advice = "set serial_update_rate_hz = 1000" if variant == BETAFLIGHT else "use a faster port"
+    return Diagnostic("pace", False, f"{detail} only, so it is steered late", advice)

@@ -1,0 +1,416 @@
+"""Set-points to sticks: arming, the throttle that holds a climb rate, touch-down and disarming. Pure.
+
+The throttle that carries the vehicle is learnt: a take-off raises the throttle slowly until the vehicle leaves the
+ground, and a slow integral keeps it right from then on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import Final
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.msp.firmware import Setup
+from skyloop.drivers.msp.motion import Motion
+from skyloop.drivers.vehicle_session import VehicleEvent, message
+from skyloop.errors import DriverError
+from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Idle, ResetEmergency, Severity
+from skyloop.wire.msp.curves import Curve, stick_for
+from skyloop.wire.msp.names import ARM_SWITCH, explained
+
+GRAVITY_M_S2: Final = 9.80665
+LEVEL: Final = Attitude()
+OFF_US: Final = 1000
+SPOOL_PER_S: Final = 0.15  #: how fast a take-off raises the throttle
+SPOOL_FROM: Final = 0.6  #: of the throttle that carries it, where it is known
+IDLE: Final = 0.05  #: where it is not
+ARM_NS: Final = nanoseconds(3.0)  #: an arming that has not shown by then failed
+NAMED_NS: Final = nanoseconds(0.4)  #: so long must a hindrance last while it arms
+REFUSED_NS: Final = nanoseconds(1.0)  #: after a refusal the arm switch stays off for so long
+ABORT_NS: Final = nanoseconds(1.0)  #: so long a take-off may be interrupted before it ends
+#: What passes by itself, soon after the connection: an arming waits for it with the arm switch off.
+PASSING: Final = frozenset(
+    {"RXLOSS", "FAILSAFE", "NOT_DISARMED", "CALIB", "BOOTGRACE", "RC_LINK", "SENSORS_CALIBRATING", ARM_SWITCH}
+)
+LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] that shows it, precise or not
+GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: without headway a descent met something
+HEADWAY: Final = 0.4  #: of the descent that is asked for
+SINK_PER_S: Final = 0.5  #: how fast the throttle is taken away then
+OFF_BELOW: Final = 0.6  #: of the throttle that carries it: it stands
+BLIND: Final = 0.93  #: of it while the climb is not known: it sinks
+BLIND_NS: Final = nanoseconds(6.0)
+MOST_LEARNT: Final = 0.9
+LEAST_LEARNT: Final = 0.05
+LIFT_M_S2: Final = 4.0  #: the most that the climb loop asks for
+STOP_NS: Final = nanoseconds(1.0)  #: so long motors may still be reported on after a stop
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The most that is asked for."""
+
+    tilt: float = 0.6  #: [rad]
+    climb: float = 1.5  #: [m/s]
+    yaw_rate: float = 2.5  #: [rad/s]
+    throttle: float = 0.85  #: share of the full one
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """Of the climb loop."""
+
+    climb_p: float = 2.5  #: acceleration per climb error [1/s]
+    climb_i: float = 1.2  #: how fast the throttle that carries it is learnt [1/s²]
+
+
+class Phase(Enum):
+    """How far a flight is."""
+
+    STANDING = auto()  #: or being flown by a pilot
+    ARMING = auto()
+    SPOOLING = auto()  #: armed, and the throttle rises
+    FLYING = auto()
+
+
+@dataclass(slots=True)
+class Report:
+    """What the flight controller said last."""
+
+    armed: bool | None = None  #: None: not known
+    hindrances: list[str] = field(default_factory=list)
+    overridden: bool = False  #: whether the pilot's switch lets our sticks through
+
+
+class SetpointController:
+    """Remembers the last set-point and turns it into receiver channels.
+
+    Args:
+        override: Whether a pilot keeps a real receiver: then only the pilot arms.
+    """
+
+    def __init__(self, override: bool = False) -> None:
+        self.limits = Limits()
+        self.gains = Gains()
+        self.given_aux: dict[int, int] = {}
+        self.full_tilt_rad: float | None = None  #: what a full stick leans, where a person says it
+        self.hover: float | None = None  #: the throttle that carries it, 0 to 1; None: not learnt yet
+        self.report = Report()
+        self.phase = Phase.STANDING
+        self.stopped = False  #: motors cut by us, until the reset
+        self.throttle = 0.0
+        self.receiving = False
+        self._override = override
+        self._setup = Setup()
+        self._tilt: tuple[Curve, Curve] = self._setup.tilt_curves()
+        self._turn: Curve = self._setup.yaw_curve()
+        self._hindrance = "its settings were not read yet"  # severe ones
+        self._wanted = LEVEL
+        self._motion = Motion()
+        self._since_ns = 0  # of the phase
+        self._stepped_ns: int | None = None
+        self._switched = False  # the arm switch is on while it arms
+        self._named: tuple[list[str], int] | None = None
+        self._refused: tuple[str, int] | None = None
+        self._abort_ns: int | None = None
+        self._still_ns: int | None = None
+        self._blind_ns: int | None = None
+        self._sink = 1.0
+        self._stopped_ns = 0
+        self._events: list[VehicleEvent] = []
+
+    def set_up(self, setup: Setup, hindrance: str) -> None:
+        """Take over how the flight controller is set up, and why it must not be armed."""
+        self._setup, self._hindrance = setup, hindrance
+        self._tilt, self._turn = setup.tilt_curves(), setup.yaw_curve()
+
+    def flight_state(self) -> FlightState:
+        """Return the flight state for feedback."""
+        if self.stopped:
+            return FlightState.EMERGENCY
+        if self.report.armed is None:
+            return FlightState.UNKNOWN
+        return FlightState.FLYING if self.phase is Phase.FLYING and self.report.armed else FlightState.LANDED
+
+    @property
+    def full_tilt(self) -> float:
+        """What a full stick leans [rad]."""
+        return self.full_tilt_rad or self._setup.full_tilt_rad or math.radians(45.0)
+
+    @property
+    def left_to(self) -> str:
+        """The pilot, while the vehicle flies by the pilot's receiver."""
+        return "RECEIVER" if self._override and self.report.armed and not self.report.overridden else ""
+
+    # What is decided -----------------------------------------------------------------------------------------------
+
+    def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
+        """Accept an action.
+
+        Args:
+            action: One of the driver's ``ACTIONS``.
+            now_ns: The present time.
+
+        Returns:
+            What is applied, after the limits.
+
+        Raises:
+            DriverError: It stands and can't be armed for this climb, or a reset while the motors still run.
+        """
+        if isinstance(action, EmergencyStop):
+            self.stopped, self._stopped_ns, self._wanted = True, now_ns, LEVEL
+            self._enter(Phase.STANDING, now_ns)
+        elif isinstance(action, ResetEmergency):
+            if self.stopped and self.report.armed:
+                raise DriverError("the motors still run: the stop has not shown yet")
+            self.stopped = False
+        elif isinstance(action, Attitude):
+            return self._follow(action, now_ns)
+        else:
+            assert isinstance(action, Idle)
+        return action
+
+    def _follow(self, action: Attitude, now_ns: int) -> Attitude:
+        if self.stopped:
+            return LEVEL
+        limits = self.limits
+        tilt = min(limits.tilt, self.full_tilt)
+        lean = math.hypot(action.roll, action.pitch)
+        share = 1.0 if lean <= tilt else tilt / lean
+        self._wanted = Attitude(
+            roll=action.roll * share,
+            pitch=action.pitch * share,
+            climb=_within(action.climb, limits.climb),
+            yaw_rate=_within(action.yaw_rate, min(limits.yaw_rate, self._turn(1.0))),
+        )
+        if self.phase is Phase.STANDING and self._wanted.climb > 0:
+            self._start(now_ns)
+        return self._wanted
+
+    def why_not(self, now_ns: int) -> str:
+        """Return why it can't take off now; empty if nothing is known to prevent it."""
+        if self.stopped:
+            return "the motors were stopped: reset the emergency first"
+        if not self.receiving or self.report.armed is None:
+            return "no data from the flight controller"
+        if self._hindrance:
+            return f"it must not be armed: {self._hindrance}"
+        if self._motion.climb_m_s is None:
+            return (
+                "its climb is not measured, so its throttle can't be controlled: send it poses (motion capture), or "
+                "let it have a barometer"
+            )
+        if self._refused is not None and now_ns - self._refused[1] < REFUSED_NS:
+            return self._refused[0]
+        if self._override and not (self.report.armed and self.report.overridden):
+            return "arm it and switch MSP override on by the pilot's receiver: then it can take off"
+        names = [name for name in self.report.hindrances if name not in PASSING]
+        return "" if self.report.armed or not names else f"the flight controller refuses to arm: {explained(names)}"
+
+    def _start(self, now_ns: int) -> None:
+        why = self.why_not(now_ns)
+        if why:
+            self._wanted = LEVEL
+            raise DriverError(why)
+        self._named, self._switched = None, False
+        self._enter(Phase.SPOOLING if self.report.armed else Phase.ARMING, now_ns)
+
+    def _enter(self, phase: Phase, now_ns: int) -> None:
+        self.phase, self._since_ns = phase, now_ns
+        self._abort_ns = self._still_ns = self._blind_ns = None
+        self._sink = 1.0
+        if phase is Phase.SPOOLING:
+            self.throttle = IDLE if self.hover is None else SPOOL_FROM * self.hover
+        elif phase is not Phase.FLYING:
+            self.throttle = 0.0
+
+    # What is received ----------------------------------------------------------------------------------------------
+
+    def on_report(self, report: Report, now_ns: int) -> None:
+        """Handle what the flight controller reports of itself."""
+        before, self.report = self.report, report
+        self.receiving = True
+        if self.phase is Phase.ARMING:
+            self._look_at_arming(now_ns)
+        elif self.phase in (Phase.SPOOLING, Phase.FLYING) and report.armed is False:
+            flew = self.phase is Phase.FLYING
+            self._enter(Phase.STANDING, now_ns)
+            self._wanted = LEVEL
+            if before.armed:
+                where = "in flight" if flew else "before it had taken off"
+                why = f": {explained(report.hindrances)}" if report.hindrances else ""
+                text = f"the flight controller disarmed {where}{why}"
+                self._events.append(message(text, "disarmed", Severity.WARNING, flags=", ".join(report.hindrances)))
+        elif self._override and before.overridden and not report.overridden:
+            self._enter(Phase.STANDING, now_ns)
+            self._events.append(message("the pilot took the sticks", "override", Severity.WARNING, active=False))
+        elif self._override and report.overridden and not before.overridden:
+            self._events.append(message("the pilot gave the sticks away", "override", active=True))
+            if report.armed and self.throttle > IDLE:
+                self._wanted = LEVEL
+                self._enter(Phase.FLYING, now_ns)
+
+    def adopt(self, throttle: float, now_ns: int) -> None:
+        """Go on with a vehicle that was found armed.
+
+        Args:
+            throttle: That it was sent last, 0 to 1.
+            now_ns: The present time.
+        """
+        if throttle > IDLE:
+            self.hover = self.throttle = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
+            self._enter(Phase.FLYING, now_ns)
+
+    def on_pilot_throttle(self, throttle: float) -> None:
+        """Learn from what a pilot flies, so that nothing jumps when the sticks are given away."""
+        self.throttle = throttle
+        climb = self._motion.climb_m_s
+        if throttle > IDLE and climb is not None and abs(climb) < 0.3:
+            self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
+
+    def on_motion(self, motion: Motion) -> None:
+        """Take in how it moves."""
+        self._motion = motion
+
+    def lost(self) -> None:
+        """Level the sticks: nothing is received any more."""
+        self.receiving = False
+        self._motion = Motion()
+        self._wanted = LEVEL
+        if self.phase is Phase.ARMING:
+            self.phase = Phase.STANDING
+
+    def _look_at_arming(self, now_ns: int) -> None:
+        report = self.report
+        if report.armed:
+            self._enter(Phase.SPOOLING, now_ns)
+            return
+        names = [name for name in report.hindrances if name not in PASSING]
+        if not report.hindrances:
+            self._switched = True
+        if not names:
+            self._named = None
+        elif self._named is None:
+            self._named = names, now_ns
+        elif now_ns - self._named[1] >= NAMED_NS:
+            self._refuse(names, now_ns)
+            return
+        if now_ns - self._since_ns >= ARM_NS:
+            self._refuse(report.hindrances, now_ns)
+
+    def _refuse(self, names: list[str], now_ns: int) -> None:
+        why = explained(names) if names else "it gives no reason"
+        text = f"the flight controller refuses to arm: {why}"
+        self._refused = text, now_ns
+        self._wanted = LEVEL
+        self._enter(Phase.STANDING, now_ns)
+        self._events.append(message(text, "arming_refused", Severity.WARNING, flags=", ".join(names)))
+
+    # What is sent --------------------------------------------------------------------------------------------------
+
+    def pop_events(self) -> list[VehicleEvent]:
+        """Return the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def channels(self, now_ns: int) -> list[int]:
+        """Return the receiver's channels [µs] now, in the order of the flight controller. Called at a steady rate."""
+        step_s = 0.0 if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
+        self._stepped_ns = now_ns
+        if self.phase is Phase.SPOOLING:
+            self._spool(step_s, now_ns)
+        elif self.phase is Phase.FLYING:
+            self._hold_climb(step_s, now_ns)
+        steers = self.phase is Phase.FLYING and self.receiving
+        wanted = self._wanted if steers else LEVEL
+        on = self.phase in (Phase.SPOOLING, Phase.FLYING) or (self.phase is Phase.ARMING and self._switched)
+        roll, pitch = self._lean(wanted.roll, self._tilt[0]), self._lean(wanted.pitch, self._tilt[1])
+        yaw = -stick_for(self._turn, wanted.yaw_rate)
+        throttle = round(OFF_US + 1000 * (self.throttle if on else 0.0))
+        sticks = [0, 0, 0, 0]
+        centred = (round(1500 + 500 * stick) for stick in (roll, pitch, yaw))
+        for place, width in zip(self._setup.sticks, (*centred, throttle), strict=True):
+            sticks[place] = width
+        given: Mapping[int, int] = self.given_aux
+        return [*sticks, *self._setup.aux_us(arm=on, given=given)]
+
+    def _lean(self, angle: float, curve: Curve) -> float:
+        return stick_for(curve, angle / self.full_tilt)
+
+    def _spool(self, step_s: float, now_ns: int) -> None:
+        if self._wanted.climb > 0:
+            self._abort_ns = None
+        elif self._abort_ns is None:
+            self._abort_ns = now_ns
+        elif now_ns - self._abort_ns >= ABORT_NS:
+            self._enter(Phase.STANDING, now_ns)
+            return
+        motion = self._motion
+        if motion.climb_m_s is None:
+            self._give_up("its climb is no longer measured", now_ns)
+            return
+        high, fast = LIFTED[motion.precise]
+        if motion.climb_m_s > fast or (motion.height_m is not None and motion.height_m > high):
+            self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, self.throttle))
+            self._enter(Phase.FLYING, now_ns)
+        elif self.throttle >= self.limits.throttle:
+            self._give_up(f"it did not leave the ground at {self.limits.throttle:.0%} throttle", now_ns)
+        elif self._abort_ns is None:
+            self.throttle = min(self.limits.throttle, self.throttle + SPOOL_PER_S * step_s)
+
+    def _give_up(self, why: str, now_ns: int) -> None:
+        self._refused = why, now_ns
+        self._wanted = LEVEL
+        self._enter(Phase.STANDING, now_ns)
+        self._events.append(message(f"take-off given up: {why}", "no_takeoff", Severity.WARNING))
+
+    def _hold_climb(self, step_s: float, now_ns: int) -> None:
+        hover = self.hover or self.throttle
+        climb = self._motion.climb_m_s
+        if climb is None or not self.receiving:
+            self._sink_blindly(hover, now_ns)
+            return
+        if self._blind_ns is not None:
+            self._blind_ns = None
+            self._events.append(message("no longer: its climb is not measured", "blind", active=False))
+        error = self._wanted.climb - climb
+        lift = _within(self.gains.climb_p * error, LIFT_M_S2)
+        stands = self._stands(climb, step_s, now_ns)
+        if not stands:
+            hover *= 1 + self.gains.climb_i * _within(error, 1.0) * step_s / GRAVITY_M_S2
+            self.hover = hover = max(LEAST_LEARNT, min(MOST_LEARNT, hover))
+        upright = max(0.5, math.cos(self._wanted.roll) * math.cos(self._wanted.pitch))
+        wanted = hover * (1 + lift / GRAVITY_M_S2) / upright * self._sink
+        self.throttle = max(0.0, min(self.limits.throttle, wanted))
+        if stands and self.throttle < OFF_BELOW * hover:
+            self._wanted = LEVEL
+            self._enter(Phase.STANDING, now_ns)
+
+    def _stands(self, climb: float, step_s: float, now_ns: int) -> bool:
+        """Return whether a descent meets the ground; takes the throttle away while it seems to."""
+        if self._wanted.climb >= -0.05 or climb < HEADWAY * self._wanted.climb:
+            self._still_ns = None
+            self._sink = min(1.0, self._sink + 2 * SINK_PER_S * step_s)
+            return False
+        if self._still_ns is None:
+            self._still_ns = now_ns
+        if now_ns - self._still_ns < GROUND_NS[self._motion.precise]:
+            return False
+        self._sink = max(0.0, self._sink - SINK_PER_S * step_s)
+        return True
+
+    def _sink_blindly(self, hover: float, now_ns: int) -> None:
+        if self._blind_ns is None:
+            self._blind_ns = now_ns
+            text = f"its climb is not measured: it sinks, level, and is disarmed after {seconds(BLIND_NS):g} s"
+            self._events.append(message(text, "blind", Severity.ERROR, active=True))
+        elif now_ns - self._blind_ns >= BLIND_NS:
+            self._enter(Phase.STANDING, now_ns)
+            return
+        self.throttle = min(self.limits.throttle, BLIND * hover)
+
+
+def _within(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))

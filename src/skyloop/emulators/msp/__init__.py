@@ -1,0 +1,21 @@
+"""A racing drone with Betaflight, emulated over a simulated vehicle, for any program that speaks MSP over TCP.
+
+For a test::
+
+    from skyloop.emulators.msp import BetaflightFirmware, with_racers
+    from skyloop.sim.host import SimHost
+    from skyloop.sim.options import SimOptions
+
+    host = SimHost(with_racers(SimOptions(world="room", seed=1)))
+    with BetaflightFirmware(host, port=0) as firmware:
+        firmware.address  # for a driver: msp://tcp:127.0.0.1:…
+        host.simulation.truth(0).position_m  # what the vehicle really does
+
+Its barometer and GPS are those of the simulated vehicle. It answers what a driver needs, and is set up as
+``docs/msp.md`` asks for.
+"""
+
+from skyloop.emulators.msp.emulator import BetaflightFirmware
+from skyloop.emulators.msp.settings import BoardSettings, with_racers
+
+__all__ = ["BetaflightFirmware", "BoardSettings", "with_racers"]

@@ -1,0 +1,302 @@
+"""The flight controller's logic: receiver, arming, failsafe, flight, and answers. Pure: fed with frames and reports.
+
+What it does when the sticks stop was measured with Betaflight 4.6.0's own simulation (``docs/msp.md``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.emulators.flight import FlightControl
+from skyloop.emulators.msp.settings import (
+    BOXES,
+    CELLS,
+    CHANNELS,
+    HOVER_THROTTLE,
+    THRUST_POWER,
+    BoardSettings,
+)
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.messages.earth import EarthOrigin
+from skyloop.sim.host import Report
+from skyloop.wire.msp import messages as msp
+from skyloop.wire.msp.curves import pack_betaflight_rates, rate_curve, share_of
+from skyloop.wire.msp.frames import Direction, Frame
+from skyloop.wire.msp.messages import BETAFLIGHT, RX_MSP, USUAL_MAP, Function, OnLoss, RxConfig, Sensor, Status
+from skyloop.wire.msp.names import ARM_SWITCH, BETAFLIGHT_FLAGS
+
+API: Final = (1, 47)
+VERSION: Final = (4, 6, 0)
+NAME: Final = "EMULATED"
+FLAGS: Final = len(BETAFLIGHT_FLAGS) + 1  #: with ARM_SWITCH
+LOSS_NS: Final = nanoseconds(0.15)  #: without sticks for so long, the receiver is lost
+HOLD_NS: Final = nanoseconds(0.3)  #: until then the last sticks are in force
+RECOVERY_NS: Final = nanoseconds(0.5)  #: so long sticks must come again
+IDLE: Final = 0.055  #: share of the throttle at which motors turn while it is armed
+LEVEL_RAD: Final = math.radians(25.0)  #: it arms within
+GROUND_M: Final = 0.06
+ORIGIN: Final = EarthOrigin(47.0, 8.0, 400.0, 6_371_000.0)  #: an arbitrary place for the world's origin
+SATELLITES: Final = 14
+_ROLL, _PITCH, _YAW, _THROTTLE = range(4)
+
+
+def bit(name: str) -> int:
+    """Return a flag that keeps it from arming as its bit."""
+    return 1 << (FLAGS - 1 if name == ARM_SWITCH else BETAFLIGHT_FLAGS.index(name))
+
+
+class Board:
+    """One flight controller. Not thread-safe. Used on the loop's thread.
+
+    ``received``: sticks that came, in the order roll, pitch, yaw, throttle, AUX; ``frames``: how many.
+
+    Args:
+        vehicle: What it flies.
+        settings: How it is set up.
+        now_ns: When it is switched on.
+    """
+
+    def __init__(self, vehicle: Vehicle, settings: BoardSettings, now_ns: int) -> None:
+        self.settings = settings
+        self.armed = False
+        self.received: list[int] = []
+        self.frames = 0
+        self.silenced = False  #: answers nothing, as a line that is cut
+        self._flight = FlightControl(vehicle)
+        self._report: Report | None = None
+        self._begun_ns = now_ns
+        self._came_ns: int | None = None
+        self._good_since_ns = now_ns
+        self._failsafe = False
+        self._landing_ns: int | None = None
+        self._not_disarmed = False
+        self._had_sticks = False
+        self._refused = False  # the arm switch was on while something kept it from arming
+        self._crashed = False
+        self._ground_m = 0.0
+        self._data = [1500, 1500, 1500, 885, *[1500] * (CHANNELS - 4)]  # what is in force
+        tilt = share_of(rate_curve(settings.rates.kind, settings.rates.roll))
+        self._tilt: Callable[[float], float] = lambda stick: math.radians(settings.angle_limit_deg) * tilt(stick)
+        self._turn = rate_curve(settings.rates.kind, settings.rates.yaw)
+
+    # Frames --------------------------------------------------------------------------------------------------------
+
+    def answer(self, frame: Frame, now_ns: int) -> Frame | None:
+        """Handle a frame and return the reply."""
+        if frame.direction is not Direction.REQUEST or self.silenced:
+            return None
+        payload = self._payload(frame, now_ns)
+        if payload is None:
+            return Frame(frame.function, b"", Direction.ERROR)
+        return Frame(frame.function, payload, Direction.REPLY)
+
+    def _payload(self, frame: Frame, now_ns: int) -> bytes | None:
+        if frame.function == Function.SET_RAW_RC:
+            return self._take_sticks(msp.channels(frame.payload), now_ns)
+        if frame.function == Function.MULTIPLE:
+            made = b""
+            for function in frame.payload:
+                part = self._state(function, now_ns) or b""
+                made += bytes((len(part),)) + part
+            return made
+        return self._state(frame.function, now_ns)
+
+    def _take_sticks(self, widths: list[int], now_ns: int) -> bytes | None:
+        if len(widths) > CHANNELS or len(widths) < len(USUAL_MAP):
+            return None
+        places = [*USUAL_MAP, *range(4, len(widths))]
+        self.received = [widths[place] for place in places]
+        self.frames += 1
+        if self._came_ns is None or now_ns - self._came_ns >= LOSS_NS:
+            self._good_since_ns = now_ns
+        self._came_ns = now_ns
+        return b""
+
+    def _state(self, function: int, now_ns: int) -> bytes | None:
+        settings = self.settings
+        if function == Function.RAW_GPS and not settings.gps:
+            return None
+        makers: dict[int, Callable[[], bytes]] = {
+            Function.API_VERSION: lambda: bytes((0, *API)),
+            Function.FC_VARIANT: BETAFLIGHT.encode,
+            Function.FC_VERSION: lambda: bytes(VERSION),
+            Function.BOARD_INFO: lambda: b"SKYL\0\0\0\0" + bytes((len(NAME),)) + NAME.encode(),
+            Function.BOXIDS: lambda: bytes(number for number, _ in BOXES),
+            Function.BOXNAMES: lambda: "".join(f"{name};" for _, name in BOXES).encode(),
+            Function.MODE_RANGES: lambda: msp.pack_mode_ranges(settings.ranges),
+            Function.RX_MAP: lambda: bytes((*USUAL_MAP, 4, 5, 6, 7)),
+            Function.RX_CONFIG: RxConfig().encode,
+            Function.FAILSAFE_CONFIG: settings.failsafe.encode,
+            Function.RXFAIL_CONFIG: lambda: msp.pack_rx_fail(settings.on_loss),
+            Function.RC_TUNING: lambda: pack_betaflight_rates(settings.rates),
+            Function.PID_ADVANCED: lambda: bytes(20) + bytes((settings.angle_limit_deg,)) + bytes(40),
+            Function.FEATURE_CONFIG: lambda: (RX_MSP * settings.rx_msp).to_bytes(4, "little"),
+            Function.BATTERY_CONFIG: lambda: bytes((33, 43)),
+            Function.STATUS: lambda: self._status(now_ns).betaflight(),
+            Function.STATUS_EX: lambda: self._status(now_ns).betaflight(),
+            Function.RC: lambda: msp.pack_channels(self._data),
+            Function.ATTITUDE: lambda: self._attitude().encode(),
+            Function.ALTITUDE: lambda: self._altitude().encode(),
+            Function.RAW_GPS: lambda: self._gps().encode(),
+            Function.RAW_IMU: lambda: self._imu().encode(),
+            Function.BATTERY_STATE: lambda: self._battery().state(),
+            Function.ANALOG: lambda: self._battery().analog(),
+        }
+        return makers[function]() if function in makers else None
+
+    # State ---------------------------------------------------------------------------------------------------------
+
+    def _status(self, now_ns: int) -> Status:
+        settings = self.settings
+        sensors = 1 << Sensor.ACCELEROMETER | settings.barometer << Sensor.BAROMETER | settings.gps << Sensor.GPS
+        modes = sum(1 << place for place, (number, _) in enumerate(BOXES) if number and self._is_on(number))
+        return Status(sensors, modes | self.armed, self._hindrances(now_ns), FLAGS, 125, 12)
+
+    def _attitude(self) -> msp.Attitude:
+        believed = self._seen.believed
+        heading = 90.0 - math.degrees(believed.yaw_rad)
+        return msp.Attitude(math.degrees(believed.roll_rad), math.degrees(believed.pitch_rad), heading)
+
+    def _altitude(self) -> msp.Altitude:
+        believed = self._seen.believed
+        return msp.Altitude(believed.altitude_m - self._ground_m, believed.velocity_m_s[2])
+
+    def _gps(self) -> msp.Gps:
+        truth = self._seen.truth
+        latitude, longitude, altitude = ORIGIN.place_of(truth.position_m)
+        east, north, _ = truth.velocity_m_s
+        course = math.degrees(math.atan2(east, north)) % 360
+        return msp.Gps(True, SATELLITES, latitude, longitude, altitude, math.hypot(east, north), course)
+
+    def _imu(self) -> msp.Imu:
+        believed = self._seen.believed
+        roll, pitch, yaw = (round(math.degrees(rate)) for rate in believed.angular_velocity_rad_s)
+        x, y, z = (round(part / 9.80665 * 512) for part in believed.acceleration_m_s2)
+        return msp.Imu((x, y, z), (roll, pitch, yaw), (0, 0, 0))
+
+    def _battery(self) -> msp.Battery:
+        return msp.Battery(self._seen.believed.battery_v, 0.0, CELLS)
+
+    @property
+    def _seen(self) -> Report:
+        assert self._report is not None
+        return self._report
+
+    def _is_on(self, number: int) -> bool:
+        """Return whether a switch is in the range of a mode, by its permanent number."""
+        ranges = [each for each in self.settings.ranges if each.mode == number]
+        return any(each.low_us <= self._data[4 + each.aux] < each.high_us for each in ranges)
+
+    def _hindrances(self, now_ns: int) -> int:
+        believed = self._seen.believed
+        if self.armed:
+            return 0 if self._gets_sticks(now_ns) else bit("RXLOSS")
+        recovered = self._gets_sticks(now_ns) and now_ns - self._good_since_ns >= RECOVERY_NS
+        tilted = max(abs(believed.roll_rad), abs(believed.pitch_rad)) > LEVEL_RAD
+        conditions = {
+            "RXLOSS": not recovered,
+            "FAILSAFE": self._failsafe,
+            "NOT_DISARMED": self._not_disarmed,
+            "CRASH": self._crashed,
+            "THROTTLE": self._data[_THROTTLE] > RxConfig().low_us,
+            "ANGLE": tilted,
+            "BOOTGRACE": now_ns - self._begun_ns < nanoseconds(self.settings.boot_s),
+            ARM_SWITCH: self._refused,
+        }
+        return sum(bit(name) for name, on in conditions.items() if on) | self.settings.flags
+
+    def _gets_sticks(self, now_ns: int) -> bool:
+        return self._came_ns is not None and now_ns - self._came_ns < LOSS_NS
+
+    # Time ----------------------------------------------------------------------------------------------------------
+
+    def crashed(self) -> None:
+        """Disarm: the vehicle hit something hard."""
+        self.armed, self._crashed = False, True
+
+    def tick(self, report: Report, now_ns: int) -> None:
+        """Handle the vehicle's newest report: receiver, failsafe, switches, motors. Called regularly."""
+        self._report = report
+        self._flight.update(report)
+        if not self.armed and self._flight.standing:
+            self._ground_m = report.believed.altitude_m
+        self._receive(now_ns)
+        self._switch(now_ns)
+        self._fly()
+
+    def _receive(self, now_ns: int) -> None:
+        came_ns = self._came_ns
+        silent_ns = None if came_ns is None else now_ns - came_ns
+        if silent_ns is None:
+            return
+        if silent_ns < LOSS_NS:
+            if self._failsafe and now_ns - self._good_since_ns >= RECOVERY_NS:
+                self._failsafe, self._landing_ns = False, None
+            if not self._failsafe:
+                self._data[: len(self.received)] = self.received
+        elif silent_ns >= HOLD_NS:
+            self._lose_sticks()
+        if self.armed and silent_ns >= nanoseconds(self.settings.failsafe.delay_s):
+            self._fail(now_ns)
+
+    def _lose_sticks(self) -> None:
+        usual = (1500, 1500, 1500, RxConfig().least_us)
+        for channel, (mode, width) in enumerate(self.settings.on_loss):
+            if mode == OnLoss.SET:
+                self._data[channel] = width
+            elif mode == OnLoss.AUTO:
+                self._data[channel] = usual[channel] if channel < len(usual) else 1500
+
+    def _fail(self, now_ns: int) -> None:
+        """Do what is to be done when the sticks have stopped: land, or drop."""
+        config = self.settings.failsafe
+        if self._landing_ns is None:
+            self._landing_ns = now_ns
+        self._failsafe = True
+        self._data[:4] = [1500, 1500, 1500, config.throttle_us]
+        if config.procedure != 0 or now_ns - self._landing_ns >= nanoseconds(config.landing_s):
+            self.armed = False
+
+    def _switch(self, now_ns: int) -> None:
+        on, gets = self._is_on(0), self._gets_sticks(now_ns)
+        if gets and not self._had_sticks and on and not self.armed:
+            self._not_disarmed = True
+        self._had_sticks = gets
+        if not on:
+            if gets:
+                self.armed = self._not_disarmed = self._refused = self._crashed = False
+            return
+        if not self.armed and not self._refused:
+            if self._hindrances(now_ns):
+                self._refused = True
+            else:
+                self.armed = True
+
+    def _fly(self) -> None:
+        flight = self._flight
+        if not self.armed:
+            if flight.state.airborne:
+                flight.cut()
+            else:
+                flight.lie()
+            return
+        throttle = max(IDLE, min(1.0, (self._data[_THROTTLE] - 1000) / 1000))
+        thrust = (throttle / HOVER_THROTTLE) ** THRUST_POWER
+        if flight.standing:
+            if thrust > 1.02:
+                flight.lift_off()
+            return
+        if flight.place[2] < GROUND_M and thrust < 0.97:
+            flight.land()
+        if not flight.airborne:
+            return
+        roll, pitch, yaw = ((self._data[axis] - 1500) / 500 for axis in (_ROLL, _PITCH, _YAW))
+        turn = -math.copysign(math.radians(self._turn(abs(yaw))), yaw)
+        flight.lean_by_thrust(self._lean(roll), self._lean(pitch), thrust, turn)
+
+    def _lean(self, stick: float) -> float:
+        """Return the angle of a stick in ANGLE mode; without that mode it stays level, for nothing else is emulated."""
+        return math.copysign(self._tilt(min(1.0, abs(stick))), stick) if self._is_on(1) else 0.0

@@ -1,0 +1,182 @@
+"""Frames of MSP: version 1, its long form for 255 bytes and more, and version 2. Pure.
+
+Version 1 is ``$M`` direction size function payload xor; version 2 is ``$X`` direction flags function(16) size(16)
+payload CRC-8/DVB-S2 (INAV's wiki, "MSP V2").
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+MOST: Final = 1024  #: bytes of a payload that the parser waits for; the longest in use, names of modes, is below 700
+LONG: Final = 255  #: a size of version 1 that says: the real one follows, in two bytes
+LARGEST: Final = 0xFFFF
+
+
+class Direction(Enum):
+    """Who speaks. The value is the third byte of a frame."""
+
+    REQUEST = ord("<")  #: to the flight controller
+    REPLY = ord(">")
+    ERROR = ord("!")  #: the flight controller doesn't know the function, or refuses it
+
+
+_DIRECTIONS: Final = {each.value: each for each in Direction}
+_V2: Final = struct.Struct("<BHH")
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame.
+
+    Args:
+        function: 0 to 65535; from 255 on only version 2 can say it.
+        payload: At most 65535 bytes.
+        direction: Who speaks.
+    """
+
+    function: int
+    payload: bytes = b""
+    direction: Direction = Direction.REQUEST
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0xD5 if crc & 0x80 else crc << 1) & 0xFF
+        table.append(crc)
+    return tuple(table)
+
+
+_CRC: Final = _crc_table()
+
+
+def crc8(data: bytes) -> int:
+    """Return the CRC-8/DVB-S2 of some bytes: polynomial 0xD5, nothing reflected, from 0."""
+    crc = 0
+    for byte in data:
+        crc = _CRC[crc ^ byte]
+    return crc
+
+
+def xor(data: bytes) -> int:
+    """Return the exclusive or of all bytes, which version 1 checks with."""
+    made = 0
+    for byte in data:
+        made ^= byte
+    return made
+
+
+def encode(frame: Frame, *, version: int | None = None) -> bytes:
+    """Return the bytes of a frame.
+
+    Args:
+        frame: To be sent.
+        version: 1 or 2; None: the lowest that can say it.
+
+    Raises:
+        ValueError: That version can't say it.
+    """
+    function, payload = frame.function, frame.payload
+    if not 0 <= function <= LARGEST or len(payload) > LARGEST:
+        raise ValueError(f"function {function} with {len(payload)} bytes does not fit into a frame")
+    if version is None:
+        version = 1 if function < LONG else 2
+    if version == 2:
+        checked = _V2.pack(0, function, len(payload)) + payload
+        return b"$X" + bytes((frame.direction.value,)) + checked + bytes((crc8(checked),))
+    if version != 1 or function >= LONG:
+        raise ValueError(f"version {version} of MSP has no function {function}")
+    size = bytes((len(payload), function))
+    if len(payload) >= LONG:
+        size = bytes((LONG, function)) + struct.pack("<H", len(payload))
+    return b"$M" + bytes((frame.direction.value,)) + size + payload + bytes((xor(size + payload),))
+
+
+class Parser:
+    """Finds frames in a stream of bytes, whatever else is in it. Never raises.
+
+    After a frame whose checksum is wrong the search goes on at the byte after its ``$``: a frame that lost some bytes
+    does not take its successor with it. ``skipped`` counts bytes that belong to no frame, ``damaged`` wrong checksums.
+    """
+
+    def __init__(self) -> None:
+        self._kept = bytearray()
+        self.skipped = 0
+        self.damaged = 0
+
+    def reset(self) -> None:
+        """Forget the beginning of a frame: what follows comes from a new connection."""
+        self._kept.clear()
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Return the frames that are complete with these bytes."""
+        self._kept += data
+        found: list[Frame] = []
+        at = 0
+        while True:
+            start = self._kept.find(b"$", at)
+            if start < 0:
+                self.skipped += len(self._kept) - at
+                at = len(self._kept)
+                break
+            self.skipped += start - at
+            at = start
+            taken = self._frame(at, found)
+            if taken == 0:
+                break  # not complete
+            if taken < 0:
+                self.skipped += 1
+                at += 1
+            else:
+                at += taken
+        del self._kept[:at]
+        return found
+
+    def _frame(self, at: int, found: list[Frame]) -> int:
+        """Return how long the frame at this ``$`` is; 0: there is more to come; -1: it is none."""
+        kept = self._kept
+        left = len(kept) - at
+        if left < 3:
+            return -1 if left == 2 and kept[at + 1] not in b"MX" else 0
+        direction = _DIRECTIONS.get(kept[at + 2])
+        if kept[at + 1] not in b"MX" or direction is None:
+            return -1
+        head = self._head(at, left)
+        if head is None:
+            return 0
+        function, begin, size = head
+        if size > MOST:
+            return -1
+        length = begin + size + 1
+        if left < length:
+            return 0
+        checked = bytes(kept[at + 3 : at + length - 1])
+        check = crc8(checked) if kept[at + 1] == ord("X") else xor(checked)
+        if check != kept[at + length - 1]:
+            self.damaged += 1
+            return -1
+        found.append(Frame(function, bytes(kept[at + begin : at + begin + size]), direction))
+        return length
+
+    def _head(self, at: int, left: int) -> tuple[int, int, int] | None:
+        """Return function, where the payload begins, and its size; None while that has not come yet."""
+        kept = self._kept
+        if kept[at + 1] == ord("X"):
+            if left < 8:
+                return None
+            _, function, size = _V2.unpack_from(kept, at + 3)
+            return function, 8, size
+        if left < 5:
+            return None
+        size, function = kept[at + 3], kept[at + 4]
+        if size < LONG:
+            return function, 5, size
+        if left < 7:
+            return None
+        return function, 7, kept[at + 5] | kept[at + 6] << 8

@@ -1,0 +1,61 @@
+"""An emulated Betaflight, and a camera system that sends its poses to the driver under test."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+from skyloop.drivers.base import ExternalPose
+from skyloop.drivers.msp import MspDriver
+from skyloop.emulators.msp import BetaflightFirmware, with_racers
+from skyloop.errors import DriverError
+from skyloop.sim.host import SimHost
+from skyloop.sim.options import SimOptions
+
+POSE_S = 0.01
+
+
+def world(**options: object) -> SimHost:
+    settings = {"world": "empty", "seed": 4, "wind": 0.0, **options}
+    return SimHost(with_racers(SimOptions(**settings)))  # type: ignore[arg-type]
+
+
+class Cameras(threading.Thread):
+    """Sees the drone a hundred times a second, and tells whoever listens."""
+
+    def __init__(self, firmware: BetaflightFirmware) -> None:
+        super().__init__(daemon=True)
+        self.firmware = firmware
+        self.listener: Callable[[ExternalPose], None] | None = None
+        self._ending = threading.Event()
+
+    def __enter__(self) -> Cameras:
+        self.start()
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self._ending.set()
+        self.join()
+
+    def run(self) -> None:
+        while not self._ending.wait(POSE_S):
+            listener, simulation = self.listener, self.firmware.host.simulation
+            if listener is None:
+                continue
+            truth = simulation.truth(self.firmware.drone)
+            try:
+                listener(ExternalPose(truth.position_m, truth.quaternion, time.monotonic_ns()))
+            except DriverError:  # closed meanwhile
+                continue
+
+
+class SeenDriver(MspDriver):
+    """A driver that gets the cameras' poses while it is open."""
+
+    cameras: Cameras | None = None
+
+    def external_pose(self, pose: ExternalPose) -> None:
+        if self._link is not None:
+            super().external_pose(pose)
