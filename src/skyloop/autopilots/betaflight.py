@@ -40,8 +40,9 @@ SETTINGS: Final = (
 )
 SETTINGS_FILE: Final = "eeprom.bin"
 CONFIGURE_S: Final = 5.0
+START_S: Final = 5.0  #: from the start of its process until its first motors, at most
+ATTEMPT_S: Final = 0.5
 _PAUSE_S: Final = 0.05
-_ATTEMPTS: Final = 10
 
 
 class Betaflight(CoupledFirmware):
@@ -60,6 +61,7 @@ class Betaflight(CoupledFirmware):
         self._motors: socket.socket | None = None
         self._fix: GpsFix | None = None
         self._due_s = 0.0
+        self._begun_s = 0.0
 
     @property
     def address(self) -> str:
@@ -95,23 +97,25 @@ class Betaflight(CoupledFirmware):
             firmware = subprocess.Popen(
                 (self._program, LOOPBACK), cwd=folder, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
             )
+        saved = False
         try:
-            with _connected(MSP_PORT) as link:
-                _enter_command_line(link)
+            with _command_line(MSP_PORT) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
                     _read_prompt(link)
                 link.sendall(b"save\r\n")
-                firmware.wait(CONFIGURE_S)
+                saved = firmware.wait(CONFIGURE_S) == 0
         except subprocess.TimeoutExpired:
             raise OSError("its settings could not be saved") from None
         finally:
+            if not saved:  # it has written others there when it started
+                (folder / SETTINGS_FILE).unlink(missing_ok=True)
             firmware.kill()
             firmware.wait()
 
     def _begin(self) -> None:
         self._receive(0.0)  # what the process before may have sent last
-        self._due_s = time.monotonic()
+        self._due_s = self._begun_s = time.monotonic()
 
     def _receive(self, wait_s: float) -> Commands | None:  # noqa: ARG002  nothing is owed: it keeps the computer's time
         commands: Commands | None = None
@@ -127,8 +131,9 @@ class Betaflight(CoupledFirmware):
 
     def _send(self, readings: Readings) -> None:
         self._keep_pace()
-        if self._motors is None:
-            return
+        starting = self._answered_s is None and time.monotonic() - self._begun_s < START_S
+        if self._motors is None or starting:
+            return  # a state that comes while its sensors are made would stop it for good; its motors come after that
         fix = self._fix = readings.gps or self._fix
         latitude, longitude, altitude = geodetic(readings.position_m)
         velocity = readings.velocity_m_s
@@ -162,39 +167,30 @@ class Betaflight(CoupledFirmware):
             time.sleep(min(ahead_s, STEP_S))
 
 
-def _connected(port: int) -> socket.socket:
-    """Return a connection to a port of this computer that is opened soon.
+def _command_line(port: int) -> socket.socket:
+    """Return a connection to the command line on a port of this computer that is opened soon.
+
+    What comes before the serial port works is lost, or ends the connection: so it is tried again.
 
     Raises:
-        OSError: It is not opened within :data:`CONFIGURE_S`.
+        OSError: It does not answer within :data:`CONFIGURE_S`.
     """
     end_s = time.monotonic() + CONFIGURE_S
     while True:
+        time.sleep(_PAUSE_S)
+        link = None
         try:
-            return socket.create_connection((LOOPBACK, port), CONFIGURE_S)
-        except ConnectionRefusedError:
-            if time.monotonic() > end_s:
-                raise
-            time.sleep(_PAUSE_S)
-
-
-def _enter_command_line(link: socket.socket) -> None:
-    """Ask for the command line until it answers: what comes before the serial port works is lost.
-
-    Raises:
-        OSError: It does not answer.
-    """
-    for left in reversed(range(_ATTEMPTS)):
-        link.sendall(b"#")
-        link.settimeout(CONFIGURE_S / _ATTEMPTS)
-        try:
+            link = socket.create_connection((LOOPBACK, port), ATTEMPT_S)
+            link.sendall(b"#")
             _read_prompt(link)
-        except TimeoutError:
-            if not left:
+        except OSError:
+            if link is not None:
+                link.close()
+            if time.monotonic() > end_s:
                 raise
         else:
             link.settimeout(CONFIGURE_S)
-            return
+            return link
 
 
 def _read_prompt(link: socket.socket) -> None:

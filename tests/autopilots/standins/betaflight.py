@@ -36,7 +36,9 @@ time.sleep(0.2)
 threading.Thread(target=command_line, daemon=True).start()
 link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 link.bind(("127.0.0.1", state_port))
+motors = encode_motors((0.1, 0.2, 0.3, 0.4)), ("127.0.0.1", motors_port)
+link.sendto(*motors)  # before any state, as Betaflight does
 with Path("states.txt").open("a", buffering=1) as states:
     while True:
         states.write(f"{decode_state(link.recv(4096))}\n")
-        link.sendto(encode_motors((0.1, 0.2, 0.3, 0.4)), ("127.0.0.1", motors_port))
+        link.sendto(*motors)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 
 from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.msp import MspDriver
@@ -35,7 +34,7 @@ class Cameras(threading.Thread):
         self.start()
         return self
 
-    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ending.set()
         self.join()
 

@@ -150,6 +150,11 @@ class SimDriver(Driver):
     def _repeat(self, action: AnyAction) -> AnyAction:
         return self._apply(action) if self._firmware is None else self._firmware.apply(action, new=False)
 
+    def check(self, action: AnyAction) -> None:
+        """Refuse what the firmware would not do; the built-in autopilot refuses nothing."""
+        if self._firmware is not None:
+            self._firmware.driver.check(action)
+
     def left_to(self) -> str:
         """Return what others made of the firmware's mode; nobody else flies the built-in autopilot."""
         return "" if self._firmware is None else self._firmware.driver.left_to()

@@ -78,6 +78,7 @@ class FirmwareFlight:
         self._drone = 0
         self._firmware: CoupledFirmware | None = None
         self._inner: Driver | None = None
+        self._linked = False  # whether the firmware's driver is to be open
         self._reports: deque[Report] = deque(maxlen=_KEPT_REPORTS)
 
     def _address(self, address: str) -> str:
@@ -108,7 +109,7 @@ class FirmwareFlight:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, host: SimHost, drone: int, sink: Sink) -> None:
-        """Start the firmware, let it fly the drone, and open its driver.
+        """Start the firmware and let it fly the drone; its driver is opened as soon as its process runs.
 
         Raises:
             UsageError: Its program is not here, or no port is free for it.
@@ -116,13 +117,14 @@ class FirmwareFlight:
         self._host, self._drone, self._sink = host, drone, sink
         folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
         self._firmware = firmware = make_firmware(self.kind, self._happened, folder=folder)
+        self._linked = True
+        sink.link(LinkState.CONNECTING, f"{_NAMES[self.kind]} is being started")
         firmware.start()
         host.simulation.fly_by(drone, firmware)
-        self.switch_link(on=True)
 
     def close(self) -> None:
         """Stop the rotors, and end the driver and the firmware. Idempotent."""
-        self.switch_link(on=False)
+        self._close_driver()
         host, firmware = self._host, self._firmware
         if host is not None and host.simulation.flown_by_firmware(self._drone):
             host.simulation.release(self._drone)
@@ -133,22 +135,36 @@ class FirmwareFlight:
 
     def switch_link(self, *, on: bool) -> None:
         """Open or close the firmware's driver: without it the vehicle hears nothing, as out of a radio's range."""
+        if on:
+            self._linked = True
+            self._open_driver()
+            return
+        self._close_driver()
+        if self._sink is not None:
+            self._sink.link(LinkState.LOST, _LINK_OFF)
+
+    def _open_driver(self) -> None:
         with self._lock:
-            inner, sink = self._inner, self._sink
-            if on and inner is None and self._firmware is not None and sink is not None:
-                made = make_driver(self._address(self._firmware.address))
-                made.open(_InnerSink(self, sink))
-                self._inner = made
-            elif not on and inner is not None:
-                self._inner = None
+            firmware, sink = self._firmware, self._sink
+            if not self._linked or self._inner is not None or firmware is None or sink is None:
+                return
+            made = make_driver(self._address(firmware.address))
+            made.open(_InnerSink(self, sink))
+            self._inner = made
+
+    def _close_driver(self) -> None:
+        with self._lock:
+            self._linked = False
+            inner, self._inner = self._inner, None
+            if inner is not None:
                 inner.close()
-                if sink is not None:
-                    sink.link(LinkState.LOST, _LINK_OFF)
 
     def _happened(self, event: FirmwareEvent) -> None:
         sink = self._sink
         if sink is not None:
             sink.event(EventKind.VEHICLE_MESSAGE, event.text, _SEVERITIES[event.kind], reason=f"firmware_{event.kind}")
+        if event.kind is FirmwareEventKind.STARTED:
+            self._open_driver()
 
     # Flying ----------------------------------------------------------------------------------------------------
 
