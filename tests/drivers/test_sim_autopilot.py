@@ -21,6 +21,7 @@ from skyloop.errors import ParameterError, UnknownNameError, UnsupportedError, U
 from skyloop.messages import EventKind, Hover, Land, LinkState, Takeoff
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
 from tests.autopilots.rig import program
 
 LONG_S = 20.0
@@ -80,11 +81,11 @@ def test_an_address_that_makes_no_sense_is_refused(uri: str, message: str) -> No
 
 
 def test_the_vehicle_is_one_that_the_firmware_is_for() -> None:
-    for autopilot, mass_kg in (("ardupilot", 1.52), ("px4", 1.52), ("betaflight", 0.752)):
+    for autopilot, vehicle in (("ardupilot", IRIS), ("px4", IRIS), ("betaflight", RACER)):
         options = options_of(parse_uri(f"sim://?autopilot={autopilot}"))
-        assert options.parameters.mass_kg == mass_kg
+        assert options.parameters == vehicle
         assert options.autopilot == autopilot
-    assert options_of(parse_uri("sim://?autopilot=px4&vehicle=crazyflie")).parameters.mass_kg == 0.028
+    assert options_of(parse_uri("sim://?autopilot=px4&vehicle=crazyflie")).parameters == CRAZYFLIE
 
 
 def test_what_it_can_do_is_what_the_firmware_s_driver_can_do() -> None:

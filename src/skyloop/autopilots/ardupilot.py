@@ -51,8 +51,9 @@ PARAMETERS: Final[dict[str, float]] = {
         for n in ("", "2", "3")
         for axis, offset in zip("XYZ", (5, 13, -18), strict=True)
     },
-    **{f"INS_ACC{n}OFFS_{axis}": 0.001 for n in ("", "2", "3") for axis in "XYZ"},
-    **{f"INS_ACC{n}SCAL_{axis}": 1.001 for n in ("", "2", "3") for axis in "XYZ"},
+    **{f"INS_ACC{n}OFFS_{axis}": 0.001 for n in ("", "2") for axis in "XYZ"},
+    **{f"INS_ACC{n}SCAL_{axis}": 1.001 for n in ("", "2") for axis in "XYZ"},
+    "INS_GYR_CAL": 1,  # its gyros have a bias: it measures that when it starts, as on a vehicle
     "SIM_BARO_RND": 0.05,
     "BATT_MONITOR": 4,
     "RNGFND1_TYPE": 100,  # the simulator's
