@@ -21,7 +21,7 @@ from skyloop.sim.firmware import GpsFix, Readings
 SOURCE = Path(skyloop.__file__).parents[1]
 STANDINS = Path(__file__).parent / "standins"
 STEP_S = 0.001
-LONG_S = 20.0
+LONG_S = 60.0
 #: What all stand-ins command, in the simulation's order.
 COMMANDS = (0.3, 0.1, 0.2, 0.4)
 AT_REST = Readings(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from skyloop.autopilots import coupling
 from skyloop.autopilots.ardupilot import VARIABLE, ArduCopter
 from skyloop.autopilots.coupling import STOPPED, WAIT_S
 from skyloop.autopilots.program import FirmwareEventKind
@@ -32,7 +33,12 @@ def states(tmp_path: Path) -> list[dict[str, object]]:
     return [json.loads(line) for line in (tmp_path / "kept" / "states.jsonl").read_text().splitlines()]
 
 
-def test_it_flies_in_step(rig: Rig, tmp_path: Path) -> None:
+@pytest.fixture
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(coupling, "WAIT_S", 20.0)  # a busy machine is no silence
+
+
+def test_it_flies_in_step(rig: Rig, patience: None, tmp_path: Path) -> None:
     rig.answered()
     for _ in range(100):
         assert rig.step() == pytest.approx(COMMANDS)  # each of them: it was waited for
@@ -75,7 +81,7 @@ def test_its_death_stops_the_rotors_and_it_is_started_again(rig: Rig) -> None:
     assert rig.firmware.program.starts == 2
 
 
-def test_other_packets_are_ignored(rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_other_packets_are_ignored(rig: Rig, patience: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("STANDIN", "garbage")
     with flying(lambda on_event: ArduCopter(on_event)) as second:
         second.answered()

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.process
 
 SLEEPS = (sys.executable, "-S", "-c", "import time; print('awake', flush=True); time.sleep(60)")
 FAILS = (sys.executable, "-S", "-c", "print('first line'); raise SystemExit('no sensors found')")
-LONG_S = 20.0
+LONG_S = 60.0
 
 
 class Watched:

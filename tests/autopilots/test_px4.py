@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.autopilots import px4
+from skyloop.autopilots import coupling, px4
 from skyloop.autopilots.coupling import STOPPED
 from skyloop.autopilots.ports import bound
 from skyloop.autopilots.program import FirmwareEventKind
@@ -48,7 +48,8 @@ def messages(tmp_path: Path) -> list[tuple[str, int]]:
     return [(kind, int(time_us)) for kind, time_us in (line.split() for line in lines)]
 
 
-def test_it_flies_in_step(rig: Rig, tmp_path: Path) -> None:
+def test_it_flies_in_step(rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(coupling, "WAIT_S", 20.0)  # a busy machine is no silence
     rig.answered()
     answers = [rig.step(gps=FIX if n == 10 else None) for n in range(40 * STEPS)]
     given = [commands for commands in answers if commands is not None]

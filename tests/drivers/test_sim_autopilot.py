@@ -24,7 +24,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
 from tests.autopilots.rig import program
 
-LONG_S = 20.0
+LONG_S = 60.0
 ARDUPILOT = "sim://?autopilot=ardupilot&world=empty&wind=0&noise=0&cameras=bottom&width=64&height=48&parameters=0"
 
 

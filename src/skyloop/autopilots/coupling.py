@@ -10,7 +10,7 @@ from typing import ClassVar, Final
 from skyloop.autopilots.program import FirmwareEvent, FirmwareEventKind, Launch, Program
 from skyloop.sim.firmware import Readings
 
-WAIT_S: Final = 0.1  #: longest wait for an answer; after one in vain there is none until it answers
+WAIT_S: Final = 0.3  #: longest wait for an answer; after one in vain there is none until it answers
 STOP_S: Final = 0.5  #: of simulated time without an answer until the rotors stop, as speed controllers stop them
 SILENT_S: Final = 1.0  #: of simulated time without an answer until that is an event
 STOPPED: Final = (0.0, 0.0, 0.0, 0.0)

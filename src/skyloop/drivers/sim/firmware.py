@@ -16,6 +16,7 @@ from skyloop.autopilots.coupling import CoupledFirmware
 from skyloop.autopilots.kinds import AutopilotKind
 from skyloop.autopilots.program import FirmwareEvent, FirmwareEventKind
 from skyloop.autopilots.registry import make_firmware
+from skyloop.clock import nanoseconds
 from skyloop.drivers.base import Driver, ExternalPose, Sink
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.sim.telemetry import native_of as truth_of
@@ -55,6 +56,9 @@ _SEVERITIES: Final = {
 }
 _KEPT_REPORTS: Final = 64
 _POSE_STD_M: Final = 0.001
+#: The state that firmware reports is no older: it comes over loopback. Where the simulation is slower than real time, the
+#: firmware's clock is too, and its driver, which takes it for a good one, would say otherwise.
+_OLDEST_NS: Final = nanoseconds(0.05)
 _LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
 
 
@@ -198,8 +202,11 @@ class FirmwareFlight:
         reports = tuple(self._reports)
         if not reports:
             return feedback
-        native = truth_of(truth_at(reports, feedback.captured_ns), self._options)
-        return msgspec.structs.replace(feedback, native={**(feedback.native or {}), **native})
+        captured_ns = max(feedback.captured_ns, reports[-1].captured_ns - _OLDEST_NS)
+        native = truth_of(truth_at(reports, captured_ns), self._options)
+        return msgspec.structs.replace(
+            feedback, captured_ns=captured_ns, native={**(feedback.native or {}), **native}
+        )
 
 
 class _InnerSink:
