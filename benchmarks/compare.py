@@ -116,11 +116,12 @@ def _sim(now: Path, before: Path) -> Iterator[Change]:
     new, old = (
         read_json(folder / "sim.json", SimResults, "the results of bench sim", MAX_RESULTS) for folder in (now, before)
     )
-    steps = {(row.world, row.drones): row.step.median_us for row in old.physics}
+    steps = {(row.world, row.drones, row.model): row.step.median_us for row in old.physics}
     for step in new.physics:
-        if (step.world, step.drones) in steps:
-            what = f"simulator, {step.drones} drones in {step.world}: a step"
-            yield Change(what, "µs", steps[step.world, step.drones], step.step.median_us)
+        before_us = steps.get((step.world, step.drones, step.model))
+        if before_us is not None:
+            what = f"simulator, {step.drones} × {step.model} in {step.world}: a step"
+            yield Change(what, "µs", before_us, step.step.median_us)
     pictures = {(row.cameras, row.width): 1e6 / row.frames_per_s for row in old.drawing}
     for row in new.drawing:
         if (row.cameras, row.width) in pictures:

@@ -31,8 +31,16 @@ def assert_plausible(spread: Spread) -> None:
 
 def test_physics_is_measured_for_each_fleet(measured: tuple[sim.SimResults, list[float]]) -> None:
     rows = measured[0].physics
-    assert [(row.world, row.drones) for row in rows] == [("empty", 1), ("empty", 10), ("empty", 100), ("gates", 100)]
-    assert [row.target for row in rows] == [100.0, None, 20.0, 20.0]
+    assert [(row.world, row.drones, row.model, row.firmware) for row in rows] == [
+        ("empty", 1, "quadrotor", False),
+        ("empty", 10, "quadrotor", False),
+        ("empty", 100, "quadrotor", False),
+        ("gates", 100, "quadrotor", False),
+        ("empty", 1, "racer", True),
+        ("street", 1, "racer", True),
+        ("empty", 100, "crazyflie", False),
+    ]
+    assert [row.target for row in rows] == [100.0, None, 20.0, 20.0, 1000 / 60, 1000 / 60, 1.0]
     for row in rows:
         assert_plausible(row.step)
         # Half of the batches took the median or longer, so all together took at least half of that each.
@@ -75,9 +83,9 @@ def test_opencv_gets_its_threads_back() -> None:
 
 def test_tables_name_the_targets(measured: tuple[sim.SimResults, list[float]]) -> None:
     physics, drawing = physics_table(measured[0]), drawing_table(measured[0])
-    assert list(physics.columns[4].cells) == ["≥ 100 ×", "", "≥ 20 ×", "≥ 20 ×"]
+    assert list(physics.columns[5].cells) == [*("≥ 100 ×", "", "≥ 20 ×", "≥ 20 ×", "≥ 16.7 ×", "≥ 16.7 ×", "≥ 1 ×")]
     assert [cell for cell in drawing.columns[4].cells if cell] == ["≥ 312", "≥ 91", "≥ 250"]
-    assert physics.row_count == 4
+    assert physics.row_count == 7
     assert drawing.row_count == 7
 
 

@@ -31,3 +31,7 @@ class TestSimThatTakesAttitudesOnly(SimSuite):
 
 class TestSimThatKnowsItsPlace(SimSuite):
     uri = "sim://?seed=4&speed=10&rate=100&cameras=bottom&native=takeoff,land,velocity"
+
+
+class TestSimWithRotors(SimSuite):
+    uri = "sim://?world=empty&seed=4&speed=4&rate=100&cameras=bottom&vehicle=iris"

@@ -15,7 +15,7 @@ pytest.importorskip("gymnasium", reason="needs Gymnasium: pip install 'skyloop[g
 import gymnasium
 from gymnasium.utils.env_checker import check_env
 
-from skyloop.errors import UsageError
+from skyloop.errors import UnknownNameError, UsageError
 from skyloop.gym import (
     FollowEnv,
     FollowVectorEnv,
@@ -247,3 +247,15 @@ def test_a_short_run_learns() -> None:
     learn = runpy.run_path(str(EXAMPLE))["learn"]
     curve = learn(8, seconds=3.0)
     assert curve[-1] > curve[0] + 1.0
+
+
+def test_a_rotor_level_vehicle_reaches_too() -> None:
+    env = ReachEnv(vehicle="crazyflie", gusts_m_s=0.0)
+    seen, _ = env.reset(seed=3)
+    for _ in range(150):
+        ahead = np.clip(np.asarray(seen)[:3], -1.0, 1.0)
+        seen, _, ended, _, told = env.step(np.array([*ahead, 0.0], np.float32))
+        assert not ended
+    assert told["distance_m"] < 0.3
+    with pytest.raises(UnknownNameError, match="crazyfly"):
+        ReachEnv(vehicle="crazyfly")

@@ -55,6 +55,14 @@ def test_capture_is_on_the_proxys_clock_and_receiving_on_ours() -> None:
     assert layout.decode(message.data, Feedback).captured_ns == 7_000
 
 
+def test_logs_are_published_in_the_order_in_which_they_came_whatever_time_they_name() -> None:
+    of = translator()
+    later, sooner = LogEntry("me", "later", 9_000, text="a"), LogEntry("me", "sooner", 6_000, text="b")
+    found = messages(of, later) + messages(of, sooner)
+    assert [message.publish_ns for message in found] == [message.log_ns for message in found]
+    assert [layout.decode(found[number].data, LogEntry).at_ns for number in (0, 2)] == [9_000, 6_000]
+
+
 def test_numbers_beyond_32_bits_begin_anew() -> None:
     (message,) = messages(translator(), Feedback(captured_ns=1, seq=2**32 + 5))
     assert message.sequence == 5

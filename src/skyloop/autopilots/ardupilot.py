@@ -37,6 +37,12 @@ PARAMETERS: Final[dict[str, float]] = {
     "FRAME_TYPE": 1,  # as an X
     "MOT_PWM_MIN": LEAST_US,
     "MOT_PWM_MAX": LEAST_US + SPAN_US,
+    "MOT_SPIN_ARM": 0.02,
+    "MOT_SPIN_MIN": 0.03,
+    "MOT_SPIN_MAX": 1.0,
+    "MOT_THST_EXPO": 0.78,  # thrust is the square of a speed that begins at an eighth of the full one
+    "MOT_THST_HOVER": 0.6,
+    "ATC_ACCEL_Y_MAX": 4000,  # its rotors turn an Iris slowly [0.01°/s²]: more would take their lift
     "FS_THR_ENABLE": 0,  # there is no remote control
     "RC1_MIN": 1000,  # values other than its defaults: the remote control counts as calibrated
     "RC1_MAX": 2000,

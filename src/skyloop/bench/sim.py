@@ -17,13 +17,37 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.messages import Takeoff, Velocity
 from skyloop.sim import STEP_S, Simulation, load_world
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
+from skyloop.sim.firmware import Readings
 from skyloop.sim.render import PlanarRenderer, Scene, SceneState, SensorEffects, use_one_core
 from skyloop.sim.render.compiled import COMPILER
 from skyloop.sim.render.opencv import cv2
+from skyloop.sim.vehicles import VEHICLES
 
 DRAWING_WORLD = "room"  #: furnished, with markers and a moving board
-#: Worlds and drones in them: free flight in an open hall, and a hundred crowded among gates, some of which they touch.
-FLEETS = (("empty", 1), ("empty", 10), ("empty", 100), ("gates", 100))
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """Drones in a world: their model, and whether firmware flies them, which gets all instruments' readings."""
+
+    world: str
+    drones: int
+    model: str = "quadrotor"
+    firmware: bool = False
+    target: float | None = None  #: simulated seconds a second, which this project holds itself to
+
+
+#: Free flight in an open hall, and a hundred crowded among gates, some of which they touch; then drones that are
+#: modelled down to their rotors in steps of a millisecond, one of them with all its instruments, in 60 µs at most each.
+FLEETS = (
+    Fleet("empty", 1, target=100.0),
+    Fleet("empty", 10),
+    Fleet("empty", 100, target=20.0),
+    Fleet("gates", 100, target=20.0),
+    Fleet("empty", 1, "racer", firmware=True, target=1000 / 60),
+    Fleet("street", 1, "racer", firmware=True, target=1000 / 60),
+    Fleet("empty", 100, "crazyflie", target=1.0),
+)
 SIZES = (1.0, 2.0)  #: pictures as wide as the cameras' own, and twice as wide
 CAMERAS_AT_ONCE = 10
 FRAMES_PER_S = 30.0  #: of each camera, by which the drones fly on between pictures
@@ -31,9 +55,8 @@ FRAMES_PER_S = 30.0  #: of each camera, by which the drones fly on between pictu
 BATCH_STEPS = 100
 LEAST_ROUNDS = 3  #: however short the time
 
-#: What this project holds itself to: simulated seconds a second, by the number of drones …
-REAL_TIME_TARGETS = {1: 100.0, 100: 20.0}
-#: … and pictures a second on one core with the extra ``fast``, front and bottom in turn, by the width of the picture, …
+#: What this project holds itself to: pictures a second on one core with the extra ``fast``, front and bottom in turn,
+#: by the width of the picture, …
 FRAMES_TARGETS = {320: 312.0, 640: 91.0}
 #: … and of the cameras at once, 25 a second of each.
 MANY_FRAMES_TARGET = 25.0 * CAMERAS_AT_ONCE
@@ -46,7 +69,7 @@ Progress = Callable[[float], None]
 
 
 class PhysicsRow(msgspec.Struct, frozen=True):
-    """Drones that fly circles, with nothing drawn.
+    """Drones that fly circles, or that firmware flies straight up and down, with nothing drawn.
 
     ``step`` is the time of a step, taken from batches of :data:`BATCH_STEPS`.
     """
@@ -56,6 +79,8 @@ class PhysicsRow(msgspec.Struct, frozen=True):
     step: Spread
     real_time: float  #: simulated seconds a second
     target: float | None
+    model: str = "quadrotor"
+    firmware: bool = False
 
 
 class DrawingRow(msgspec.Struct, frozen=True):
@@ -97,24 +122,23 @@ def measure(seconds: float, progress: Progress = lambda _: None) -> SimResults:
 
     COMPILER.start().join()
     with _one_core():
-        for number, (world, drones) in enumerate(FLEETS):
-            physics.append(measure_physics(world, drones, share_s, part(number)))
+        for number, fleet in enumerate(FLEETS):
+            physics.append(measure_physics(fleet, share_s, part(number)))
         for number, factor in enumerate(SIZES, len(FLEETS)):
             drawing += measure_pair(factor, share_s, part(number))
         drawing.append(measure_many(share_s, part(parts - 1)))
     return SimResults(Machine.here(), physics, drawing)
 
 
-def measure_physics(world: str, drones: int, seconds: float, progress: Progress) -> PhysicsRow:
+def measure_physics(fleet: Fleet, seconds: float, progress: Progress) -> PhysicsRow:
     """Step a world full of flying drones.
 
     Args:
-        world: The world's name.
-        drones: How many.
+        fleet: The drones.
         seconds: How long [s].
         progress: Called with the share that is done, 0 to 1.
     """
-    simulation = _circling(world, drones)
+    simulation = _flown_by_firmware(fleet) if fleet.firmware else _circling(fleet.world, fleet.drones, fleet.model)
     batches: list[int] = []
     for _ in rounds(seconds, progress):
         begin = monotonic_ns()
@@ -122,7 +146,8 @@ def measure_physics(world: str, drones: int, seconds: float, progress: Progress)
         batches.append(monotonic_ns() - begin)
     step = spread([ns / BATCH_STEPS for ns in batches])
     simulated_s = len(batches) * BATCH_STEPS * STEP_S
-    return PhysicsRow(world, drones, step, simulated_s / (sum(batches) * 1e-9), REAL_TIME_TARGETS.get(drones))
+    real_time = simulated_s / (sum(batches) * 1e-9)
+    return PhysicsRow(fleet.world, fleet.drones, step, real_time, fleet.target, fleet.model, fleet.firmware)
 
 
 def measure_pair(factor: float, seconds: float, progress: Progress) -> list[DrawingRow]:
@@ -208,9 +233,25 @@ class Flight:
         return monotonic_ns() - begin
 
 
-def _circling(world: str, drones: int) -> Simulation:
+class _Hops:
+    """Firmware that lets a drone jump: it reads all, and computes nothing."""
+
+    def exchange(self, readings: Readings) -> tuple[float, ...]:
+        """Return full thrust near the ground, and none above."""
+        thrust = 0.6 if (readings.range_m or 0.0) < 0.5 else 0.2
+        return (thrust,) * 4
+
+
+def _flown_by_firmware(fleet: Fleet) -> Simulation:
+    simulation = Simulation(load_world(fleet.world), fleet.drones, seed=1, parameters=VEHICLES[fleet.model])
+    for drone in range(fleet.drones):
+        simulation.fly_by(drone, _Hops())
+    return simulation
+
+
+def _circling(world: str, drones: int, model: str = "quadrotor") -> Simulation:
     """Return a world whose drones have taken off and fly circles."""
-    simulation = Simulation(load_world(world), drones, seed=1)
+    simulation = Simulation(load_world(world), drones, seed=1, parameters=VEHICLES[model])
     for action in (Takeoff(), _CIRCLING):
         for drone in range(drones):
             simulation.command(drone, action)

@@ -229,13 +229,14 @@ def as_rich(found: Sequence[tables.Table], where: str) -> list[Table]:
 
 def physics_table(results: SimResults) -> Table:
     """Return the figures of flying without pictures."""
-    title = "Physics alone, µs a step: median (p99)"
+    title = "Physics alone, µs a step of 4 ms: median (p99)"
     shown = Table(
-        "drones", "world", "a step", "real time", "target", title=title, caption=str(results.machine), box=None
+        "drones", "model", "world", "a step", "real time", "target", title=title, caption=str(results.machine), box=None
     )
     for row in results.physics:
-        target = "" if row.target is None else f"≥ {row.target:g} ×"
-        shown.add_row(str(row.drones), row.world, _spread(row.step), f"{row.real_time:.0f} ×", target)
+        target = "" if row.target is None else f"≥ {row.target:.3g} ×"
+        model = f"{row.model}, by firmware" if row.firmware else row.model
+        shown.add_row(str(row.drones), model, row.world, _spread(row.step), f"{row.real_time:.0f} ×", target)
     return shown
 
 

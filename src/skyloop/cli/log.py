@@ -37,6 +37,7 @@ class Form(StrEnum):
     PARQUET = "parquet"
     NPZ = "npz"
     MP4 = "mp4"
+    LEROBOT = "lerobot"
 
 
 class Which(StrEnum):
@@ -120,42 +121,61 @@ def report(
 
 @log.command(short_help="Samples and frames for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
 def export(
-    file: File,
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE...", help="A recording; several for lerobot", autocompletion=recordings),
+    ],
     to: Annotated[Form, typer.Option("--to", help="csv and parquet: a file for each channel")] = Form.CSV,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="PATH", help="A folder for csv and parquet, else a file"),
+        typer.Option("-o", "--output", metavar="PATH", help="A folder for csv, parquet and lerobot, else a file"),
     ] = None,
     drone: DroneName = None,
     channel: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Only this one, e.g. feedback; may be repeated")
     ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="NAME", help="For mp4 (default: the first)")] = None,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="For mp4 (default: the first); for lerobot, may be repeated (default: all)"),
+    ] = None,
     burn_time: Annotated[bool, typer.Option("--burn-time", help="For mp4: write the time into the frames")] = False,
     encode: Annotated[
         bool, typer.Option("--encode", help="For mp4: encode H.264 too, which is else copied as it was recorded")
     ] = False,
+    fps: Annotated[float | None, typer.Option(help="For lerobot: rows a second (default: 10)")] = None,
+    task: Annotated[str | None, typer.Option(help="For lerobot: what was to be done, in words")] = None,
 ) -> None:
-    """Write the samples as tables, or a camera's frames as a video with their own times.
+    """Write the samples as tables, a camera's frames as a video with their own times, or flights to learn from.
 
-    H.264 is copied as it was recorded, in seconds, unless the time is written into the frames.
+    H.264 is copied as it was recorded, in seconds, unless the time is written into the frames. To lerobot, flights
+    become episodes of a LeRobotDataset: pictures, the state at their capture, and what was commanded.
     """
     from skyloop.cli import log_tables
     from skyloop.recording.review import export as ways
     from skyloop.recording.review.video import export_mp4
 
+    if to is Form.LEROBOT:
+        _refuse({"--channel": bool(channel), "--burn-time": burn_time, "--encode": encode}, to)
+        _export_lerobot(files, output, drone, camera, fps, task)
+        return
+    _refuse({"--fps": fps is not None, "--task": task is not None}, to)
+    if len(files) > 1:
+        raise UsageError(f"{len(files)} recordings were given: {to.value} is made of one at a time")
+    (file,) = files
     recording = _open(file)
     name = recording.drone(drone).name
     if to is Form.MP4:
         _refuse({"--channel": bool(channel)}, to)
-        chosen = camera or _first_camera(recording, name)
+        if camera and len(camera) > 1:
+            raise UsageError(f"{len(camera)} cameras were given: mp4 is made of one at a time")
+        chosen = camera[0] if camera else _first_camera(recording, name)
         target = output or file.with_name(f"{file.stem}-{chosen}.mp4")
         with _progress(f"exporting {chosen}") as progress:
             found = export_mp4(recording, name, chosen, target, burn_time=burn_time, encode=encode, progress=progress)
         for line in log_tables.exported(found, chosen):
             _print(line)
         return
-    _refuse({"--camera": camera is not None, "--burn-time": burn_time, "--encode": encode}, to)
+    _refuse({"--camera": bool(camera), "--burn-time": burn_time, "--encode": encode}, to)
     with _progress("reading") as progress:
         tables = ways.read(recording, name, _channels(channel), progress)
     if to is Form.NPZ:
@@ -236,6 +256,35 @@ def recover(
         typer.echo(f"{count:8} {topic}")
     lost = f"; at most {saved.lost} bytes are lost" if saved.lost else ""
     _print(f"{target}: {sum(saved.messages.values())} messages, {saved.seconds:.1f} s saved{lost}")
+
+
+def _export_lerobot(
+    files: list[Path],
+    output: Path | None,
+    drone: str | None,
+    cameras: list[str] | None,
+    fps: float | None,
+    task: str | None,
+) -> None:
+    from skyloop.recording.review.lerobot import export_lerobot
+
+    recordings = [_open(file) for file in files]
+    target = output or files[0].with_name(f"{files[0].stem}-lerobot")
+    with _progress("exporting") as progress:
+        found = export_lerobot(
+            recordings,
+            target,
+            drone=drone,
+            cameras=cameras,
+            fps=10.0 if fps is None else fps,
+            task=task or "",
+            doing=lambda _, share: progress(share),
+        )
+    repeated = f"; {found.repeated} pictures were damaged, those before them stand there" if found.repeated else ""
+    _print(
+        f"{target}: {found.episodes} episodes, {found.rows} rows: {', '.join(found.form.state)}; "
+        f"{', '.join(found.form.cameras) or 'no camera'}; action: {', '.join(found.form.action)}{repeated}"
+    )
 
 
 # Inside --------------------------------------------------------------------------------------------------------

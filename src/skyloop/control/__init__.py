@@ -13,6 +13,7 @@ from skyloop.control.gates import FIVE_GATES, FlyThroughGates, GateKind
 from skyloop.control.heading import AlongPath, FixedYaw, LookAt, YawMode
 from skyloop.control.image_servo import ImageServo
 from skyloop.control.landing import LandOnMarker
+from skyloop.control.onnx_policy import OnnxPolicy, PolicyNetwork, PolicyPhase
 from skyloop.control.path import Circle, FunctionPath, Lemniscate, Path, Polyline, Spline
 from skyloop.control.path_following import FollowPath, TrackingError, Waypoints
 from skyloop.control.path_law import PathLaw, PathSettings
@@ -48,6 +49,7 @@ __all__ = [
     "Lemniscate",
     "Look",
     "LookAt",
+    "OnnxPolicy",
     "OrbitMarker",
     "OrbitPlace",
     "Path",
@@ -55,6 +57,8 @@ __all__ = [
     "PathSettings",
     "Photo",
     "Polyline",
+    "PolicyNetwork",
+    "PolicyPhase",
     "PositionSource",
     "Route",
     "RouteCheck",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.messages import Takeoff, Velocity
-from skyloop.sim import STEP_S, Simulation, Wind, World, parse_world
+from skyloop.sim import STEP_S, Simulation, VehicleParameters, Wind, World, parse_world
 
 Floats = NDArray[np.float64]
 
@@ -23,10 +23,12 @@ _UP_S: Final = 15.0  #: within which every drone has taken off
 class Arena:
     """``drones`` of them, hovering. Deterministic: the same seed and actions give the same numbers."""
 
-    def __init__(self, drones: int, seed: int, *, gusts_m_s: float, period_s: float) -> None:
+    def __init__(
+        self, drones: int, seed: int, *, gusts_m_s: float, period_s: float, vehicle: VehicleParameters
+    ) -> None:
         wind = Wind(gust_m_s=gusts_m_s) if gusts_m_s > 0.0 else None
         self.world = _hall(drones)
-        self.simulation = Simulation(self.world, drones, seed=seed, wind=wind)
+        self.simulation = Simulation(self.world, drones, seed=seed, wind=wind, parameters=vehicle)
         self.count = drones
         self.centres = np.array([spawn.position_m[:2] for spawn in self.world.spawns])
         self._steps = max(1, round(period_s / STEP_S))

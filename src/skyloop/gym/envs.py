@@ -88,7 +88,8 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
     cosine of the turn to the wanted heading. With ``"pixels"``: what its camera ahead sees, RGB, shape (size_px,
     size_px, 3), uint8, the goal as a red ring. With ``"both"``: a dict of ``pixels`` and ``motion``, which is velocity,
     roll and pitch. ``info`` has ``is_success`` and ``distance_m``, of reset too. Leaving the cell of 7 m costs 5 and
-    ends the episode. ``render_mode="rgb_array"``: a picture of the drone and its goal.
+    ends the episode. ``vehicle`` is one of ``skyloop.sim.vehicles.VEHICLES``. ``render_mode="rgb_array"``: a picture of
+    the drone and its goal.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / PERIOD_S)}  # noqa: RUF012
@@ -102,12 +103,13 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         gusts_m_s: float = 0.3,
         observe: Observe = "state",
         size_px: int = ONBOARD_PX,
+        vehicle: str = "quadrotor",
         render_mode: str | None = None,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UsageError(f'render_mode is {render_mode!r} and must be "rgb_array" or None')
         self.render_mode = render_mode
-        self._task = self.task(1, seconds, gusts_m_s)
+        self._task = self.task(1, seconds, gusts_m_s, vehicle)
         self._observer = _Observer(self._task, observe, size_px)
         self.observation_space = self._observer.space
         self._picture: Picture | None = None
@@ -154,11 +156,12 @@ class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
         gusts_m_s: float = 0.3,
         observe: Observe = "state",
         size_px: int = ONBOARD_PX,
+        vehicle: str = "quadrotor",
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or not 1 <= num_envs <= 1000:
             raise UsageError(f"num_envs is {num_envs!r} and must be a whole number from 1 to 1000")
         self.num_envs = num_envs
-        self._task = self.task(num_envs, seconds, gusts_m_s)
+        self._task = self.task(num_envs, seconds, gusts_m_s, vehicle)
         self._observer = _Observer(self._task, observe, size_px)
         self.single_action_space, self.single_observation_space = ACTIONS, self._observer.space
         self.action_space = batch_space(ACTIONS, num_envs)

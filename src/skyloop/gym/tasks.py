@@ -9,8 +9,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from skyloop.errors import UsageError
+from skyloop.errors import UnknownNameError, UsageError
 from skyloop.gym.arena import Arena, outside
+from skyloop.sim.vehicles import VEHICLES
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -45,12 +46,15 @@ MOTIONS: Final = spaces.Box(-_HIGHEST[MOTION], _HIGHEST[MOTION], dtype=np.float3
 class Reaching:
     """Fly to a place and stay there, at a heading. Base of the other tasks."""
 
-    def __init__(self, drones: int, seconds: float, gusts_m_s: float) -> None:
+    def __init__(self, drones: int, seconds: float, gusts_m_s: float, vehicle: str = "quadrotor") -> None:
         if not (1.0 <= seconds <= 600.0):
             raise UsageError(f"seconds is {seconds!r} and must be from 1 to 600")
         if not (0.0 <= gusts_m_s <= 5.0):
             raise UsageError(f"gusts_m_s is {gusts_m_s!r} and must be from 0 to 5")
+        if vehicle not in VEHICLES:
+            raise UnknownNameError("simulated vehicle", vehicle, VEHICLES)
         self.drones = drones
+        self.vehicle = vehicle
         self.steps = round(seconds / PERIOD_S)
         self.gusts_m_s = gusts_m_s
         self.goals = np.zeros((drones, 3))
@@ -73,7 +77,9 @@ class Reaching:
 
     def begin(self, seed: int) -> None:
         """A new world from this seed, all drones hovering."""
-        self._arena = Arena(self.drones, seed, gusts_m_s=self.gusts_m_s, period_s=PERIOD_S)
+        self._arena = Arena(
+            self.drones, seed, gusts_m_s=self.gusts_m_s, period_s=PERIOD_S, vehicle=VEHICLES[self.vehicle]
+        )
 
     def restart(self, which: Bools, rng: np.random.Generator) -> None:
         """Another start and another goal for these drones."""
@@ -155,8 +161,8 @@ class Hovering(Reaching):
 class Following(Reaching):
     """Follow a target that walks about: at a distance, with the target in the middle of the picture."""
 
-    def __init__(self, drones: int, seconds: float, gusts_m_s: float) -> None:
-        super().__init__(drones, seconds, gusts_m_s)
+    def __init__(self, drones: int, seconds: float, gusts_m_s: float, vehicle: str = "quadrotor") -> None:
+        super().__init__(drones, seconds, gusts_m_s, vehicle)
         self._phases = np.zeros((drones, 3))
         self._rates = np.zeros((drones, 3))
 
@@ -199,8 +205,8 @@ class Following(Reaching):
 class Racing(Reaching):
     """Fly through gates on a circle, in order; done when all are passed."""
 
-    def __init__(self, drones: int, seconds: float, gusts_m_s: float) -> None:
-        super().__init__(drones, seconds, gusts_m_s)
+    def __init__(self, drones: int, seconds: float, gusts_m_s: float, vehicle: str = "quadrotor") -> None:
+        super().__init__(drones, seconds, gusts_m_s, vehicle)
         self.passed = np.zeros(drones, dtype=np.int64)
         self._gates = np.zeros((drones, GATES, 3))
         self._normals = np.zeros((drones, GATES, 3))

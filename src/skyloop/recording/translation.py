@@ -156,7 +156,7 @@ class Translator:
         at_ns = self._unix(event.at_ns)
         yield self._own(Channel.EVENTS, event, log_ns, at_ns, event.seq)
         line = foxglove.log(self._drone, at_ns, event.severity, event.text, event.kind.value)
-        yield Message(layout.LOG, foxglove.Log, line, log_ns, at_ns)
+        yield Message(layout.LOG, foxglove.Log, line, log_ns, log_ns)
 
     def _parameter(self, parameter: Parameter, log_ns: int) -> Iterator[Message]:
         self._parameters[parameter.name] = parameter
@@ -172,14 +172,16 @@ class Translator:
 
     def _log(self, entry: LogEntry, log_ns: int) -> Iterator[Message]:
         at_ns = self._unix(entry.at_ns)
-        yield self._own(Channel.LOGS, entry, log_ns, at_ns)
+        # Applications choose an entry's own time, which stands in it. As times of publication these would run
+        # backwards, and viewers sort the whole topic anew for it.
+        yield self._own(Channel.LOGS, entry, log_ns, log_ns)
         if entry.name == MOCAP and entry.values is not None and len(entry.values) >= 7:
             pose = foxglove.pose_in_world(at_ns, foxglove.pose_of(entry.values))
             yield Message(layout.mocap_topic(self._drone), foxglove.PoseInFrame, pose, log_ns, at_ns)
         if entry.text is not None:
             text = f"{entry.name}: {entry.text}" if entry.name else entry.text
             line = foxglove.log(self._drone, at_ns, entry.severity, text, entry.source)
-            yield Message(layout.LOG, foxglove.Log, line, log_ns, at_ns)
+            yield Message(layout.LOG, foxglove.Log, line, log_ns, log_ns)
 
     def _result(self, result: ProcessorResult, log_ns: int) -> Iterator[Message]:
         try:

@@ -4,6 +4,7 @@ Nothing here knows of proxies or networks, and nothing reads a wall clock but :c
 """
 
 from skyloop.sim.dynamics import STEP_S
+from skyloop.sim.firmware import Firmware, Readings
 from skyloop.sim.pacing import Pacer
 from skyloop.sim.parameters import LIMIT_RANGES, Limits, VehicleParameters
 from skyloop.sim.reports import Occurrence, OccurrenceKind, VehicleFeedback, VehicleTruth
@@ -14,10 +15,12 @@ from skyloop.sim.world_file import load_world, parse_world, shipped_worlds
 __all__ = [
     "LIMIT_RANGES",
     "STEP_S",
+    "Firmware",
     "Limits",
     "Occurrence",
     "OccurrenceKind",
     "Pacer",
+    "Readings",
     "Simulation",
     "TargetState",
     "VehicleFeedback",

@@ -28,17 +28,17 @@ class InstrumentParameters:
         UsageError: A value is not finite or negative, or zero where it has to be more.
     """
 
-    gyro_noise_rad_s: float = 0.0016
+    gyro_noise_rad_s: float = 0.002
     gyro_bias_rad_s: float = 0.005
-    accelerometer_noise_m_s2: float = 0.05
+    accelerometer_noise_m_s2: float = 0.09
     accelerometer_bias_m_s2: float = 0.05
-    magnetometer_noise_gauss: float = 0.003
+    magnetometer_noise_gauss: float = 0.002
     magnetometer_bias_gauss: float = 0.005
-    barometer_noise_pa: float = 1.5
-    barometer_bias_pa: float = 6.0
-    gps_noise_m: float = 0.08
-    gps_bias_m: float = 0.4
-    gps_velocity_noise_m_s: float = 0.06
+    barometer_noise_pa: float = 1.2
+    barometer_bias_pa: float = 2.0
+    gps_noise_m: float = 0.05
+    gps_bias_m: float = 0.15
+    gps_velocity_noise_m_s: float = 0.05
     range_noise_m: float = 0.01
     flow_noise_rad_s: float = 0.05
     bias_time_constant_s: float = 300.0

@@ -4,17 +4,19 @@ Parameters that are not given have their defaults. ``docs/rotors.md`` repeats th
 
 Sources: [A] Agilicious, P. Foehn et al., "Agilicious: Open-source and open-hardware agile quadrotor for vision-based
 flight", Science Robotics 7(67), 2022: thrust and torque fit, rotor speeds and lag in its library's ``Quadrotor``. [L]
-The simulator of "Learning on the Fly", Robotics and Perception Group, University of Zurich, 2025: its default quadrotor
-is [A]'s racer. [N] L. Bauersfeld et al., "NeuroBEM: Hybrid Aerodynamic Quadrotor Model", RSS 2021: the same racer's
-5.1-inch propellers. [R] F. Furrer, M. Burri, M. Achtelik, R. Siegwart, "RotorS - A Modular Gazebo MAV Simulator
-Framework", 2016: ``iris.xacro``. [F] J. Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", ETH
-Zurich, 2015. [E] J. Eschmann, D. Albani, G. Loianno, "Data-Driven System Identification of Quadrotors Subject to Motor
-Delays", 2024, as RotorPy 3.0.0 has it. [D] drone-models 0.1.0, Learning Systems and Robotics Lab, 2026: attitude
-responses of three Crazyflies, identified from flights. [B] Bitcraze, Crazyflie 2.1 data sheet. [I] 3D Robotics, Iris
-data sheet.
+The simulator of "Learning on the Fly", Robotics and Perception Group, University of Zurich, 2025: its default
+quadrotor, and for drag a comment in its example of a vehicle. [N] L. Bauersfeld et al., "NeuroBEM: Hybrid Aerodynamic
+Quadrotor Model", RSS 2021: the same racer's 5.1-inch propellers. [R] F. Furrer, M. Burri, M. Achtelik, R. Siegwart,
+"RotorS - A Modular Gazebo MAV Simulator Framework", 2016: ``iris.xacro``. [F] J. Förster, "System Identification of
+the Crazyflie 2.0 Nano Quadrocopter", ETH Zurich, 2015. [E] J. Eschmann, D. Albani, G. Loianno, "Data-Driven System
+Identification of Quadrotors Subject to Motor Delays", 2024, as RotorPy 3.0.0 has it. [D] drone-models 0.1.0, Learning
+Systems and Robotics Lab, 2026: attitude responses of three Crazyflies, identified from flights. [B] Bitcraze,
+Crazyflie 2.1 data sheet.
 """
 
 from __future__ import annotations
+
+from typing import Final
 
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.rotor_parameters import RotorParameters
@@ -77,7 +79,7 @@ IRIS = VehicleParameters(
     attitude_damping=0.8,
     most_angular_acceleration_rad_s2=30.0,  # estimate
     yaw_time_constant_s=0.2,  # estimate
-    battery_charge_c=18360.0,  # 5100 mAh, 3 cells [I]
+    battery_charge_c=18360.0,  # 5100 mAh, 3 cells, estimate
     battery_full_v=12.6,
     battery_empty_v=9.9,
     battery_resistance_ohm=0.015,  # estimate
@@ -93,7 +95,7 @@ IRIS = VehicleParameters(
         rotor_drag_kg=8.06428e-5,  # [R]
         rotor_inflow_kg=8.06428e-5,  # estimate: as across
         body_drag_kg_m=(0.03, 0.03, 0.06),  # 500 and 1000 cm² with a drag coefficient of 1, estimate
-        efficiency=0.8,  # estimate: 20 minutes in the air [I] would be 170 W
+        efficiency=0.8,  # estimate: some 20 minutes in the air
     ),
 )
 
@@ -130,3 +132,12 @@ CRAZYFLIE = VehicleParameters(
         efficiency=0.5,  # estimate: 7 minutes in the air [B]
     ),
 )
+
+#: By the names that addresses, environments and command lines use.
+VEHICLES: Final = {
+    "quadrotor": VehicleParameters(),
+    "ardrone": AR_DRONE,
+    "racer": RACER,
+    "iris": IRIS,
+    "crazyflie": CRAZYFLIE,
+}

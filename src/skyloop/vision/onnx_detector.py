@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.errors import FileFormatError, MissingExtraError, UsageError
+from skyloop.errors import FileFormatError, UsageError
 from skyloop.vision.detection import Detection, suppress
 from skyloop.vision.detector_layouts import (
     RAW_BGR,
@@ -24,6 +24,7 @@ from skyloop.vision.detector_layouts import (
     layout_named,
     tell_layout,
 )
+from skyloop.vision.onnx import load_network, reason
 from skyloop.vision.opencv import opencv
 from skyloop.vision.planar import pixels_of
 from skyloop.vision.tracking import Image
@@ -88,7 +89,7 @@ class OnnxDetector:
         if not self._path.is_file():
             raise UsageError(f"there is no file {path}: give the ONNX file of a detector")
         self._cv = opencv("detecting")
-        self._errors, self._session = _load(self._path, threads)
+        self._errors, self._session = load_network(self._path, threads, "detecting with an ONNX file")
         metadata = dict(self._session.get_modelmeta().custom_metadata_map)
         task = metadata.get("task", "detect")
         if task != "detect":
@@ -155,7 +156,7 @@ class OnnxDetector:
         try:
             results = self._session.run(None, feed)
         except self._errors as error:
-            raise FileFormatError(f"{self._path} can't be run on {_shape(tensor.shape)}: {_reason(error)}") from error
+            raise FileFormatError(f"{self._path} can't be run on {_shape(tensor.shape)}: {reason(error)}") from error
         named = dict(zip((each.name for each in self._session.get_outputs()), results, strict=True))
         if not all(isinstance(each, np.ndarray) for each in results):
             raise FileFormatError(f"{self._path} returns sequences, and must return arrays")
@@ -218,23 +219,6 @@ class OnnxDetector:
             raise FileFormatError(f"it has {classes} classes, and {len(self.names)} names were given for them")
 
 
-def _load(path: Path, threads: int) -> tuple[tuple[type[Exception], ...], Any]:
-    try:
-        import onnxruntime
-        from onnxruntime.capi import onnxruntime_pybind11_state as state
-    except ImportError as error:
-        raise MissingExtraError("detecting with an ONNX file", "detect", cause=str(error)) from error
-    own = [each for each in vars(state).values() if isinstance(each, type) and issubclass(each, Exception)]
-    errors: tuple[type[Exception], ...] = (*own, RuntimeError, ValueError, TypeError)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 4  # what is wrong is in the exception
-    try:
-        return errors, onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except errors as error:
-        raise FileFormatError(f"{path} can't be loaded as an ONNX file: {_reason(error)}") from error
-
-
 def _names(text: str | None, path: Path) -> dict[int, str]:
     """Read the names in a file's metadata: a dict or list in Python's notation, as Ultralytics writes it."""
     if text is None:
@@ -284,7 +268,3 @@ def _check_size(size: Any) -> None:
 
 def _shape(shape: Sequence[Any]) -> str:
     return "×".join(str(each) for each in shape)
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]

@@ -26,19 +26,12 @@ from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
-from skyloop.sim.options import EVERY_ACTION, STANDARD_VEHICLE, SimOptions
-from skyloop.sim.vehicles import AR_DRONE, CRAZYFLIE, IRIS, RACER
+from skyloop.sim.options import EVERY_ACTION, SimOptions
+from skyloop.sim.vehicles import VEHICLES
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
 RENDERERS: Final = ("planar", "mujoco")
-VEHICLES: Final = {
-    "quadrotor": STANDARD_VEHICLE,
-    "ardrone": AR_DRONE,
-    "racer": RACER,
-    "iris": IRIS,
-    "crazyflie": CRAZYFLIE,
-}
 ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
 KNOWN: Final = {
     *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),

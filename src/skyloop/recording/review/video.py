@@ -123,7 +123,7 @@ def _images(pictures: Iterator[Picture]) -> Iterator[tuple[int, NDArray[np.uint8
     """Decode frames: yield the time of capture [ns], and the image or None for one that can't be decoded."""
     for picture in pictures:
         try:
-            image = _even(picture.pixels())
+            image = even(picture.pixels())
         except FileFormatError:
             image = None  # a damaged frame is left out; the others keep their times
         yield picture.header.captured_ns, image
@@ -188,8 +188,8 @@ def _stream(av: Any, container: Any, image: NDArray[np.uint8]) -> Any:
     raise MissingExtraError("encoding MP4", "video", cause=f"PyAV has none of {', '.join(_CODECS)}")
 
 
-def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Video codecs want even sizes: an odd last row or column is left out."""
+def even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image without an odd last row or column, as video codecs want it."""
     height, width = image.shape[0] & ~1, image.shape[1] & ~1
     return np.ascontiguousarray(image[:height, :width])
 

@@ -1,0 +1,262 @@
+"""Fly by a policy that was learnt: a network in an ONNX file, from a picture and the state to a set-point."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.control.behaviour import Behaviour
+from skyloop.errors import FileFormatError, UnknownNameError, UsageError
+from skyloop.messages import Attitude, Feedback, Text, Velocity
+from skyloop.messages.annotation import Shape
+from skyloop.messages.rows import ACTIONS, STATE, set_point, state_row
+from skyloop.vision.onnx import load_network, reason
+from skyloop.vision.opencv import opencv
+from skyloop.vision.planar import pixels_of
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone, Frame
+
+STATE_INPUT: Final = "observation.state"
+IMAGE_INPUT: Final = "observation.images."
+OUTPUT: Final = "action"
+STATE_NAMES: Final = "skyloop.state"  #: of a file's metadata: the state's numbers by name, as a JSON list
+ACTION_NAMES: Final = "skyloop.action"  #: and the action's
+_MOST_SIDE: Final = 4096
+_PURPOSE: Final = "flying by an ONNX file"
+
+
+class PolicyPhase(StrEnum):
+    """What a policy is doing."""
+
+    FLYING = "flying"
+    NO_STATE = "the drone does not know all that the policy needs: hovering"
+    NO_ACTION = "the policy's action is not finite: hovering"
+
+
+class PolicyNetwork:
+    """A policy's network. Call it from one thread.
+
+    The file has an input ``observation.images.CAMERA`` of float32 (1, 3, height, width), red, green, blue, 0 to 1, and
+    may have ``observation.state`` of float32 (1, n); its output is ``action`` of (1, m). These are the names and the
+    numbers of ``skyloop log export --to lerobot``. Its metadata names the numbers, as JSON lists in ``skyloop.state``
+    and ``skyloop.action``.
+
+    Args:
+        path: The ONNX file.
+        state: Names of the state's numbers, of :data:`~skyloop.messages.rows.STATE`; None: those of the metadata.
+        action: ``velocity`` or ``attitude``; None: by the metadata.
+        threads: Of the processor for one run, 1 to 64.
+
+    Attributes:
+        camera: The camera whose pictures it was learnt from.
+        size: Width and height of the pictures that it takes [px]; others are scaled.
+        state: Names of the state's numbers.
+        action: ``velocity`` or ``attitude``.
+
+    Raises:
+        MissingExtraError: ONNX Runtime or OpenCV is not installed.
+        UnknownNameError: A name of the state's numbers, or of the action, is not known.
+        UsageError: There is no such file, or an argument is out of its range or contradicts the file.
+        FileFormatError: It is no ONNX file, or its inputs, outputs or metadata are not as above.
+    """
+
+    def __init__(
+        self, path: Path | str, *, state: Sequence[str] | None = None, action: str | None = None, threads: int = 1
+    ) -> None:
+        self._path = Path(path)
+        if not self._path.is_file():
+            raise UsageError(f"there is no file {path}: give the ONNX file of a policy")
+        if isinstance(threads, bool) or not isinstance(threads, int) or not 1 <= threads <= 64:
+            raise UsageError(f"threads is {threads!r} and must be a whole number from 1 to 64")
+        self._cv = opencv(_PURPOSE)
+        self._errors, self._session = load_network(self._path, threads, _PURPOSE)
+        metadata = dict(self._session.get_modelmeta().custom_metadata_map)
+        inputs = {each.name: each for each in self._session.get_inputs()}
+        self._image, self.camera, self.size = self._picture(inputs)
+        self.state = self._state(inputs, state, metadata)
+        self.action = self._action(action, metadata)
+        if [each.name for each in self._session.get_outputs()].count(OUTPUT) != 1:
+            raise FileFormatError(f"{path} must have one output with the name {OUTPUT}")
+        self(np.zeros((self.size[1], self.size[0], 3), np.uint8), [0.0] * len(self.state))
+
+    def __call__(self, image: NDArray[np.uint8], state: Sequence[float]) -> Velocity | Attitude:
+        """Compute the set-point.
+
+        Args:
+            image: BGR, shape (height, width, 3), or grey (height, width), uint8, of any size.
+            state: Numbers by :attr:`state`.
+
+        Returns:
+            The set-point, which may not be finite.
+
+        Raises:
+            FileFormatError: The network can't be run, or its action has another number of values.
+        """
+        if image.ndim == 2:
+            image = self._cv.cvtColor(image, self._cv.COLOR_GRAY2BGR)
+        if (image.shape[1], image.shape[0]) != self.size:
+            image = self._cv.resize(image, self.size, interpolation=self._cv.INTER_AREA)
+        planes = np.stack(self._cv.split(image)[::-1])
+        feed: dict[str, Any] = {self._image: np.divide(planes[None], np.float32(255), dtype=np.float32)}
+        if self.state:
+            feed[STATE_INPUT] = np.array([state], np.float32)
+        try:
+            (row,) = self._session.run([OUTPUT], feed)
+        except self._errors as error:
+            raise FileFormatError(f"{self._path} can't be run: {reason(error)}") from error
+        values = np.asarray(row, np.float64).ravel()
+        try:
+            return set_point(self.action, values.tolist())
+        except UsageError as error:
+            raise FileFormatError(f"{self._path}: {error}") from None
+
+    def _picture(self, inputs: Mapping[str, Any]) -> tuple[str, str, tuple[int, int]]:
+        pictures = [name for name in inputs if name.startswith(IMAGE_INPUT)]
+        others = [name for name in inputs if name not in (*pictures, STATE_INPUT)]
+        if len(pictures) != 1 or others:
+            raise FileFormatError(
+                f"{self._path} has the inputs {', '.join(inputs) or 'none'}, and must have one picture, "
+                f"{IMAGE_INPUT}CAMERA, and may have {STATE_INPUT}"
+            )
+        (name,) = pictures
+        shape = list(inputs[name].shape)
+        sized = len(shape) == 4 and all(isinstance(each, int) and 0 < each <= _MOST_SIDE for each in shape[1:])
+        if not sized or shape[1] != 3 or inputs[name].type != "tensor(float)":
+            raise FileFormatError(
+                f"{self._path} takes {name} as {inputs[name].type} {tuple(shape)}, and must take float32 "
+                f"(1, 3, height, width), each side at most {_MOST_SIDE}"
+            )
+        return name, name.removeprefix(IMAGE_INPUT), (shape[3], shape[2])
+
+    def _state(
+        self, inputs: Mapping[str, Any], given: Sequence[str] | None, metadata: Mapping[str, str]
+    ) -> tuple[str, ...]:
+        if STATE_INPUT not in inputs:
+            if given:
+                raise UsageError(f"{self._path} takes no {STATE_INPUT}: leave state out")
+            return ()
+        names = tuple(given) if given is not None else self._names(STATE_NAMES, metadata)
+        for name in names:
+            if name not in STATE:
+                raise UnknownNameError("number of a drone's state", name, STATE)
+        shape = inputs[STATE_INPUT].shape
+        if len(shape) != 2 or (isinstance(shape[1], int) and shape[1] != len(names)):
+            raise FileFormatError(
+                f"{self._path} takes {STATE_INPUT} as {tuple(shape)}, and not (1, {len(names)}): {', '.join(names)}"
+            )
+        return names
+
+    def _action(self, given: str | None, metadata: Mapping[str, str]) -> str:
+        if given is not None:
+            if given not in ACTIONS:
+                raise UnknownNameError("set-point of a policy", given, ACTIONS)
+            return given
+        names = self._names(ACTION_NAMES, metadata)
+        for kind, own in ACTIONS.items():
+            if names == own:
+                return kind
+        raise FileFormatError(f"{self._path} names the action {', '.join(names)}, and must name that of {_ACTIONS}")
+
+    def _names(self, key: str, metadata: Mapping[str, str]) -> tuple[str, ...]:
+        try:
+            names = json.loads(metadata[key])
+        except (KeyError, ValueError, RecursionError):
+            names = None
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            argument = "state" if key == STATE_NAMES else "action"
+            raise FileFormatError(f"{self._path} has no JSON list of names as {key} in its metadata: give {argument}=")
+        return tuple(names)
+
+
+_ACTIONS: Final = " or ".join(f"{kind} ({', '.join(names)})" for kind, names in ACTIONS.items())
+
+
+class OnnxPolicy(Behaviour):
+    """Flies by a learnt policy: with each frame, its network computes a set-point from the picture and the state.
+
+    Limits, zones and failsafe of the proxy hold as for any application. It hovers, and says so in an event, when frames
+    stop, when the drone does not know a number of the state that the network takes, and when the action is not finite.
+    The vehicle must be airborne when :meth:`run` is called. All callbacks run on the thread that called it.
+    """
+
+    name = "policy"
+    losses = frozenset({PolicyPhase.NO_STATE, PolicyPhase.NO_ACTION})
+
+    def __init__(
+        self,
+        drone: Drone,
+        path: Path | str,
+        *,
+        camera: str | None = None,
+        state: Sequence[str] | None = None,
+        action: str | None = None,
+        threads: int = 1,
+    ) -> None:
+        """Load the network.
+
+        Args:
+            drone: The drone to fly.
+            path: The ONNX file; see :class:`PolicyNetwork`.
+            camera: Whose frames to use; None is the camera that the file names.
+            state: Names of the state's numbers, where the file does not tell.
+            action: ``velocity`` or ``attitude``, where the file does not tell.
+            threads: Of the processor for one picture.
+
+        Raises:
+            MissingExtraError: ONNX Runtime or OpenCV is not installed.
+            UsageError: There is no such file, or an argument is out of its range.
+            UnknownNameError: The vehicle has no such camera, or a name is not known.
+            FileFormatError: The file is not a policy's.
+        """
+        self.network = PolicyNetwork(path, state=state, action=action, threads=threads)
+        self._newest = _Newest()
+        super().__init__(drone, self._newest, self.network.camera if camera is None else camera)
+        self._phase = PolicyPhase.FLYING
+
+    @property
+    def phase(self) -> PolicyPhase:
+        """Whether it flies, or why not."""
+        return self._phase
+
+    def look(self, frame: Frame) -> list[Shape]:
+        """Compute the set-point of a frame, and write it into the frame."""
+        believed = frame.feedback
+        row = None if believed is None else state_row(believed, self.network.state)
+        if row is None:
+            self._phase, self._newest.wanted = PolicyPhase.NO_STATE, Velocity()
+            return [Text(self._phase, (8.0, 16.0))]
+        wanted = self.network(pixels_of(frame), row)
+        self._phase = PolicyPhase.FLYING if wanted.finite else PolicyPhase.NO_ACTION
+        self._newest.wanted = wanted if wanted.finite else Velocity()
+        return [self._written(self._newest.wanted)]
+
+    def steer(self, wanted: Velocity | Attitude) -> None:
+        """Send the set-point; hover while there is none."""
+        if self._phase is PolicyPhase.FLYING:
+            super().steer(wanted)
+        else:
+            self.drone.hover()
+
+    def _written(self, wanted: Velocity | Attitude) -> Text:
+        names = ACTIONS[self.network.action]
+        return Text(" ".join(f"{name} {getattr(wanted, name, 0.0):+.2f}" for name in names), (8.0, 16.0))
+
+
+class _Newest:
+    """The law of a behaviour whose set-point is computed as a frame is looked at."""
+
+    def __init__(self) -> None:
+        self.wanted: Velocity | Attitude = Velocity()
+
+    def feedback(self, feedback: Feedback) -> None:
+        pass
+
+    def step(self, now_ns: int) -> Velocity | Attitude:  # noqa: ARG002  as laws are called
+        return self.wanted

@@ -1,0 +1,80 @@
+"""A drone's state and set-points as rows of numbers, for data sets to learn from and policies that were learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages.command import Attitude, Velocity
+from skyloop.messages.feedback import Feedback, Vector
+
+_Number = Callable[[Feedback], float | None]
+
+
+def _part(of: Callable[[Feedback], Vector | None], axis: int) -> _Number:
+    def number(feedback: Feedback) -> float | None:
+        vector = of(feedback)
+        return None if vector is None else vector[axis]
+
+    return number
+
+
+_NUMBERS: Final[dict[str, _Number]] = {
+    "roll_rad": lambda feedback: feedback.roll_rad,
+    "pitch_rad": lambda feedback: feedback.pitch_rad,
+    "yaw_rad": lambda feedback: feedback.yaw_rad,
+    "altitude_m": lambda feedback: feedback.altitude_m,
+    "velocity_forward_m_s": _part(lambda feedback: feedback.velocity_m_s, 0),
+    "velocity_left_m_s": _part(lambda feedback: feedback.velocity_m_s, 1),
+    "velocity_up_m_s": _part(lambda feedback: feedback.velocity_m_s, 2),
+}
+
+#: What a drone knows of itself, in the axes and units of :class:`Feedback`.
+STATE: Final = tuple(_NUMBERS)
+#: The numbers of the set-points that an application steers by, by the set-point's name.
+ACTIONS: Final[dict[str, tuple[str, ...]]] = {
+    "velocity": ("forward", "left", "up", "yaw_rate"),
+    "attitude": ("roll", "pitch", "climb", "yaw_rate"),
+}
+
+
+def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
+    """Return a drone's state as a row.
+
+    Args:
+        feedback: The state.
+        names: Of the numbers, some of :data:`STATE`.
+
+    Returns:
+        The numbers in the order of the names; None if one of them is not known.
+
+    Raises:
+        UnknownNameError: There is no such number.
+    """
+    row = []
+    for name in names:
+        if name not in _NUMBERS:
+            raise UnknownNameError("number of a drone's state", name, STATE)
+        number = _NUMBERS[name](feedback)
+        if number is None:
+            return None
+        row.append(number)
+    return row
+
+
+def set_point(kind: str, row: Sequence[float]) -> Velocity | Attitude:
+    """Return the set-point of a row.
+
+    Args:
+        kind: A key of :data:`ACTIONS`.
+        row: Its numbers, in the order of :data:`ACTIONS`.
+
+    Raises:
+        UsageError: There are more numbers, or fewer.
+    """
+    names = ACTIONS[kind]
+    if len(row) != len(names):
+        raise UsageError(f"a set-point of {kind} has {len(names)} numbers ({', '.join(names)}), not {len(row)}")
+    numbers = [float(number) for number in row]
+    return Velocity(*numbers) if kind == "velocity" else Attitude(*numbers)

@@ -1,0 +1,208 @@
+"""Flights of a recording as episodes for learning: rows at a steady rate, each with what was seen and what was done.
+
+Pure: everything is computed from a recording's tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import NS_PER_S, nanoseconds
+from skyloop.errors import FileFormatError, UsageError
+from skyloop.messages import FlightState
+from skyloop.messages.rows import ACTIONS, STATE
+from skyloop.recording.review.tables import Table
+
+MARK: Final = "mark"  #: the name of a logged text that begins another episode, whose task it is
+_STILL: Final = "hover"
+_STEERED: Final = (FlightState.HOVERING.value, FlightState.FLYING.value)
+_GAP_S: Final = 0.5  #: without a picture, or a state, for so long, an episode ends
+_SHORTEST_S: Final = 1.0
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """What each row holds.
+
+    Attributes:
+        state: Names of the state's numbers, of :data:`~skyloop.messages.rows.STATE`.
+        set_point: The set-point that was commanded, a key of :data:`~skyloop.messages.rows.ACTIONS`.
+        cameras: Whose pictures a row has.
+        fps: Rows a second.
+    """
+
+    state: tuple[str, ...]
+    set_point: str
+    cameras: tuple[str, ...]
+    fps: float
+
+    @property
+    def action(self) -> tuple[str, ...]:
+        """Names of the action's numbers."""
+        return ACTIONS[self.set_point]
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One flight, or one part of it that the application marked.
+
+    Attributes:
+        task: What was to be done, in words.
+        state: At the capture of the first camera's picture, shape (rows, len(form.state)), float64.
+        action: Commanded by the time of the next row, shape (rows, len(form.action)), float64.
+        frames_ns: By camera, the capture of each row's picture, on the proxy's clock, shape (rows,).
+    """
+
+    task: str
+    state: Floats
+    action: Floats
+    frames_ns: Mapping[str, Times]
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.state)
+
+
+def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> Form:
+    """Return what can be known in each row of a recording.
+
+    Args:
+        tables: Of one drone; see :func:`skyloop.recording.review.tables.tables`.
+        cameras: Whose pictures are wanted.
+        fps: Rows a second.
+
+    Raises:
+        FileFormatError: The recording has no feedback, no set-points, or no frames of a camera.
+        UsageError: It was flown by several kinds of set-points, or by positions.
+    """
+    feedback, commands = tables.get("feedback"), tables.get("commands")
+    state = tuple(name for name in STATE if feedback is not None and feedback.known(name))
+    if not state:
+        raise FileFormatError("the recording knows nothing of the drone's state: record the channel feedback")
+    for camera in cameras:
+        if f"frames.{camera}" not in tables:
+            raise FileFormatError(f"the recording has no frames of {camera}")
+    asked: set[str] = set() if commands is None else {str(name) for name in commands["asked"][_piloted(commands)]}
+    kinds = asked & (ACTIONS.keys() | {"position"})
+    if not kinds:
+        raise FileFormatError("the recording has no set-points of an application: there is nothing to learn")
+    if len(kinds) > 1 or kinds == {"position"}:
+        raise UsageError(
+            f"the recording was flown by {' and '.join(sorted(kinds))} set-points: an action is either velocity "
+            "(forward, left, up, yaw rate) or attitude (roll, pitch, climb, yaw rate)"
+        )
+    return Form(state, kinds.pop(), tuple(cameras), fps)
+
+
+def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode]:
+    """Cut a recording into episodes.
+
+    An episode lasts while the drone follows set-points, without a gap in pictures or state, and is cut at marks. Its
+    rows are ``1 / form.fps`` apart. Each has the newest picture of every camera, the state at the first camera's
+    capture, and the set-point in force when the next row begins: what was done about that picture. Hovering is a
+    set-point of zeros.
+
+    Args:
+        tables: Of one drone.
+        form: What each row holds.
+        task: What was to be done, where no mark says it.
+
+    Returns:
+        Those that last a second at least.
+    """
+    feedback, commands = tables["feedback"], tables["commands"]
+    state_ns, frames = (
+        _times(feedback, "captured_ns"),
+        {camera: np.sort(_times(tables[f"frames.{camera}"], "captured_ns")) for camera in form.cameras},
+    )
+    found = []
+    for begin_ns, end_ns, what in _parts(feedback, tables.get("logs"), task):
+        grid = np.arange(begin_ns, end_ns, NS_PER_S / form.fps).astype(np.int64)
+        rows = {camera: np.searchsorted(times, grid, side="right") - 1 for camera, times in frames.items()}
+        shown = {camera: frames[camera][np.maximum(row, 0)] for camera, row in rows.items()}
+        good = np.ones(len(grid), np.bool_)
+        for camera, row in rows.items():
+            good &= (row >= 0) & (grid - shown[camera] < nanoseconds(_GAP_S))
+        at_ns = shown[form.cameras[0]] if form.cameras else grid
+        nearest = np.searchsorted(state_ns, at_ns).clip(1, max(len(state_ns) - 1, 1))
+        good &= np.abs(state_ns[nearest - 1] - at_ns) < nanoseconds(_GAP_S)
+        state, action = _states(feedback, form, at_ns), _actions(commands, form, grid + round(NS_PER_S / form.fps))
+        for part in _runs(good):
+            if (part.stop - part.start) / form.fps >= _SHORTEST_S:
+                pictures = {camera: times[part] for camera, times in shown.items()}
+                found.append(Episode(what, state[part], action[part], pictures))
+    return found
+
+
+def _times(table: Table, column: str) -> Times:
+    return np.asarray(table[column], np.int64)
+
+
+def _piloted(commands: Table) -> NDArray[np.bool_]:
+    """Which commands an application gave, and not the proxy itself."""
+    given: NDArray[np.bool_] = commands.numbers("app_id") > 0
+    return given
+
+
+def _parts(feedback: Table, logs: Table | None, task: str) -> list[tuple[int, int, str]]:
+    """Return begin and end [ns] and the task of each stretch that follows set-points, cut at marks."""
+    times, steered = _times(feedback, "captured_ns"), np.isin(feedback["state"], _STEERED)
+    marks: list[tuple[int, str]] = []
+    if logs is not None and "text" in logs.columns:
+        marked = (logs["name"] == MARK) & (logs["text"] != "")
+        # The time of a table is relative; a mark lies in the file where it was received, between two states.
+        for t_s, text in zip(logs.numbers("t_s")[marked], logs["text"][marked], strict=True):
+            marks.append((int(np.interp(t_s, feedback.numbers("t_s"), times)), str(text)))
+    parts = []
+    for run in _runs(steered):
+        begin_ns, end_ns = int(times[run.start]), int(times[run.stop - 1])
+        what = task
+        for at_ns, text in marks:
+            if at_ns >= end_ns:
+                break
+            if at_ns > begin_ns:
+                parts.append((begin_ns, at_ns, what))
+                begin_ns = at_ns
+            what = text
+        parts.append((begin_ns, end_ns, what))
+    return parts
+
+
+def _runs(good: NDArray[np.bool_]) -> list[slice]:
+    """Return the stretches that are true."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], good, [False])).astype(np.int8)))
+    return [slice(int(begin), int(end)) for begin, end in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
+    """Return the state at times, interpolated: angles the short way round."""
+    times = _times(feedback, "captured_ns")
+    columns = []
+    for name in form.state:
+        values = feedback.numbers(name)
+        known = np.isfinite(values)
+        values = np.unwrap(values[known]) if name == "yaw_rad" else values[known]
+        column = np.interp(at_ns, times[known], values)
+        columns.append((column + np.pi) % (2 * np.pi) - np.pi if name == "yaw_rad" else column)
+    return np.stack(columns, axis=1) if columns else np.empty((len(at_ns), 0))
+
+
+def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
+    """Return the set-point in force at times; zeros before the first and while it hovers."""
+    kept = _piloted(commands) & np.isin(commands["asked"], [form.set_point, _STILL])
+    times, moves = _times(commands, "applied_ns")[kept], (commands["asked"] == form.set_point)[kept]
+    values = np.stack([np.nan_to_num(commands.numbers(f"asked_{name}")[kept]) for name in form.action], axis=1)
+    rows = np.searchsorted(times, by_ns, side="right") - 1
+    if not len(times):
+        return np.zeros((len(by_ns), len(form.action)))
+    newest = np.maximum(rows, 0)
+    found: Floats = np.where(((rows >= 0) & moves[newest])[:, None], values[newest], 0.0)
+    return found

@@ -1,0 +1,188 @@
+"""A learnt policy: what its network is given, what it flies, and files that are none."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from skyloop.control import OnnxPolicy, PolicyNetwork, PolicyPhase
+from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
+from skyloop.messages import Attitude, Feedback, Severity, Velocity
+from skyloop.messages.rows import ACTIONS, STATE, set_point, state_row
+from tests.control.test_follow import Recorder, frame, state
+
+NAMES = ["altitude_m", "yaw_rad"]
+#: Forward by the red, left by the green, up by the altitude, yaw rate by the yaw.
+MIXED = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+def write(
+    path: Path,
+    *,
+    weights: Sequence[Sequence[float]] = MIXED,
+    names: Any = NAMES,
+    action: Any = ACTIONS["velocity"],
+    picture: str = "observation.images.front",
+    size: Sequence[Any] = (1, 3, 12, 16),
+    more: Sequence[str] = (),
+    output: str = "action",
+    metadata: dict[str, str] | None = None,
+) -> Path:
+    """Write a policy: the mean of each colour, and the state, times weights."""
+    inputs = [helper.make_tensor_value_info(picture, TensorProto.FLOAT, list(size))]
+    inputs += [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1]) for name in more]
+    nodes = [
+        helper.make_node("ReduceMean", [picture], ["means"], axes=[2, 3], keepdims=0),
+        helper.make_node("MatMul", ["all" if names else "means", "weights"], [output]),
+    ]
+    if names:
+        inputs.append(helper.make_tensor_value_info("observation.state", TensorProto.FLOAT, [1, len(names)]))
+        nodes.insert(1, helper.make_node("Concat", ["means", "observation.state"], ["all"], axis=1))
+    table = np.array(weights, np.float32)
+    outputs = [helper.make_tensor_value_info(output, TensorProto.FLOAT, [1, table.shape[1]])]
+    graph = helper.make_graph(nodes, "policy", inputs, outputs, [numpy_helper.from_array(table, "weights")])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    about = {"skyloop.state": json.dumps(names), "skyloop.action": json.dumps(action)}
+    helper.set_model_props(model, about if metadata is None else metadata)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> Path:
+    return write(tmp_path / "policy.onnx")
+
+
+@pytest.fixture
+def drone() -> Recorder:
+    return Recorder()
+
+
+def fly(drone: Recorder, path: Path, **options: Any) -> OnnxPolicy:
+    return OnnxPolicy(drone, path, **options)  # type: ignore[arg-type]
+
+
+def test_it_is_given_red_green_blue_and_the_state_by_name(policy: Path) -> None:
+    network = PolicyNetwork(policy)
+    assert (network.camera, network.size, network.state, network.action) == (
+        "front",
+        (16, 12),
+        ("altitude_m", "yaw_rad"),
+        "velocity",
+    )
+    image = np.zeros((120, 160, 3), np.uint8)
+    image[:, :, 2] = 255
+    image[:, :, 1] = 51
+    flown = network(image, [1.5, -0.5])
+    assert isinstance(flown, Velocity)
+    assert (flown.forward, flown.left, flown.up, flown.yaw_rate) == pytest.approx((1.0, 0.2, 1.5, -0.5))
+    assert network(np.full((12, 16), 255, np.uint8), [0, 0]) == Velocity(1.0, 1.0), "a grey picture"
+
+
+def test_a_frame_is_flown_by_its_picture_and_the_state_at_its_capture(drone: Recorder, policy: Path) -> None:
+    pilot = fly(drone, policy)
+    assert pilot.camera == "front"
+    pilot.on_frame(frame(1_000_000_000, []))
+    (sent,) = drone.velocities
+    assert sent["up"] == pytest.approx(1.0), "the altitude"
+    assert 0 < sent["forward"] <= 1.0
+    assert pilot.phase is PolicyPhase.FLYING
+    assert drone.hovers == 0
+    assert "forward +" in drone.drawn[0][0].text
+
+
+def test_it_hovers_while_it_does_not_know_what_the_policy_needs(drone: Recorder, tmp_path: Path) -> None:
+    pilot = fly(drone, write(tmp_path / "policy.onnx"))
+    pilot.on_frame(frame(1_000_000_000, [], known=False))
+    assert (drone.velocities, drone.hovers) == ([], 1)
+    pilot.on_frame(frame(1_100_000_000, []))
+    assert len(drone.velocities) == 1
+    pilot.on_frame(frame(1_200_000_000, [], known=False))
+    assert drone.told[-1] == ("policy: the drone does not know all that the policy needs: hovering", Severity.WARNING)
+
+
+def test_it_hovers_where_the_action_is_not_finite(drone: Recorder, tmp_path: Path) -> None:
+    pilot = fly(drone, write(tmp_path / "policy.onnx", weights=[[float("nan")] * 4] * 5))
+    pilot.on_frame(frame(1_000_000_000, []))
+    assert (drone.velocities, drone.hovers, pilot.phase) == ([], 1, PolicyPhase.NO_ACTION)
+
+
+def test_a_policy_may_fly_by_attitude_and_without_state(tmp_path: Path) -> None:
+    path = write(tmp_path / "policy.onnx", names=[], weights=MIXED[:3], action=ACTIONS["attitude"])
+    network = PolicyNetwork(path)
+    assert network.state == ()
+    assert network(np.full((12, 16, 3), 255, np.uint8), []) == Attitude(1.0, 1.0)
+    with pytest.raises(UsageError, match=r"takes no observation\.state: leave state out"):
+        PolicyNetwork(path, state=NAMES)
+
+
+def test_names_may_be_given_where_the_file_has_none(tmp_path: Path) -> None:
+    path = write(tmp_path / "policy.onnx", metadata={})
+    network = PolicyNetwork(path, state=NAMES, action="velocity")
+    assert network.state == tuple(NAMES)
+    with pytest.raises(FileFormatError, match=r"skyloop\.state in its metadata: give state="):
+        PolicyNetwork(path)
+    with pytest.raises(FileFormatError, match=r"skyloop\.action in its metadata: give action="):
+        PolicyNetwork(path, state=NAMES)
+    with pytest.raises(UnknownNameError, match="altitude"):
+        PolicyNetwork(path, state=["altitude", "yaw_rad"], action="velocity")
+    with pytest.raises(UnknownNameError, match="position"):
+        PolicyNetwork(path, state=NAMES, action="position")
+    with pytest.raises(FileFormatError, match=r"not \(1, 3\)"):
+        PolicyNetwork(path, state=[*NAMES, "roll_rad"], action="velocity")
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"picture": "image"}, "must have one picture"),
+        ({"more": ["noise"]}, "the inputs .*noise"),
+        ({"size": (1, 3, "height", 16)}, "must take float32"),
+        ({"size": (1, 3, 5000, 16)}, "at most 4096"),
+        ({"output": "logits"}, "one output with the name action"),
+        ({"action": ["forward"]}, "names the action forward"),
+        ({"action": "velocity"}, "no JSON list of names as skyloop.action"),
+        ({"metadata": {"skyloop.state": "[" * 10_000}}, "no JSON list of names as skyloop.state"),
+        ({"weights": [row[:3] for row in MIXED]}, "a set-point of velocity has 4 numbers .* not 3"),
+    ],
+)
+def test_files_that_are_no_policy_are_refused(tmp_path: Path, how: dict[str, Any], words: str) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        PolicyNetwork(write(tmp_path / "policy.onnx", **how))
+
+
+def test_what_is_no_file_or_out_of_range_is_refused(
+    drone: Recorder, tmp_path: Path, policy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(UsageError, match="there is no file"):
+        PolicyNetwork(tmp_path / "none.onnx")
+    (tmp_path / "bad.onnx").write_bytes(b"no network")
+    with pytest.raises(FileFormatError, match="can't be loaded as an ONNX file"):
+        PolicyNetwork(tmp_path / "bad.onnx")
+    with pytest.raises(UsageError, match="threads is 0"):
+        PolicyNetwork(policy, threads=0)
+    with pytest.raises(UnknownNameError, match="left"):
+        fly(drone, policy, camera="left")
+    assert fly(drone, policy, camera="bottom").camera == "bottom"
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+    with pytest.raises(MissingExtraError, match=r"skyloop\[detect\]"):
+        PolicyNetwork(policy)
+
+
+def test_rows_have_the_numbers_by_name_or_none() -> None:
+    known = msgspec.structs.replace(state(1), altitude_m=2.0, velocity_m_s=(0.1, 0.2, 0.3))
+    assert state_row(known, STATE) == [0.0, 0.0, 0.0, 2.0, 0.1, 0.2, 0.3]
+    assert state_row(Feedback(captured_ns=1), ["velocity_up_m_s"]) is None
+    assert state_row(Feedback(captured_ns=1), []) == []
+    with pytest.raises(UnknownNameError, match="height"):
+        state_row(known, ["height"])
+    assert set_point("attitude", [0.1, 0.2, 0.3, 0.4]) == Attitude(0.1, 0.2, 0.3, 0.4)
+    with pytest.raises(UsageError, match="has 4 numbers"):
+        set_point("velocity", [1.0])
