@@ -88,7 +88,10 @@ def test_ports_count_from_a_base() -> None:
         (("--bind", "0.0.0.0"), "--bind is for --firmware"),
         (("--firmware", "ardrone2", "--name", "mine"), "--name is the proxy's"),
         (("--firmware", "ardrone2", "--option", "cameras=front"), "--option cameras can't be chosen with --firmware"),
-        (("--firmware", "ardrone3"), "'ardrone3' is none of 'ardrone1', 'ardrone2', 'arducopter', 'px4', 'tello'"),
+        (
+            ("--firmware", "ardrone3"),
+            "'ardrone3' is none of 'ardrone1', 'ardrone2', 'arducopter', 'betaflight', 'px4', 'tello'",
+        ),
         (("--firmware", "ardrone2", "--lose", "1.5"), "--lose: must be at most 1"),
         (("--firmware", "ardrone2", "--port-base", "0", "--bind", "no such host"), "can't be opened"),
     ],

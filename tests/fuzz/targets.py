@@ -116,6 +116,26 @@ def mavlink(data: bytes) -> None:
         stream.decode(part)
 
 
+def msp(data: bytes) -> None:
+    """What a flight controller answers by MSP, and what an emulated one is sent."""
+    from skyloop.clock import NS_PER_S
+    from skyloop.drivers.msp.options import options_of
+    from skyloop.drivers.msp.protocol import MspSession
+    from skyloop.drivers.uri import parse_uri
+    from skyloop.wire.msp.frames import Direction, Frame, encode
+
+    session = MspSession(options_of(parse_uri("msp:///dev/ttyACM0")), 0)
+    now_ns = 0
+    for part in _parts(data):
+        now_ns += NS_PER_S // 50
+        session.poll(now_ns)
+        session.receive(part, now_ns)
+        if part:  # as a payload with a good checksum
+            session.receive(encode(Frame(part[0], part[1:], Direction.REPLY)), now_ns)
+            session.receive(encode(Frame(0x2000 | part[0] & 3, part[1:], Direction.REPLY)), now_ns)
+        session.drain()
+
+
 def vrpn(data: bytes) -> None:
     """What a motion capture server sends by VRPN, or whoever pretends to be one; what comes out goes on as frames."""
     from skyloop.motion_capture.pose import plausible
@@ -184,7 +204,7 @@ def page(data: bytes) -> None:
 Target = Callable[[bytes], None]
 TARGETS: Final[dict[str, Target]] = {
     target.__name__: target
-    for target in (samples, packets, proxy, ardrone, tello, mavlink, vrpn, recording, files, page)
+    for target in (samples, packets, proxy, ardrone, tello, mavlink, msp, vrpn, recording, files, page)
 }
 
 

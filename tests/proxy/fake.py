@@ -11,6 +11,7 @@ from typing import Any
 from skyloop.clock import Clock, ManualClock
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import DriverError
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,
@@ -90,6 +91,7 @@ class FakeDriver(Driver):
         self.while_setting: Callable[[], None] = lambda: None
         self.closed = False
         self.left = ""  #: what others made of the vehicle
+        self.refuses = ""  #: why the software autopilot must not begin, and what ``apply`` raises
         self.repeats = 0
         self.answers = True  #: whether feedback follows a command
         self._actions = frozenset(actions)
@@ -127,6 +129,10 @@ class FakeDriver(Driver):
     def _close(self) -> None:
         self.closed = True
 
+    def check(self, action: AnyAction) -> None:
+        if self.refuses:
+            raise DriverError(f"{action.name}: {self.refuses}")
+
     def left_to(self) -> str:
         return self.left
 
@@ -136,6 +142,7 @@ class FakeDriver(Driver):
 
     def _apply(self, action: AnyAction) -> AnyAction:
         self._may_fail("apply")
+        self.check(action)
         self.told.append(action)
         self.left = ""
         if self.answers and type(action) in _NEXT:

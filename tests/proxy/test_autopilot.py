@@ -377,3 +377,39 @@ def test_what_is_not_allowed_on_the_way_is_not_flown() -> None:
     assert isinstance(told, Velocity)
     assert (told.forward, told.left) == (0.0, 0.0)
     assert told.up > 0.0
+
+
+# A vehicle that says itself whether it stands -------------------------------------------------------------------------
+
+
+def seen(autopilot: Autopilot, state: FlightState, now_ns: int, altitude_m: float) -> Attitude | Velocity | None:
+    return autopilot.step(now_ns, Feedback(captured_ns=now_ns, altitude_m=altitude_m), state)
+
+
+def test_a_vehicle_that_was_disarmed_in_the_air_is_flown_no_more() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Takeoff(), 0, None)
+    assert seen(autopilot, FlightState.LANDED, STEP_NS, 0.0) is not None, "it is about to rise"
+    seen(autopilot, FlightState.FLYING, 2 * STEP_NS, 1.0)
+    assert autopilot.state(FlightState.FLYING) is FlightState.HOVERING
+    assert seen(autopilot, FlightState.LANDED, 3 * STEP_NS, 0.1) is None
+    assert autopilot.state(FlightState.LANDED) is FlightState.LANDED
+
+
+def test_a_take_off_that_never_leaves_the_ground_ends() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Takeoff(), 0, None)
+    assert seen(autopilot, FlightState.LANDED, 14 * NS_PER_S, 0.0) is not None
+    assert seen(autopilot, FlightState.LANDED, 15 * NS_PER_S, 0.0) is None
+    assert autopilot.state(FlightState.LANDED) is FlightState.LANDED
+
+
+def test_a_refusal_ends_a_take_off_and_no_flight() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Takeoff(), 0, None)
+    autopilot.refused(FlightState.UNKNOWN)
+    autopilot.refused(FlightState.FLYING)
+    assert autopilot.state(FlightState.FLYING) is FlightState.TAKING_OFF
+    autopilot.refused(FlightState.LANDED)
+    assert autopilot.step(STEP_NS, None) is None
+    assert autopilot.state(FlightState.LANDED) is FlightState.LANDED

@@ -344,3 +344,23 @@ def test_above_the_limit_of_altitude_the_vehicle_comes_down_while_it_is_steered(
     bench.driver.report(altitude_m=5.0)
     pilot.command(Hover())
     assert bench.driver.told[-1] == Hover()
+
+
+def test_a_vehicle_refuses_what_the_software_autopilot_would_begin() -> None:
+    with Bench(actions={"attitude"}) as bench:
+        pilot = bench.pilot()
+        bench.driver.report(altitude_m=0.0)
+        bench.driver.answers = False  # it goes on to stand
+        bench.driver.refuses = "it can't be armed: THROTTLE"
+        pilot.command(Takeoff())
+        assert "takeoff: it can't be armed: THROTTLE" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
+        bench.driver.refuses = ""
+        pilot.command(Takeoff())
+        bench.run(0.1)
+        assert isinstance(bench.driver.told[-1], Attitude)
+        bench.driver.refuses = "it refused to arm"  # from now on, while it still stands
+        bench.run(0.1)
+        bench.driver.refuses = ""
+        bench.driver.told.clear()
+        bench.run(0.2)
+        assert bench.driver.told == [], "the take-off is over"

@@ -43,6 +43,16 @@ PARAMETERS: Final[dict[str, float]] = {
     "MOT_THST_EXPO": 0.78,  # thrust is the square of a speed that begins at an eighth of the full one
     "MOT_THST_HOVER": 0.6,
     "ATC_ACCEL_Y_MAX": 4000,  # its rotors turn an Iris slowly [0.01°/s²]: more would take their lift
+    # Rates of an Iris that follow within 50 ms: by rotors' thrust and places, and its inertia; the usual values are for
+    # shorter arms that are lighter.
+    "ATC_RAT_RLL_P": 0.2,
+    "ATC_RAT_RLL_I": 0.2,
+    "ATC_RAT_RLL_D": 0.005,
+    "ATC_RAT_PIT_P": 0.42,
+    "ATC_RAT_PIT_I": 0.42,
+    "ATC_RAT_PIT_D": 0.01,
+    "ATC_RAT_YAW_P": 1.2,
+    "ATC_RAT_YAW_I": 0.12,
     "FS_THR_ENABLE": 0,  # there is no remote control
     "RC1_MIN": 1000,  # values other than its defaults: the remote control counts as calibrated
     "RC1_MAX": 2000,

@@ -129,7 +129,7 @@ class ActionExecutor:
         if not self._had_feedback and feedback is not None and feedback.altitude_m is not None:
             self._had_feedback = True
             self.autopilot.on_first_feedback(feedback)
-        action = self.autopilot.step(now_ns, feedback)
+        action = self.autopilot.step(now_ns, feedback, self._vehicle.reported_state)
         if action is None:
             return None
         try:
@@ -137,7 +137,7 @@ class ActionExecutor:
         except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
             self._vehicle.driver_failed("autopilot", error)
             if isinstance(error, DriverError):
-                self.autopilot.refused(feedback)
+                self.autopilot.refused(self._vehicle.reported_state)
             return None
 
     def _start(self, action: AnyAction, now_ns: int) -> None:

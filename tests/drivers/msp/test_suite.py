@@ -1,4 +1,4 @@
-"""The driver keeps the drivers' contract, against the emulated Betaflight: by cameras' poses, and by its own sensors."""
+"""The driver keeps the drivers' contract, against the emulated Betaflight: by its own sensors, and by poses."""
 
 from __future__ import annotations
 

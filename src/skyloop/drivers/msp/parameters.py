@@ -13,7 +13,7 @@ from skyloop.messages import Parameter, ParameterType, Refusal, Value
 
 AUTOMATIC: Final = 0  #: of an AUX channel: as the modes need it
 _LIMITS: Final = (
-    ("tilt", 0.02, 1.2, "rad", "greatest roll and pitch together; never more than a full stick"),
+    ("tilt", 0.02, 1.0, "rad", "greatest roll and pitch together; never more than a full stick"),
     ("climb", 0.05, 10.0, "m/s", "greatest climb and descent"),
     ("yaw_rate", 0.05, 10.0, "rad/s", "greatest yaw rate; never more than a full stick"),
     ("throttle", 0.1, 1.0, "", "greatest throttle, as a share of the full one"),

@@ -52,9 +52,9 @@ STOP_NS: Final = nanoseconds(1.0)  #: so long motors may still be reported on af
 class Limits:
     """The most that is asked for."""
 
-    tilt: float = 0.6  #: [rad]
-    climb: float = 1.5  #: [m/s]
-    yaw_rate: float = 2.5  #: [rad/s]
+    tilt: float = 0.35  #: [rad]
+    climb: float = 1.0  #: [m/s]
+    yaw_rate: float = 1.75  #: [rad/s]
     throttle: float = 0.85  #: share of the full one
 
 
@@ -190,7 +190,9 @@ class SetpointController:
         return self._wanted
 
     def why_not(self, now_ns: int) -> str:
-        """Return why it can't take off now; empty if nothing is known to prevent it."""
+        """Return why it can't take off now; empty if nothing is known to prevent it, or it is at it already."""
+        if self.phase is not Phase.STANDING:
+            return ""
         if self.stopped:
             return "the motors were stopped: reset the emergency first"
         if not self.receiving or self.report.armed is None:

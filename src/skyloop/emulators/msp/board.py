@@ -25,7 +25,17 @@ from skyloop.sim.host import Report
 from skyloop.wire.msp import messages as msp
 from skyloop.wire.msp.curves import pack_betaflight_rates, rate_curve, share_of
 from skyloop.wire.msp.frames import Direction, Frame
-from skyloop.wire.msp.messages import BETAFLIGHT, RX_MSP, USUAL_MAP, Function, OnLoss, RxConfig, Sensor, Status
+from skyloop.wire.msp.messages import (
+    ANGLE_LIMIT_AT,
+    BETAFLIGHT,
+    RX_MSP,
+    USUAL_MAP,
+    Function,
+    OnLoss,
+    RxConfig,
+    Sensor,
+    Status,
+)
 from skyloop.wire.msp.names import ARM_SWITCH, BETAFLIGHT_FLAGS
 
 API: Final = (1, 47)
@@ -132,7 +142,7 @@ class Board:
             Function.FAILSAFE_CONFIG: settings.failsafe.encode,
             Function.RXFAIL_CONFIG: lambda: msp.pack_rx_fail(settings.on_loss),
             Function.RC_TUNING: lambda: pack_betaflight_rates(settings.rates),
-            Function.PID_ADVANCED: lambda: bytes(20) + bytes((settings.angle_limit_deg,)) + bytes(40),
+            Function.PID_ADVANCED: lambda: bytes(ANGLE_LIMIT_AT) + bytes((settings.angle_limit_deg,)) + bytes(43),
             Function.FEATURE_CONFIG: lambda: (RX_MSP * settings.rx_msp).to_bytes(4, "little"),
             Function.BATTERY_CONFIG: lambda: bytes((33, 43)),
             Function.STATUS: lambda: self._status(now_ns).betaflight(),

@@ -149,17 +149,22 @@ class Autopilot:
         elif self._state not in _STANDING:
             self._state = FlightState.HOVERING if action_name == "hover" else FlightState.FLYING
 
-    def refused(self, feedback: Feedback | None) -> None:
-        """The vehicle refused what it was sent: a take-off of one that stands is over."""
-        if self.mode is Mode.TAKEOFF and feedback is not None and feedback.state is FlightState.LANDED:
+    def refused(self, reported: FlightState) -> None:
+        """The vehicle refused what it was sent: a take-off of one that ``reported`` to stand is over."""
+        if self.mode is Mode.TAKEOFF and reported is FlightState.LANDED:
             self.mode, self._state = Mode.OFF, FlightState.LANDED
 
-    def step(self, now_ns: int, feedback: Feedback | None) -> Attitude | Velocity | None:
-        """What to send to the vehicle now; None while off. To be called every :data:`PERIOD_S`."""
+    def step(
+        self, now_ns: int, feedback: Feedback | None, reported: FlightState = FlightState.UNKNOWN
+    ) -> Attitude | Velocity | None:
+        """What to send to the vehicle now; None while off. To be called every :data:`PERIOD_S`.
+
+        ``reported``: the flight state as the vehicle's driver reported it, which is not that of the ``feedback``.
+        """
         if self.mode is Mode.OFF:
             return None
         known = feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
-        if known is not None and self._stands(known.state, now_ns):
+        if known is not None and self._stands(reported, now_ns):
             self.mode, self._state = Mode.OFF, FlightState.LANDED
             return None
         wanted = self._wanted(now_ns, known)

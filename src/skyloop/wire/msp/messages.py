@@ -520,8 +520,13 @@ def features(payload: bytes) -> int:
     return bits
 
 
+ANGLE_LIMIT_AT: Final = 17
+
+
 def angle_limit_deg(payload: bytes) -> int:
     """Return the tilt of a full stick [degrees], from Betaflight's ``PID_ADVANCED``."""
-    if len(payload) < 21:
-        raise DecodeError(f"PID_ADVANCED of {len(payload)} bytes: 21 are the least")
-    return payload[20]
+    if len(payload) <= ANGLE_LIMIT_AT:
+        raise DecodeError(f"PID_ADVANCED of {len(payload)} bytes: {ANGLE_LIMIT_AT + 1} are the least")
+    if payload[ANGLE_LIMIT_AT] == 0:
+        raise DecodeError("PID_ADVANCED has no angle limit")
+    return payload[ANGLE_LIMIT_AT]

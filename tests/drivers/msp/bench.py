@@ -1,0 +1,129 @@
+"""The driver's session and the emulated board with nothing between them, in simulated time: no thread, no socket."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+from skyloop.clock import NS_PER_S, ManualClock
+from skyloop.drivers.base import ExternalPose
+from skyloop.drivers.msp.options import MspOptions, options_of
+from skyloop.drivers.msp.protocol import MspSession
+from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.drivers.uri import parse_uri
+from skyloop.emulators.msp.board import Board
+from skyloop.emulators.msp.settings import RACER, BoardSettings
+from skyloop.emulators.vehicle import SimulatedVehicle
+from skyloop.messages import Attitude, Feedback
+from skyloop.sim.dynamics import STEP_S
+from skyloop.sim.host import Report
+from skyloop.sim.parameters import with_ideal_sensors
+from skyloop.sim.simulation import Simulation
+from skyloop.sim.world_file import load_world
+from skyloop.wire.msp.frames import Frame, Parser, encode
+
+TICK_S: Final = 0.008
+POSE_TICKS: Final = 2
+BATTERY_FREE: Final = with_ideal_sensors(RACER)
+
+
+def options(text: str = "msp://tcp:127.0.0.1:5761") -> MspOptions:
+    return options_of(parse_uri(text))
+
+
+class Bench:
+    """A drone on the ground, seen by cameras if ``poses``; ``cut``: nothing passes; ``deaf``: no reply passes."""
+
+    def __init__(
+        self, settings: BoardSettings | None = None, text: str = "msp://tcp:127.0.0.1:5761", *, poses: bool = True
+    ) -> None:
+        world = replace(load_world("empty", 0), targets=())
+        self.simulation = Simulation(world, seed=1, parameters=BATTERY_FREE)
+        self.clock = ManualClock(100 * NS_PER_S)
+        self.board = Board(SimulatedVehicle(self.simulation, 0), settings or BoardSettings(), self.clock.now_ns)
+        self.sink = RecordingSink()
+        self.poses = poses
+        self.cut = self.deaf = False
+        self.sent: list[Frame] = []
+        self._parser = Parser()
+        self._ticks = 0
+        self._look()
+        self.session = MspSession(options(text), self.clock.now_ns)
+
+    @property
+    def height_m(self) -> float:
+        return self.simulation.truth(0).position_m[2]
+
+    @property
+    def climb_m_s(self) -> float:
+        return self.simulation.truth(0).velocity_m_s[2]
+
+    @property
+    def feedback(self) -> Feedback:
+        assert self.sink.newest is not None
+        return self.sink.newest
+
+    def reconnect(self, text: str = "msp://tcp:127.0.0.1:5761") -> None:
+        """Another proxy takes over: a new session."""
+        self.session = MspSession(options(text), self.clock.now_ns)
+        self._parser.reset()
+
+    def fly(self, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> None:
+        self.session.command(Attitude(roll, pitch, climb, yaw_rate), self.clock.now_ns)
+
+    def tick(self) -> None:
+        self.clock.advance(TICK_S)
+        self.simulation.step(round(TICK_S / STEP_S))
+        self._ticks += 1
+        self._look()
+        now_ns = self.clock.now_ns
+        if self.poses and self._ticks % POSE_TICKS == 0:
+            truth = self.simulation.truth(0)
+            self.session.on_pose(ExternalPose(truth.position_m, truth.quaternion, now_ns))
+        if now_ns >= self.session.due_ns:
+            self._exchange(self.session.poll(now_ns))
+        for publish in self.session.drain():
+            publish(self.sink)
+
+    def _exchange(self, data: bytes) -> None:
+        if self.cut:
+            return
+        for frame in self._parser.feed(data):
+            self.sent.append(frame)
+            reply = self.board.answer(frame, self.clock.now_ns)
+            if reply is not None and not self.deaf:
+                self.session.receive(encode(reply), self.clock.now_ns)
+
+    def _look(self) -> None:
+        now_ns = self.clock.now_ns
+        self.board.tick(Report(self.simulation.feedback(0), self.simulation.truth(0), (), now_ns), now_ns)
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / TICK_S)):
+            self.tick()
+
+    def until(self, condition: Callable[[], bool], within_s: float) -> float:
+        """How long it took [s]."""
+        for ticks in range(round(within_s / TICK_S)):
+            if condition():
+                return ticks * TICK_S
+            self.tick()
+        raise AssertionError(f"not within {within_s} s: {self.simulation.truth(0)}, {self.sink.events}")
+
+    def ready(self) -> None:
+        """Wait until it could be armed."""
+        self.until(lambda: self.sink.newest is not None and not self.session.setpoints.report.hindrances, 5.0)
+
+    def take_off(self, hover: float | None = 0.32) -> None:
+        """Rise to a metre and hold there; ``hover``: the throttle that was learnt in an earlier flight."""
+        self.ready()
+        self.session.setpoints.hover = hover
+        self.fly(climb=0.7)
+        self.until(lambda: self.height_m > 1.0, 20.0)
+        self.fly()
+        self.run(1.0)
+
+    def texts(self, reason: str) -> list[str]:
+        """Of the events with this reason."""
+        return [event.text for event in self.sink.events if event.data.get("reason") == reason]

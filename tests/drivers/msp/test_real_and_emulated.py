@@ -1,0 +1,170 @@
+"""What the driver relies on, asked of real Betaflight and of the emulated one by the same test."""
+
+from __future__ import annotations
+
+import math
+import socket
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from skyloop.drivers.msp import MspDriver
+from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.drivers.uri import parse_uri
+from skyloop.emulators.msp import BetaflightFirmware
+from skyloop.emulators.msp.board import bit
+from skyloop.errors import DriverError
+from skyloop.messages import Attitude, FlightState, LinkState
+from skyloop.wire.msp.frames import Frame, Parser, encode
+from skyloop.wire.msp.messages import Function, Status, channels, pack_channels
+from skyloop.wire.msp.names import flag_names
+from tests.drivers.msp.rig import world
+from tests.drivers.msp.sitl import MSP_PORT, Sitl, why_not
+
+PATIENCE_S: Final = 20.0
+
+
+@dataclass
+class Vehicle:
+    """One of the two. ``tilt`` puts it on its side, or upright again."""
+
+    host: str
+    port: int
+    tilt: Callable[[bool], None]
+
+    @property
+    def address(self) -> str:
+        return f"msp://tcp:{self.host}:{self.port}"
+
+
+@pytest.fixture(params=["emulated", pytest.param("real", marks=[pytest.mark.slow, pytest.mark.process])])
+def vehicle(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Vehicle]:
+    if request.param == "emulated":
+        with BetaflightFirmware(world(), port=0) as firmware:
+            board = firmware.board
+
+            def set_flag(on: bool) -> None:
+                board.settings = replace(board.settings, flags=bit("ANGLE") if on else 0)
+
+            yield Vehicle("127.0.0.1", firmware.port, set_flag)
+        return
+    reason = why_not()
+    if reason:
+        pytest.skip(reason)
+    with Sitl(tmp_path) as sitl:
+
+        def roll(on: bool) -> None:
+            sitl.roll_rad = math.radians(60.0) if on else 0.0
+
+        yield Vehicle("127.0.0.1", MSP_PORT, roll)
+
+
+class Line:
+    """A client of our own, to be silent when the test wants it."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._socket = socket.create_connection((vehicle.host, vehicle.port), 5)
+        self._socket.settimeout(5)
+        self._parser = Parser()
+        self._came: list[Frame] = []
+
+    def ask(self, function: int, payload: bytes = b"") -> bytes:
+        self._socket.sendall(encode(Frame(function, payload)))
+        while True:
+            while not self._came:
+                self._came += self._parser.feed(self._socket.recv(4096))
+            frame = self._came.pop(0)
+            if frame.function == function:
+                return frame.payload
+
+    def sticks(self, throttle: int, arm: int) -> None:
+        self.ask(Function.SET_RAW_RC, pack_channels([1500, 1500, throttle, 1500, arm, 1000, 1000, 1000]))
+
+    def state(self) -> tuple[bool, set[str], int]:
+        """Whether it is armed, what hinders it, and the throttle that is in force [µs]."""
+        status = Status.of_betaflight(self.ask(Function.STATUS_EX))
+        names = flag_names("BTFL", status.flags or 0, status.count)
+        return bool(status.modes & 1), set(names), channels(self.ask(Function.RC))[3]
+
+    def send_until(self, arm: int, condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < end, self.state()
+            self.sticks(1000, arm)
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def test_what_the_driver_relies_on(vehicle: Vehicle) -> None:
+    driver, sink = MspDriver(parse_uri(vehicle.address)), RecordingSink()
+    driver.open(sink)
+    try:
+        _arms_and_disarms(driver, sink, vehicle)
+    finally:
+        driver.close()
+    line = Line(vehicle)
+    try:
+        _silence(line)
+    finally:
+        line.close()
+
+
+def _arms_and_disarms(driver: MspDriver, sink: RecordingSink, vehicle: Vehicle) -> None:
+    assert sink.wait(lambda: sink.link_state is LinkState.UP, PATIENCE_S), sink.links
+    assert any(event.text.startswith("Betaflight 4.6.0 on ") for event in sink.events)
+
+    def flags() -> str:
+        return str(sink.newest and sink.newest.native and sink.newest.native["arming.flags"])
+
+    def phase() -> str:
+        return str(sink.newest and sink.newest.native and sink.newest.native["phase"])
+
+    assert sink.wait(lambda: flags() == "", PATIENCE_S), flags()
+    assert not [each for each in driver.checkup() if each.severe and not each.good]
+
+    vehicle.tilt(True)
+    assert sink.wait(lambda: "ANGLE" in flags(), PATIENCE_S), flags()
+    with pytest.raises(DriverError, match="refuses to arm: ANGLE"):
+        driver.apply(Attitude(climb=0.3))
+    vehicle.tilt(False)
+    assert sink.wait(lambda: flags() == "", PATIENCE_S), flags()
+
+    driver.apply(Attitude(climb=0.3))
+    assert sink.wait(lambda: phase() == "spooling", PATIENCE_S), sink.events
+    driver.apply(Attitude())
+    assert sink.wait(lambda: phase() == "standing" and "armed" in native(sink) and not native(sink)["armed"], 10.0)
+    assert sink.newest is not None
+    assert sink.newest.state is FlightState.LANDED
+    assert abs(sink.newest.roll_rad or 0.0) < 0.05
+
+
+def native(sink: RecordingSink) -> dict[str, object]:
+    return dict((sink.newest and sink.newest.native) or {})
+
+
+def _silence(line: Line) -> None:
+    """What ``docs/msp.md`` says of the time after the last stick: held, throttle off, disarmed."""
+    line.send_until(1000, lambda: not line.state()[1])
+    line.send_until(2000, lambda: line.state()[0])
+    begun = time.monotonic()
+    line.sticks(1090, 2000)
+    seen: list[tuple[float, bool, set[str], int]] = []
+    while time.monotonic() - begun < 2.5:
+        seen.append((time.monotonic() - begun, *line.state()))
+        time.sleep(0.01)
+
+    def at(low_s: float, high_s: float) -> list[tuple[bool, set[str], int]]:
+        return [each[1:] for each in seen if low_s <= each[0] <= high_s]
+
+    assert all(armed for armed, _, _ in at(0.0, 1.2)), "armed until the failsafe begins"
+    assert all(throttle == 1090 for _, _, throttle in at(0.05, 0.2)), "the last sticks are held"
+    assert all("RXLOSS" in flags for _, flags, _ in at(0.35, 1.2))
+    assert all(throttle < 1000 for _, _, throttle in at(0.5, 1.2)), "no throttle"
+    assert all(not armed and "FAILSAFE" in flags for armed, flags, _ in at(2.0, 2.5)), "dropped"
+    line.send_until(1000, lambda: not line.state()[1])

@@ -1,0 +1,328 @@
+"""The session with an emulated board, in simulated time: arming, flight, refusals, silence, a pilot's switch."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from skyloop.emulators.msp.board import bit
+from skyloop.emulators.msp.settings import BoardSettings
+from skyloop.errors import DriverError
+from skyloop.messages import Attitude, EmergencyStop, FlightState, Hover, Idle, LinkState, ResetEmergency
+from skyloop.wire.msp.frames import Direction, Frame, encode
+from skyloop.wire.msp.messages import FailsafeConfig, Function, ModeRange, OnLoss, channels
+from tests.drivers.msp.bench import Bench, options
+
+
+def test_it_learns_the_throttle_and_holds_its_height() -> None:
+    bench = Bench()
+    bench.take_off(hover=None)
+    bench.run(2.0)
+    assert bench.feedback.state is FlightState.FLYING
+    before = bench.height_m
+    bench.run(3.0)
+    assert abs(bench.climb_m_s) < 0.05
+    assert abs(bench.height_m - before) < 0.3
+    hover = bench.session.setpoints.hover
+    assert hover is not None
+    assert 0.27 < hover < 0.37, "the emulated racer hovers at 0.32"
+
+
+def test_climbs_and_descends_as_asked() -> None:
+    bench = Bench()
+    bench.take_off()
+    for climb in (0.8, -0.4):
+        bench.fly(climb=climb)
+        bench.run(2.5)
+        assert bench.climb_m_s == pytest.approx(climb, abs=0.12)
+
+
+@pytest.mark.parametrize("poses", [True, False])
+def test_feedback_has_our_axes(poses: bool) -> None:
+    bench = Bench(poses=poses)
+    bench.take_off()
+    bench.fly(roll=-0.1, pitch=0.15)
+    bench.run(0.6)
+    truth, feedback = bench.simulation.truth(0), bench.feedback
+    assert feedback.roll_rad == pytest.approx(truth.roll_rad, abs=0.02)
+    assert feedback.pitch_rad == pytest.approx(truth.pitch_rad, abs=0.02)
+    assert truth.pitch_rad == pytest.approx(0.15, abs=0.02), "the stick leans it as far as it was asked to"
+    assert truth.roll_rad == pytest.approx(-0.1, abs=0.02)
+    assert feedback.yaw_rad == pytest.approx(truth.yaw_rad, abs=math.radians(1))
+    assert feedback.velocity_m_s is not None
+    east, north, up = truth.velocity_m_s
+    cos, sin = math.cos(truth.yaw_rad), math.sin(truth.yaw_rad)
+    expected = (cos * east + sin * north, cos * north - sin * east, up)
+    assert expected[0] > 0.4, "nose down is forward"
+    assert expected[1] > 0.2, "left side down is left"
+    assert feedback.velocity_m_s == pytest.approx(expected, abs=0.12)
+    assert feedback.altitude_m == pytest.approx(bench.height_m - 0.04, abs=0.05)
+    assert feedback.battery is not None
+    assert 0.5 < feedback.battery <= 1.0
+
+
+def test_turns_as_fast_as_asked() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.fly(yaw_rate=0.7)
+    bench.run(0.5)
+    before = bench.simulation.truth(0).yaw_rad
+    bench.run(1.0)
+    assert bench.simulation.truth(0).yaw_rad - before == pytest.approx(0.7, abs=0.05)
+
+
+def test_lands_and_disarms() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.fly(climb=-0.4)
+    bench.until(lambda: not bench.board.armed, 12.0)
+    assert bench.height_m < 0.06
+    bench.run(0.2)
+    assert bench.feedback.state is FlightState.LANDED
+    assert not bench.texts("disarmed"), "that was our own doing"
+    bench.fly(climb=0.5)  # and again
+    bench.until(lambda: bench.height_m > 0.8, 20.0)
+
+
+def test_a_descent_from_height_is_not_taken_for_the_ground() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.fly(climb=1.0)
+    bench.run(5.0)
+    bench.fly(climb=-0.6)
+    bench.run(4.0)
+    assert bench.board.armed
+    assert bench.height_m > 1.0
+    assert bench.climb_m_s == pytest.approx(-0.6, abs=0.1)
+
+
+def test_an_interrupted_take_off_disarms() -> None:
+    bench = Bench()
+    bench.ready()
+    bench.fly(climb=0.5)
+    bench.until(lambda: bench.board.armed, 2.0)
+    bench.fly()
+    bench.until(lambda: not bench.board.armed, 3.0)
+    assert bench.height_m < 0.1
+
+
+def test_limits() -> None:
+    bench = Bench()
+    bench.take_off()
+    setpoints = bench.session.setpoints
+    applied = bench.session.command(Attitude(0.9, 0.9, 9.0, -9.0), bench.clock.now_ns)
+    assert isinstance(applied, Attitude)
+    assert math.hypot(applied.roll, applied.pitch) == pytest.approx(setpoints.limits.tilt)
+    assert (applied.climb, applied.yaw_rate) == (setpoints.limits.climb, -setpoints.limits.yaw_rate)
+    assert bench.session.command(Idle(), bench.clock.now_ns) == Idle()
+
+
+# Refusals ------------------------------------------------------------------------------------------------------------
+
+
+def test_refused_arming_is_told_by_name() -> None:
+    bench = Bench(BoardSettings(flags=bit("NO_ACC_CAL") | bit("ANGLE")))
+    bench.run(2.0)
+    with pytest.raises(DriverError, match=r"ANGLE \(it is not level\); NO_ACC_CAL \(its accelerometer was never"):
+        bench.fly(climb=0.5)
+    assert "NO_ACC_CAL" in str(bench.feedback.native and bench.feedback.native["arming.flags"])
+    assert any(not each.good and "NO_ACC_CAL" in each.detail for each in bench.session.diagnose())
+
+
+def test_what_appears_while_it_arms_is_told_by_name() -> None:
+    bench = Bench(BoardSettings(boot_s=30.0))
+    bench.run(2.0)
+    bench.fly(climb=0.5)  # waits for what passes by itself
+    bench.until(lambda: bool(bench.texts("arming_refused")), 5.0)
+    assert "BOOTGRACE" in bench.texts("arming_refused")[0]
+    assert not bench.board.armed
+    with pytest.raises(DriverError, match="BOOTGRACE"):
+        bench.fly(climb=0.5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (BoardSettings(ranges=(ModeRange(1, 1, 900, 2100),)), "no AUX channel arms it"),
+        (BoardSettings(ranges=(ModeRange(0, 0, 1700, 2100),)), "no AUX channel switches ANGLE mode on"),
+        (BoardSettings(rx_msp=False), "sticks do not come by MSP"),
+        (BoardSettings(on_loss=((OnLoss.HOLD, 1500),) * 18), "holds the last roll, pitch, yaw, throttle"),
+    ],
+)
+def test_unsafe_settings_are_refused(settings: BoardSettings, told: str) -> None:
+    bench = Bench(settings)
+    bench.run(2.0)
+    with pytest.raises(DriverError, match=told):
+        bench.fly(climb=0.5)
+    assert any(told in text for text in bench.texts("setup"))
+    assert bench.sink.link_state is LinkState.UP, "it can be watched all the same"
+
+
+def test_a_late_failsafe_is_warned_of() -> None:
+    bench = Bench(BoardSettings(failsafe=FailsafeConfig(5.0, 10.0, 1300, 10.0, 0)))
+    bench.run(1.0)
+    assert any("after 5 s only" in text for text in bench.texts("setup"))
+    bench.take_off()
+
+
+def test_without_a_measured_climb_nothing_takes_off() -> None:
+    bench = Bench(BoardSettings(barometer=False, gps=False), poses=False)
+    bench.run(2.0)
+    with pytest.raises(DriverError, match="its climb is not measured"):
+        bench.fly(climb=0.5)
+
+
+def test_other_firmware_is_not_flown() -> None:
+    bench = Bench()
+    bench.cut = True
+    bench.tick()
+    now_ns = bench.clock.now_ns
+    for function, payload in ((1, b"\0\1\x2a"), (2, b"CLFL"), (3, b"\2\6\0"), (4, b"ABCD"), (101, bytes(20))):
+        bench.session.poll(now_ns)
+        bench.session.receive(encode(Frame(function, payload, Direction.REPLY)), now_ns)
+    for publish in bench.session.drain():
+        publish(bench.sink)
+    assert bench.sink.link_state is LinkState.DEGRADED
+    assert "'CLFL'" in bench.sink.links[-1][1]
+
+
+# Silence -------------------------------------------------------------------------------------------------------------
+
+
+def test_silence_drops_it_after_the_firmwares_failsafe() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.cut = True
+    bench.until(lambda: not bench.board.armed, 1.6)
+    assert bench.sink.link_state is LinkState.LOST
+    bench.cut = False
+    bench.until(lambda: bench.sink.link_state is LinkState.UP, 3.0)
+    bench.run(0.5)
+    assert bench.feedback.state is FlightState.LANDED
+    bench.run(3.0)
+    assert not bench.board.armed, "it is not armed again by itself"
+
+
+def test_a_short_cut_is_flown_through() -> None:
+    landing = FailsafeConfig(1.5, 10.0, 1310, 10.0, 0)
+    bench = Bench(BoardSettings(failsafe=landing))
+    bench.take_off()
+    bench.fly(climb=0.8)
+    bench.run(3.0)
+    bench.fly()
+    bench.cut = True
+    bench.run(1.9)
+    bench.cut = False
+    bench.until(lambda: bench.sink.link_state is LinkState.UP, 3.0)
+    bench.run(2.0)
+    assert bench.board.armed
+    assert bench.feedback.state is FlightState.FLYING
+    assert bench.height_m > 0.5
+    assert abs(bench.climb_m_s) < 0.3
+
+
+def test_without_replies_it_sinks_level_and_is_disarmed() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.fly(pitch=0.3)
+    bench.run(0.3)
+    bench.deaf = True
+    bench.poses = False
+    bench.run(1.5)
+    assert abs(bench.simulation.truth(0).pitch_rad) < 0.03
+    assert -3.0 < bench.climb_m_s < 0.05
+    assert "sinks" in bench.texts("blind")[0]
+    bench.until(lambda: not bench.board.armed, 7.0)
+
+
+def test_poses_that_stop_leave_the_barometer() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.poses = False
+    bench.run(3.0)
+    assert not bench.texts("blind")
+    assert abs(bench.climb_m_s) < 0.1
+
+
+def test_hover_survives_a_new_proxy() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.reconnect()
+    bench.until(lambda: bench.sink.link_state is LinkState.UP, 3.0)
+    bench.run(2.0)
+    assert bench.board.armed, "what flies is not disarmed by a new connection"
+    assert bench.feedback.state is FlightState.FLYING
+    assert abs(bench.climb_m_s) < 0.15
+
+
+def test_standing_is_disarmed_with_the_last_words() -> None:
+    bench = Bench()
+    bench.ready()
+    bench.fly(climb=0.5)
+    bench.until(lambda: bench.board.armed, 2.0)
+    words = bench.session.last_words(bench.clock.now_ns)
+    assert channels(words[5:-1])[4] == 1000, "the arm switch is off"
+    bench.take_off()
+    assert bench.session.last_words(bench.clock.now_ns) == b""
+
+
+def test_sticks_are_held_back_while_none_is_acknowledged() -> None:
+    bench = Bench()
+    bench.ready()
+    bench.deaf = True
+    bench.run(0.2)
+    before = len([frame for frame in bench.sent if frame.function == Function.SET_RAW_RC])
+    bench.run(0.5)
+    sent = len([frame for frame in bench.sent if frame.function == Function.SET_RAW_RC]) - before
+    assert sent <= 21, "not the 25 of a healthy link: what waits would be obeyed late"
+
+
+# Stops ---------------------------------------------------------------------------------------------------------------
+
+
+def test_emergency_stop_until_the_reset() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    with pytest.raises(DriverError, match="motors still run"):
+        bench.session.command(ResetEmergency(), bench.clock.now_ns)
+    bench.until(lambda: not bench.board.armed, 0.2)
+    bench.run(2.0)
+    assert bench.feedback.state is FlightState.EMERGENCY
+    assert bench.session.command(Attitude(climb=0.5), bench.clock.now_ns) == Attitude()
+    bench.session.command(ResetEmergency(), bench.clock.now_ns)
+    bench.run(0.2)
+    assert bench.feedback.state is FlightState.LANDED
+
+
+def test_a_crash_disarms_and_is_told() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.board.crashed()
+    bench.run(0.5)
+    assert "disarmed in flight: CRASH" in bench.texts("disarmed")[0]
+    assert bench.feedback.state is FlightState.LANDED
+
+
+# A pilot's receiver ---------------------------------------------------------------------------------------------------
+
+OVERRIDE = "msp://tcp:127.0.0.1:5761?override=1"
+
+
+def test_override_needs_its_switch_and_a_receiver() -> None:
+    bench = Bench(text=OVERRIDE)
+    bench.run(1.0)
+    told = " ".join(bench.texts("setup"))
+    assert "no switch gives the sticks away" in told
+    assert "there is no pilot's" in told
+    assert "holds the last sticks for ever" in told
+    with pytest.raises(DriverError, match="no switch gives"):
+        bench.fly(climb=0.5)
+    assert options(OVERRIDE).override
+
+
+def test_actions_that_it_does_not_name_are_no_surprise() -> None:
+    bench = Bench()
+    with pytest.raises(AssertionError):
+        bench.session.command(Hover(), bench.clock.now_ns)
