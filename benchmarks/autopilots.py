@@ -55,6 +55,7 @@ class AgreementRow(msgspec.Struct, frozen=True):
     pitch_deg: Spread
     yaw_deg: Spread
     position_m: Spread | None  #: distance; None: it does not report its position
+    position_wander_m: Spread | None  #: the same without its mean, which is what its GPS was wrong by meanwhile
 
 
 class FlightRow(msgspec.Struct, frozen=True):
@@ -74,7 +75,7 @@ class Agreement:
     """Compares each sample with the truth beside it. ``angles``: roll, pitch, yaw [rad]."""
 
     angles: list[tuple[float, float, float]] = field(default_factory=list)
-    distances_m: list[float] = field(default_factory=list)
+    errors_m: list[tuple[float, ...]] = field(default_factory=list)
     begun_ns: int = 0
     ended_ns: int = 0
 
@@ -88,20 +89,22 @@ class Agreement:
         roll, pitch, yaw = (wrap_angle(float(a or 0.0) - float(str(b))) for a, b in zip(said, true, strict=False))
         self.angles.append((roll, pitch, yaw))
         if feedback.position_m is not None:
-            self.distances_m.append(math.dist(feedback.position_m, [float(str(each)) for each in true[3:]]))
+            self.errors_m.append(tuple(a - float(str(b)) for a, b in zip(feedback.position_m, true[3:], strict=True)))
         self.begun_ns = self.begun_ns or feedback.captured_ns
         self.ended_ns = feedback.captured_ns
 
     def row(self) -> AgreementRow:
         """Return the figures."""
         degrees = [[math.degrees(one) for one in column] for column in zip(*self.angles, strict=True)]
+        means = [sum(column) / len(self.errors_m) for column in zip(*self.errors_m, strict=True)]
         return AgreementRow(
             seconds=(self.ended_ns - self.begun_ns) / 1e9,
             samples=len(self.angles),
             roll_deg=Spread.of(degrees[0]),
             pitch_deg=Spread.of(degrees[1]),
             yaw_deg=Spread.of(degrees[2]),
-            position_m=Spread.of(self.distances_m) if self.distances_m else None,
+            position_m=Spread.of([math.hypot(*error) for error in self.errors_m]) if means else None,
+            position_wander_m=Spread.of([math.dist(error, means) for error in self.errors_m]) if means else None,
         )
 
 
@@ -157,8 +160,12 @@ def fly_square(drone: skyloop.Drone, seconds: float) -> int:
     until_s, corners = time.monotonic() + seconds, 0
     while time.monotonic() < until_s:
         x, y = SQUARE[corners % len(SQUARE)]
-        drone.go_to(x=x, y=y, z=HEIGHT_M, speed=0.8, timeout_s=30.0, tolerance_m=0.3)
-        corners += 1
+        try:
+            drone.go_to(x=x, y=y, z=HEIGHT_M, speed=0.8, timeout_s=30.0, tolerance_m=0.3)
+        except RefusedError:  # a busy computer: it hovered meanwhile, and is sent on
+            time.sleep(0.5)
+        else:
+            corners += 1
     return corners
 
 

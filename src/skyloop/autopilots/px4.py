@@ -40,7 +40,14 @@ RANGE_EVERY: Final = 10
 PROBE_EVERY: Final = 25  #: of its steps, while it is silent
 MAX_BACKLOG: Final = 4096  #: bytes that wait to be sent; PX4 does not read any more then
 MAX_READ: Final = 65536
+#: What PX4 must know of this vehicle; and without a remote control it is to hold its place when set-points stop.
+PARAMETERS: Final = {
+    "MPC_THR_HOVER": "0.7",
+    "THR_MDL_FAC": "0.78",  # thrust is the square of a speed that begins at an eighth of the full one
+    "COM_OBL_RC_ACT": "5",
+}
 _EVERYTHING: Final = 0b1_1011_1111_1111  #: all readings but the differential pressure are new
+_NO_LOGS: Final = {"SDLOG_MODE": "-1"}
 _SYSTEM, _COMPONENT = 1, 200
 _DOWN: Final = 25  # MAV_SENSOR_ROTATION_PITCH_270
 _FIX_3D: Final = 3
@@ -107,8 +114,8 @@ class Px4(CoupledFirmware):
 
     def _prepare(self, folder: Path) -> Launch:  # noqa: ARG002  it keeps its parameters where it runs
         environment = {"PX4_SIM_MODEL": MODEL, "PX4_SYS_AUTOSTART": AIRFRAME, "PX4_SIM_HOSTNAME": LOOPBACK}
-        if not self.keeps_folder:
-            environment["PX4_PARAM_SDLOG_MODE"] = "-1"
+        parameters = PARAMETERS if self.keeps_folder else {**PARAMETERS, **_NO_LOGS}
+        environment.update({f"PX4_PARAM_{name}": value for name, value in parameters.items()})
         command = (self._program, "-i", str(self._instance), "-d", str(self._files()))
         return Launch(command, environment)
 

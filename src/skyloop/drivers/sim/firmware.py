@@ -56,8 +56,8 @@ _SEVERITIES: Final = {
 }
 _KEPT_REPORTS: Final = 64
 _POSE_STD_M: Final = 0.001
-#: The state that firmware reports is no older: it comes over loopback. Where the simulation is slower than real time, the
-#: firmware's clock is too, and its driver, which takes it for a good one, would say otherwise.
+#: The state that firmware reports is no older: it comes over loopback. Where the simulation is slower than real time,
+#: so is the firmware's clock, and its driver, which takes it for a good one, would say otherwise.
 _OLDEST_NS: Final = nanoseconds(0.05)
 _LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
 
@@ -204,9 +204,7 @@ class FirmwareFlight:
             return feedback
         captured_ns = max(feedback.captured_ns, reports[-1].captured_ns - _OLDEST_NS)
         native = truth_of(truth_at(reports, captured_ns), self._options)
-        return msgspec.structs.replace(
-            feedback, captured_ns=captured_ns, native={**(feedback.native or {}), **native}
-        )
+        return msgspec.structs.replace(feedback, captured_ns=captured_ns, native={**(feedback.native or {}), **native})
 
 
 class _InnerSink:
