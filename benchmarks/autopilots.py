@@ -192,15 +192,15 @@ def fly(autopilot: str, square_s: float, follow_s: float, say: Callable[[str], o
         with compared(drone) as agreement:
             corners = fly_square(drone, square_s)
         say(f"{corners} corners")
-        follower = follow(drone, follow_s)
+        follower = follow(drone, follow_s) if follow_s else None
         drone.land(timeout_s=60.0)
         return FlightRow(
             autopilot=autopilot,
             ready_s=ready_s,
             corners=corners,
             agreement=agreement.row(),
-            marker_frames=follower.score.frames,
-            marker_in_view=follower.score.share_in_view,
+            marker_frames=0 if follower is None else follower.score.frames,
+            marker_in_view=None if follower is None else follower.score.share_in_view,
             collisions=sum(event.kind == "collision" for event in drone.recent_events()),
         )
 
