@@ -74,6 +74,7 @@ COMMANDS: Final = {
     "cockpit": Entry(
         Task.SEE, "cockpit", "cockpit", "A page in the browser to watch and fly drones", "cockpit --port 8000"
     ),
+    "view": Entry(Task.SEE, "view", "view", "Show drones live in Foxglove or Rerun", "view alpha --foxglove"),
     "process": Entry(
         Task.SEE,
         "process",

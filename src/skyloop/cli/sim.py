@@ -10,6 +10,7 @@ from urllib.parse import urlencode
 
 import typer
 
+from skyloop.autopilots.kinds import AutopilotKind
 from skyloop.cli.firmware import Firmware, Serving, serve
 from skyloop.cli.network import (
     ConnectOption,
@@ -53,6 +54,14 @@ def sim(
     option: Annotated[
         list[str] | None,
         typer.Option(metavar="KEY=VALUE", help="Any other option of sim://, e.g. cameras=front; may be repeated"),
+    ] = None,
+    autopilot: Annotated[
+        AutopilotKind | None,
+        typer.Option(
+            metavar="KIND",
+            help="Real firmware flies the drones: ardupilot, betaflight or px4; its program by SKYLOOP_ARDUCOPTER, "
+            "SKYLOOP_BETAFLIGHT or SKYLOOP_PX4",
+        ),
     ] = None,
     network: ServeOption = None,
     listen: ListenOption = None,
@@ -100,13 +109,18 @@ def sim(
 ) -> None:
     """Simulate drones that see one another in one world, each with a proxy of its own, until Ctrl-C.
 
-    With --firmware each is a real drone's firmware on the network instead, for any program that flies the real one.
+    With --autopilot real ArduCopter, PX4 or Betaflight flies them (docs/autopilots.md). With --firmware each is an
+    emulated drone's firmware on the network instead, for any program that flies the real one.
+
+    Examples: skyloop sim --drones 2; SKYLOOP_ARDUCOPTER=bin/arducopter skyloop sim --autopilot ardupilot --option
+    cameras=front.
     """
     from skyloop.cli.simulating import settle
     from skyloop.drivers.sim import options_of
     from skyloop.drivers.uri import parse_uri
 
-    uri = parse_uri(address(world, seed, speed, option or []))
+    chosen = [] if autopilot is None else [f"autopilot={autopilot}"]
+    uri = parse_uri(address(world, seed, speed, [*chosen, *(option or [])]))
     options = options_of(uri)
     settings = {
         "--bind": bind,
@@ -133,6 +147,8 @@ def sim(
         raise UsageError("--metrics is of proxies, and with --firmware there is none: leave it out")
     if network is not None:
         raise UsageError("--network is for proxies, and with --firmware there is none: give --bind ADDRESS instead")
+    if options.autopilot is not None:
+        raise UsageError("--autopilot is real firmware and --firmware an emulation of it: give one of them")
     _refuse_for_firmware(name, uri)
     from skyloop.emulators.ardrone import Faults
 

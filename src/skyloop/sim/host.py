@@ -11,6 +11,7 @@ import numpy as np
 
 from skyloop.clock import nanoseconds
 from skyloop.errors import UsageError
+from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.options import SimOptions
 from skyloop.sim.pacing import Pacer
 from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
@@ -262,7 +263,8 @@ class _RealTimeStepper:
 
     def _run(self) -> None:
         try:
-            while not self._stop.wait(max(self._pacer.run_due(), TICK_S)):
+            least_s = STEP_S if self._host.options.autopilot is not None else TICK_S  # firmware needs even steps
+            while not self._stop.wait(max(self._pacer.run_due(), least_s)):
                 with self._publishing:
                     self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
         except Exception as error:  # noqa: BLE001  reported to every driver, so that the thread does not die silently

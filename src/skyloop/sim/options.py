@@ -36,6 +36,8 @@ class SimOptions:
         truth: Whether the drone reports its true state too.
         rate_hz: Of the reports.
         parameters: Of the vehicles.
+        autopilot: The real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``.
+        autopilot_folder: Where the firmware keeps its settings; None: they last as long as the drone.
     """
 
     world: str = "room"
@@ -53,6 +55,8 @@ class SimOptions:
     truth: bool = True
     rate_hz: float = 40.0
     parameters: VehicleParameters = STANDARD_VEHICLE
+    autopilot: str | None = None
+    autopilot_folder: str | None = None
 
     def load_world(self) -> World:
         """Load the world.

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.base import Driver, ExternalPose, Sink
 from skyloop.drivers.sim import parameters as table
-from skyloop.drivers.sim.options import options_of
+from skyloop.drivers.sim.options import firmware_options, options_of
 from skyloop.drivers.sim.setpoints import SetpointController
 from skyloop.drivers.sim.telemetry import feedback_of
 from skyloop.drivers.uri import VehicleUri
@@ -22,11 +22,13 @@ from skyloop.messages import (
     Capabilities,
     EventKind,
     Hover,
+    Land,
     LinkState,
     Parameter,
     Severity,
     Value,
 )
+from skyloop.messages.checkup import Diagnostic
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.parameters import LIMIT_RANGES, Limits
@@ -34,6 +36,7 @@ from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.sim.world import Wind, World
 
 if TYPE_CHECKING:
+    from skyloop.drivers.sim.firmware import FirmwareFlight
     from skyloop.sim.camera_pipeline import Camera
 
 _OCCURRENCES: Final = {
@@ -50,6 +53,10 @@ class SimDriver(Driver):
     [rad], ``.vx``, ``.vy``, ``.vz`` [m/s], and of each moving target ``truth.target.x``, ``.y``, ``.z``, ``.yaw`` (a
     second one is ``truth.target2``; x, y and z also by its name: ``truth.NAME.x``), all in world axes.
     ``sim.time_s`` is the simulation's own time.
+
+    With ``autopilot`` in the address real firmware flies the drone: what can be done, the feedback and most parameters
+    are those of the driver for it (``mavlink://``, ``msp://``), the rest as for any simulated drone; see
+    ``docs/autopilots.md``.
 
     Args:
         uri: The vehicle's address; its options count only without a host.
@@ -72,9 +79,21 @@ class SimDriver(Driver):
         self._setpoints: SetpointController | None = None
         self._cameras: tuple[Camera, ...] = ()
         self._world: World | None = None
+        self._firmware: FirmwareFlight | None = None  # None: the built-in autopilot flies
+        if self.options.autopilot is not None:
+            from skyloop.drivers.sim.firmware import FirmwareFlight
+
+            self._firmware = FirmwareFlight(self.options, firmware_options(uri))
+
+    @property
+    def firmware(self) -> FirmwareFlight | None:
+        """The real firmware that flies the drone; None: its built-in autopilot does."""
+        return self._firmware
 
     def capabilities(self) -> Capabilities:
         """Return the actions and cameras that the address asks for."""
+        if self._firmware is not None:
+            return self._firmware.capabilities(self.options)
         return Capabilities(
             vehicle="sim",
             actions=self.options.native,
@@ -94,12 +113,18 @@ class SimDriver(Driver):
         simulation = host.simulation
         if self._battery != self.options.battery:
             simulation.set_charge(self.drone, self._battery)
+        if self._firmware is not None:
+            self._firmware.open(host, self.drone, sink)
+            self._cameras = host.attach(self.drone, self, self, list(self._models))
+            return
         self._setpoints = None if "takeoff" in self.options.native else SetpointController(simulation, self.drone)
         simulation.set_limits(self.drone, self._in_force(self._limits))
         self._cameras = host.attach(self.drone, self, self, list(self._models))
         sink.link(LinkState.UP)
 
     def _close(self) -> None:
+        if self._firmware is not None:
+            self._firmware.close()
         if self.host is not None:
             self.host.detach(self.drone, self)
         self._battery = self.options.battery
@@ -113,12 +138,41 @@ class SimDriver(Driver):
     # Flying ----------------------------------------------------------------------------------------------------
 
     def _apply(self, action: AnyAction) -> AnyAction:
+        if self._firmware is not None:
+            return self._firmware.apply(action, new=True)
         if action.name not in self.options.native:
             return super()._apply(action)
         host = self.host
         if host is None or self._sink is None or not self._link:
             return action  # lost: the drone receives nothing
         return self._command(host, action)
+
+    def _repeat(self, action: AnyAction) -> AnyAction:
+        return self._apply(action) if self._firmware is None else self._firmware.apply(action, new=False)
+
+    def check(self, action: AnyAction) -> None:
+        """Refuse what the firmware would not do; the built-in autopilot refuses nothing."""
+        if self._firmware is not None:
+            self._firmware.driver.check(action)
+
+    def left_to(self) -> str:
+        """Return what others made of the firmware's mode; nobody else flies the built-in autopilot."""
+        return "" if self._firmware is None else self._firmware.driver.left_to()
+
+    def failsafe(self, action: Hover | Land) -> bool:
+        """Apply an action while nobody is in command, as the firmware's driver does it."""
+        return super().failsafe(action) if self._firmware is None else self._firmware.driver.failsafe(action)
+
+    def external_pose(self, pose: ExternalPose) -> None:
+        """Give a pose to the firmware; the built-in autopilot takes none."""
+        if self._firmware is None:
+            super().external_pose(pose)
+        else:
+            self._firmware.external_pose(pose)
+
+    def checkup(self) -> list[Diagnostic]:
+        """Return what needs attention about the firmware."""
+        return [] if self._firmware is None else self._firmware.driver.checkup()
 
     def _command(self, host: SimHost, action: AnyAction) -> AnyAction:
         if self._setpoints is not None:
@@ -131,7 +185,8 @@ class SimDriver(Driver):
         """Return limits, cameras, battery, wind, the radio link, the room and what stands in it."""
         world = self._known_world()
         surroundings = [] if world is None else [table.room(world.room), table.geometry(world)]
-        return [*table.describe(self._present(), self._standard()), *surroundings]
+        firmware = [] if self._firmware is None else self._firmware.driver.parameters()
+        return [*table.describe(self._present(), self._standard()), *surroundings, *firmware]
 
     def set_parameter(self, name: str, value: Value) -> Value:
         """Write a parameter. The wind is the whole world's.
@@ -140,6 +195,8 @@ class SimDriver(Driver):
             UnknownNameError: There is no such parameter.
             ParameterError: It does not take this value.
         """
+        if self._firmware is not None and name not in table.names(self._present()):
+            return self._firmware.driver.set_parameter(name, value)
         with self._changing:
             before, standard = self._present(), self._standard()
             after = table.with_value(before, standard, name, value)
@@ -148,10 +205,12 @@ class SimDriver(Driver):
 
     def _present(self) -> table.ParameterValues:
         wind = self._wind or (self.host.wind if self.host is not None else self._usual_wind())
-        return table.ParameterValues(self._limits, self._models, wind, self._battery, self._link)
+        limits = None if self._firmware is not None else self._limits
+        return table.ParameterValues(limits, self._models, wind, self._battery, self._link)
 
     def _standard(self) -> table.ParameterValues:
-        return table.ParameterValues(Limits(), self.options.cameras, self._usual_wind(), self.options.battery)
+        limits = None if self._firmware is not None else Limits()
+        return table.ParameterValues(limits, self.options.cameras, self._usual_wind(), self.options.battery)
 
     def _usual_wind(self) -> Wind:
         world = self._known_world()
@@ -166,7 +225,9 @@ class SimDriver(Driver):
 
     def _write(self, before: table.ParameterValues, after: table.ParameterValues) -> None:
         host = self.host if self._sink is not None else None
-        self._limits, self._models, self._battery = after.limits, after.cameras, after.battery
+        self._models, self._battery = after.cameras, after.battery
+        if after.limits is not None:
+            self._limits = after.limits
         for camera, model in zip(self._cameras, after.cameras, strict=False):
             camera.model = model
         if after.wind != before.wind:
@@ -176,7 +237,7 @@ class SimDriver(Driver):
                 host.set_wind(after.wind)
         if host is None:
             return
-        if after.limits != before.limits:
+        if after.limits is not None and after.limits != before.limits:
             host.simulation.set_limits(self.drone, self._in_force(after.limits))
         if after.battery != before.battery:
             host.simulation.set_charge(self.drone, after.battery)
@@ -188,7 +249,10 @@ class SimDriver(Driver):
         sink = self._sink
         if sink is None:
             return
-        if on:
+        if self._firmware is not None:
+            self._link = on
+            self._firmware.switch_link(on=on)
+        elif on:
             self._link = True
             sink.link(LinkState.UP)
         else:
@@ -202,6 +266,9 @@ class SimDriver(Driver):
         """Publish the drone's state, as it believes it to be and as it is. On a thread of the host."""
         believed, sink = report.believed, self._sink
         self._battery = believed.battery
+        if self._firmware is not None:
+            self._firmware.report(report)
+            return
         state = believed.state
         if self._setpoints is not None:
             self._setpoints.on_feedback(believed)

@@ -9,14 +9,20 @@ the actions that the vehicle itself takes, the others being left to the proxy (a
 knows its position, as with an indoor positioning system (1; ``none`` for one without); ``velocity`` whether it reports
 its velocity (1; ``none`` for one that does not); ``truth`` whether feedback carries the true state too (1); ``rate`` of
 feedback [1/s] (40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified,
-or that is modelled down to its rotors, ``racer``, ``iris`` or ``crazyflie`` (``quadrotor``).
+or that is modelled down to its rotors, ``racer``, ``iris`` or ``crazyflie`` (``quadrotor``); ``autopilot`` the real
+firmware that flies it, ``ardupilot``, ``betaflight`` or ``px4`` (none), on an ``iris``, or a ``racer`` for Betaflight,
+if no other is named; ``autopilot_folder`` where it keeps its settings (they last as long as the drone). With
+``autopilot`` all other options, and ``rate``, are those of the driver that speaks to the firmware, ``mavlink://`` or
+``msp://``.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Final
+from urllib.parse import urlencode
 
+from skyloop.autopilots.kinds import AutopilotKind
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
@@ -31,7 +37,14 @@ ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
 KNOWN: Final = {
     *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),
     *("renderer", "quality", "native", "position", "velocity", "truth", "rate", "vehicle"),
+    *("autopilot", "autopilot_folder"),
 }
+AUTOPILOT_VEHICLES: Final = {
+    AutopilotKind.ARDUPILOT: "iris",
+    AutopilotKind.BETAFLIGHT: "racer",
+    AutopilotKind.PX4: "iris",
+}
+TRUTH_HZ: Final = 100.0  #: how often the truth is noted that is reported beside the firmware's state
 
 
 def options_of(uri: VehicleUri) -> SimOptions:
@@ -41,7 +54,9 @@ def options_of(uri: VehicleUri) -> SimOptions:
         UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
         UsageError: An option's value makes no sense, or options don't go together.
     """
-    reject_unknown_options(uri, KNOWN)
+    autopilot = _autopilot(uri)
+    if autopilot is None:
+        reject_unknown_options(uri, KNOWN)
     if uri.place:
         raise UsageError(f"{uri}: a simulated drone has no place; did you mean sim://?world={uri.place}")
     options = uri.options
@@ -51,14 +66,19 @@ def options_of(uri: VehicleUri) -> SimOptions:
     renderer = options.get("renderer", "planar")
     if renderer not in RENDERERS:
         raise UnknownNameError("renderer", renderer, RENDERERS)
-    vehicle = options.get("vehicle", "quadrotor")
+    vehicle = options.get("vehicle", "quadrotor" if autopilot is None else AUTOPILOT_VEHICLES[autopilot])
     if vehicle not in VEHICLES:
         raise UnknownNameError("simulated vehicle", vehicle, VEHICLES)
+    if autopilot is not None and VEHICLES[vehicle].rotors is None:
+        raise UsageError(f"{uri}: firmware needs a vehicle with rotors, such as vehicle=iris: not {vehicle}")
+    speed = uri.number("speed", 1.0, minimum=0.01, maximum=100.0)
+    if autopilot is AutopilotKind.BETAFLIGHT and speed != 1.0:
+        raise UsageError(f"{uri}: Betaflight's clock is the computer's: speed is 1 with it, not {speed:g}")
     noise = uri.number("noise", 1.0, minimum=0.0, maximum=20.0)
     return SimOptions(
         world=options.get("world", "room"),
         seed=uri.whole("seed", 0),
-        speed=uri.number("speed", 1.0, minimum=0.01, maximum=100.0),
+        speed=speed,
         cameras=tuple(_camera(uri, model, noise) for model in _models(options.get("cameras", "front,bottom"))),
         noise=noise,
         wind=uri.number("wind", 1.0, minimum=0.0, maximum=20.0),
@@ -69,9 +89,32 @@ def options_of(uri: VehicleUri) -> SimOptions:
         position=options.get("position") != "none" and uri.flag("position", default=True),
         velocity=options.get("velocity") != "none" and uri.flag("velocity", default=True),
         truth=uri.flag("truth", default=True),
-        rate_hz=uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
+        rate_hz=TRUTH_HZ if autopilot is not None else uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
         parameters=VEHICLES[vehicle],
+        autopilot=None if autopilot is None else autopilot.value,
+        autopilot_folder=options.get("autopilot_folder"),
     )
+
+
+def firmware_options(uri: VehicleUri) -> str:
+    """Return the options that are those of the driver that speaks to the firmware, as a query."""
+    own = KNOWN - {"rate"}
+    return urlencode({name: value for name, value in uri.options.items() if name not in own}, safe="/,:")
+
+
+def _autopilot(uri: VehicleUri) -> AutopilotKind | None:
+    given = uri.options.get("autopilot")
+    if given is None:
+        if "autopilot_folder" in uri.options:
+            raise UsageError(f"{uri}: autopilot_folder is for real firmware: give autopilot=… as well")
+        return None
+    known = [kind.value for kind in AutopilotKind]
+    if given not in known:
+        raise UnknownNameError("autopilot of sim://", given, known)
+    for name in ("native", "velocity"):
+        if name in uri.options:
+            raise UsageError(f"{uri}: {name} is an option of the built-in autopilot, and {given} flies: leave it out")
+    return AutopilotKind(given)
 
 
 def _models(text: str) -> list[CameraModel]:

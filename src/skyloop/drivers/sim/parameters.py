@@ -35,9 +35,9 @@ _CAMERA: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ParameterValues:
-    """The values of all parameters of one drone."""
+    """The values of all parameters of one drone. Its limits are None where its firmware has limits of its own."""
 
-    limits: Limits
+    limits: Limits | None
     cameras: tuple[CameraModel, ...]
     wind: Wind
     battery: float
@@ -53,6 +53,11 @@ class _Settable:
 def describe(state: ParameterValues, standard: ParameterValues) -> list[Parameter]:
     """Return all parameters with their present values; ``standard`` holds the defaults."""
     return [entry.parameter for entry in _table(state, standard).values()]
+
+
+def names(state: ParameterValues) -> frozenset[str]:
+    """Return the names of all parameters."""
+    return frozenset(_table(state, state))
 
 
 def room(room: Room) -> Parameter:
@@ -89,11 +94,15 @@ def _table(state: ParameterValues, standard: ParameterValues) -> dict[str, _Sett
 
 
 def _limit_entries(state: ParameterValues, standard: ParameterValues) -> list[_Settable]:
+    limits = state.limits
+    if limits is None:
+        return []
+
     def entry(name: str, field: str, unit: str, description: str) -> _Settable:
-        now, usual = getattr(state.limits, field), getattr(standard.limits, field)
+        now, usual = getattr(limits, field), getattr(standard.limits, field)
 
         def write(before: ParameterValues, value: Value) -> ParameterValues:
-            return replace(before, limits=replace(before.limits, **{field: float(value)}))  # type: ignore[arg-type]
+            return replace(before, limits=replace(limits, **{field: float(value)}))  # type: ignore[arg-type]
 
         return _Settable(_number(name, now, usual, unit, LIMIT_RANGES[field], description), write)
 

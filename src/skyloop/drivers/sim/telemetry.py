@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import replace
+
 from skyloop.messages import Feedback, FlightState, Value
+from skyloop.messages.geometry import wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.options import SimOptions
+from skyloop.sim.world import Vec3
 
 
 def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feedback:
@@ -16,6 +22,9 @@ def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feed
         options: Whether the vehicle reports its position and its velocity, and whether the truth is reported too.
     """
     believed = report.believed
+    native = native_of(report, options)
+    if believed.emergency_reason:
+        native["emergency_reason"] = believed.emergency_reason
     return Feedback(
         captured_ns=report.captured_ns,
         state=state,
@@ -29,14 +38,13 @@ def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feed
         angular_velocity_rad_s=believed.angular_velocity_rad_s,
         acceleration_m_s2=believed.acceleration_m_s2,
         position_m=report.truth.position_m if options.position else None,
-        native=_native(report, options),
+        native=native,
     )
 
 
-def _native(report: Report, options: SimOptions) -> dict[str, Value]:
+def native_of(report: Report, options: SimOptions) -> dict[str, Value]:
+    """Return the simulation's time, and the truth if it is reported, as native telemetry."""
     native: dict[str, Value] = {"sim.time_s": report.truth.time_s}
-    if report.believed.emergency_reason:
-        native["emergency_reason"] = report.believed.emergency_reason
     if not options.truth:
         return native
     truth = report.truth
@@ -51,3 +59,39 @@ def _native(report: Report, options: SimOptions) -> dict[str, Value]:
         native[f"{name}.x"], native[f"{name}.y"], native[f"{name}.z"] = target.position_m
         native[f"{name}.yaw"] = target.yaw_rad
     return native
+
+
+def truth_at(reports: Sequence[Report], captured_ns: int) -> Report:
+    """Return the report of a time, with the drone's true motion interpolated between the two around it.
+
+    Args:
+        reports: At least one, oldest first.
+        captured_ns: The time; before the first and after the last, those count.
+    """
+    after = bisect_right(reports, captured_ns, key=lambda report: report.captured_ns)
+    if after == 0:
+        return reports[0]
+    if after == len(reports):
+        return reports[-1]
+    a, b = reports[after - 1], reports[after]
+    share = (captured_ns - a.captured_ns) / (b.captured_ns - a.captured_ns)
+    first, last = a.truth, b.truth
+    truth = replace(
+        first,
+        time_s=first.time_s + share * (last.time_s - first.time_s),
+        position_m=_between(first.position_m, last.position_m, share),
+        velocity_m_s=_between(first.velocity_m_s, last.velocity_m_s, share),
+        roll_rad=_turned(first.roll_rad, last.roll_rad, share),
+        pitch_rad=_turned(first.pitch_rad, last.pitch_rad, share),
+        yaw_rad=_turned(first.yaw_rad, last.yaw_rad, share),
+    )
+    return replace(a, truth=truth, captured_ns=captured_ns)
+
+
+def _between(a: Vec3, b: Vec3, share: float) -> Vec3:
+    x, y, z = (p + share * (q - p) for p, q in zip(a, b, strict=True))
+    return x, y, z
+
+
+def _turned(a: float, b: float, share: float) -> float:
+    return wrap_angle(a + share * wrap_angle(b - a))

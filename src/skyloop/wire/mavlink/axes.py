@@ -17,6 +17,8 @@ from skyloop.messages.geometry import wrap_angle
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  #: x, y, z, w
 
+_HALF = math.sqrt(0.5)
+
 
 def flip(x: float, y: float, z: float) -> Vector:
     """Body axes, either way."""
@@ -43,6 +45,12 @@ def from_wire(q: Sequence[float]) -> Quaternion:
     """The field ``q`` of a message (w, x, y, z) as x, y, z, w."""
     w, x, y, z = q
     return x, y, z, w
+
+
+def turned_axes(q: Sequence[float]) -> Quaternion:
+    """A rotation from body to world, w, x, y, z, from our axes to MAVLink's or back, up to its sign."""
+    w, x, y, z = q
+    return _HALF * (w + z), _HALF * (x + y), _HALF * (x - y), _HALF * (w - z)
 
 
 def angles_of(q: Quaternion) -> Vector:

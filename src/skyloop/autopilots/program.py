@@ -1,0 +1,207 @@
+"""A flight firmware as a child process: found, started in a folder of its own, watched, started again, ended."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from skyloop.child_process import ChildProcess
+from skyloop.errors import SkyloopError, UsageError
+
+RESTART_S: Final = 1.0  #: from the firmware's death to its next start; doubled each time that it dies soon
+LONGEST_RESTART_S: Final = 30.0
+SOON_S: Final = 10.0
+LOG: Final = "firmware.log"
+_LAST_LINES: Final = 5
+_LAST_BYTES: Final = 2000
+
+
+class FirmwareEventKind(StrEnum):
+    """What can happen to a firmware."""
+
+    STARTED = "started"  #: its process runs
+    ANSWERS = "answers"  #: it controls the rotors, for the first time or again
+    SILENT = "silent"  #: it has not answered for a while, and the rotors stand
+    DIED = "died"  #: its process ended; it is started again
+    FAILED = "failed"  #: it could not be started; that is tried again
+
+
+@dataclass(frozen=True, slots=True)
+class FirmwareEvent:
+    """Something that happened to a firmware. ``text`` is for people."""
+
+    kind: FirmwareEventKind
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """How a firmware is started: its command line, and what its environment has besides this process's."""
+
+    command: Sequence[str]
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+class Program:
+    """A firmware's process. It is started again after it ended, until :meth:`close`.
+
+    Attributes:
+        name: Of the firmware, for people.
+        starts: How often it was started.
+        pid: Its process id; 0 while it does not run.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        prepare: Callable[[Path], Launch],
+        report: Callable[[FirmwareEvent], None],
+        *,
+        folder: Path | None = None,
+        restart_s: float = RESTART_S,
+    ) -> None:
+        """Store how it is started; :meth:`start` does it.
+
+        Args:
+            name: Of the firmware, for people.
+            prepare: Called before each start with the folder it will run in; writes what it reads there. Raises
+                :class:`~skyloop.errors.SkyloopError` or ``OSError`` if it can't be started now.
+            report: Called with each event, on a thread of this object.
+            folder: Where it runs and keeps its settings; None: a new one, which is removed at the end.
+            restart_s: From its death to its next start [s].
+        """
+        self.name = name
+        self.starts = 0
+        self.pid = 0
+        self._prepare = prepare
+        self._report = report
+        self._folder = folder
+        self._restart_s = restart_s
+        self._lock = threading.Lock()
+        self._ending = threading.Event()
+        self._child: ChildProcess | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def running(self) -> bool:
+        """Whether its process runs."""
+        return self.pid != 0
+
+    def start(self) -> None:
+        """Start it, on a thread that watches it from then on."""
+        self._thread = threading.Thread(target=self._run, name="skyloop-firmware", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End it. Idempotent."""
+        with self._lock:
+            self._ending.set()
+            child = self._child
+        if child is not None:
+            child.end()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        if self._folder is not None:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._watch(self._folder)
+            return
+        with tempfile.TemporaryDirectory(prefix="skyloop-firmware-", ignore_cleanup_errors=True) as folder:
+            self._watch(Path(folder))
+
+    def _watch(self, folder: Path) -> None:
+        pause_s = self._restart_s
+        while not self._ending.is_set():
+            begun_s = time.monotonic()
+            try:
+                ended = self._run_once(folder)
+            except (SkyloopError, OSError) as error:
+                self._report(FirmwareEvent(FirmwareEventKind.FAILED, f"{self.name} can't be started: {error}"))
+            else:
+                if not self._ending.is_set():
+                    self._report(FirmwareEvent(FirmwareEventKind.DIED, f"{self.name} {ended}{_last_words(folder)}"))
+            soon = time.monotonic() - begun_s < SOON_S
+            self._ending.wait(pause_s)
+            pause_s = min(2 * pause_s, LONGEST_RESTART_S) if soon else self._restart_s
+
+    def _run_once(self, folder: Path) -> str:
+        """Run it until it ends; return how, for people."""
+        launch = self._prepare(folder)
+        settings = [f"{name}={value}" for name, value in launch.environment.items()]
+        keeper = [sys.executable, "-m", "skyloop.autopilots.keeper", str(folder), str(folder / LOG), *settings]
+        with self._lock:
+            if self._ending.is_set():
+                return ""
+            child = self._child = ChildProcess([*keeper, "--", *launch.command])
+        try:
+            number = child.stdout.readline()
+            if not number:
+                child.wait()
+                raise UsageError(f"its process could not be started{child.quoted_output}")
+            self.starts += 1
+            self.pid = int(number)
+            self._report(FirmwareEvent(FirmwareEventKind.STARTED, f"{self.name} runs as process {self.pid}"))
+            child.wait()
+            return _ending(child.code)
+        finally:
+            self.pid = 0
+            with self._lock:
+                self._child = None
+            child.close()
+
+
+def find_program(variable: str, names: Sequence[str], what: str, where: str) -> str:
+    """Return the path of a firmware's program.
+
+    Args:
+        variable: The environment variable that has it, if it is set.
+        names: What it is called on the search path.
+        what: The firmware, for people.
+        where: Where its program comes from, for people.
+
+    Raises:
+        UsageError: There is none.
+    """
+    given = os.environ.get(variable)
+    if given:
+        path = Path(given).expanduser()
+        if not (path.is_file() and os.access(path, os.X_OK)):
+            raise UsageError(f"{variable} is {given!r}, which is no program: it must be the path of {what}'s")
+        return str(path.resolve())
+    for name in names:
+        found = shutil.which(name)
+        if found is not None:
+            return found
+    raise UsageError(f"{what}'s program is not here: set {variable} to its path. {where}")
+
+
+def _ending(code: int | None) -> str:
+    if code is not None and code > 128:
+        name = str(code - 128)
+        with suppress(ValueError):
+            name = signal.Signals(code - 128).name
+        return f"was killed by {name}"
+    return f"ended with exit code {code}"
+
+
+def _last_words(folder: Path) -> str:
+    try:
+        with (folder / LOG).open("rb") as log:
+            log.seek(max(0, log.seek(0, os.SEEK_END) - _LAST_BYTES))
+            lines = log.read().decode(errors="replace").split("\n")
+    except OSError:
+        return ""
+    text = "\n".join(line.rstrip() for line in lines if line.strip())
+    return "; its output ends with:\n" + "\n".join(text.split("\n")[-_LAST_LINES:]) if text else ""

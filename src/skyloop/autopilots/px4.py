@@ -1,0 +1,310 @@
+"""PX4 in the simulated world, by MAVLink's messages for hardware in the loop and in step with it.
+
+PX4 connects to a TCP server, port 4560 and one more for each further vehicle. ``HIL_SENSOR`` is its clock: it answers
+each with ``HIL_ACTUATOR_CONTROLS`` once its startup has come so far that motors are driven.
+https://docs.px4.io/main/en/simulation/#px4-mavlink-api
+"""
+
+from __future__ import annotations
+
+import math
+import select
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from skyloop.autopilots.coupling import Commands, CoupledFirmware
+from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
+from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
+from skyloop.errors import UsageError
+from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, geodetic
+from skyloop.sim.firmware import GpsFix, Readings
+from skyloop.wire.mavlink.axes import flip, swap, turned_axes
+
+VARIABLE: Final = "SKYLOOP_PX4"
+WHERE: Final = (
+    "How to get it: https://docs.px4.io/main/en/dev_setup/building_px4.html (px4_sitl); it is bin/px4 of the build"
+)
+MODEL: Final = "none_iris"  #: PX4's quadrotor for a simulator that it does not start itself
+AIRFRAME: Final = "10016"
+SIMULATOR_PORT = 4560  # each of these ports plus the number of the instance
+TELEMETRY_PORT = 14540
+COMPANION_PORT = 14580
+STATION_PORT = 18570
+MOST_INSTANCES: Final = 10  #: beyond, PX4 sends all vehicles to one port
+STEPS: Final = 4  #: of the plant for one of PX4: 250 Hz, which its startup for such simulators expects
+STEP_US: Final = 4000
+TRUTH_EVERY: Final = 5  #: of its steps
+RANGE_EVERY: Final = 10
+PROBE_EVERY: Final = 25  #: of its steps, while it is silent
+MAX_BACKLOG: Final = 4096  #: bytes that wait to be sent; PX4 does not read any more then
+MAX_READ: Final = 65536
+#: What PX4 must know of this vehicle; and without a remote control it is to hold its place when set-points stop.
+PARAMETERS: Final = {
+    "MPC_THR_HOVER": "0.7",
+    "THR_MDL_FAC": "0.78",  # thrust is the square of a speed that begins at an eighth of the full one
+    "COM_OBL_RC_ACT": "5",
+}
+_EVERYTHING: Final = 0b1_1011_1111_1111  #: all readings but the differential pressure are new
+_NO_LOGS: Final = {"SDLOG_MODE": "-1"}
+_SYSTEM, _COMPONENT = 1, 200
+_DOWN: Final = 25  # MAV_SENSOR_ROTATION_PITCH_270
+_FIX_3D: Final = 3
+_UNKNOWN_COURSE: Final = 65535
+
+
+class Px4(CoupledFirmware):
+    """PX4, flying a simulated drone. See :class:`CoupledFirmware`.
+
+    Raises:
+        MissingExtraError: pymavlink is not installed.
+    """
+
+    NAME: ClassVar[str] = "PX4"
+    IN_STEP: ClassVar[bool] = True
+
+    def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
+        from skyloop.wire.mavlink.codec import Codec
+
+        super().__init__(on_event, folder=folder)
+        self._codec = Codec(_SYSTEM, _COMPONENT)
+        self._program = ""
+        self._instance: int | None = None
+        self._server: socket.socket | None = None
+        self._link: socket.socket | None = None
+        self._backlog = b""
+        self._step = 0
+        self._sent = 0  # states
+        self._inertial: list[tuple[float, ...]] = []  # gyro and accelerometer since the last state
+        self._fix: GpsFix | None = None
+        self._own_us = STEP_US  # PX4's time: stands still while it is silent
+        self._wanted_us = 0  # commands older than this answer something else
+
+    @property
+    def address(self) -> str:
+        """Where it sends MAVLink to. A ground station on this computer that listens to UDP port 14550 finds it too."""
+        i = self._instance
+        assert i is not None, "not started"
+        peer = f"peer={LOOPBACK}:{COMPANION_PORT + i}"
+        origin = f"origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"
+        return f"mavlink://udpin:{LOOPBACK}:{TELEMETRY_PORT + i}?sysid={i + 1}&{peer}&{origin}"
+
+    def _open(self) -> None:
+        self._program = find_program(VARIABLE, ("px4",), self.NAME, WHERE)
+        if not self._files().is_dir():
+            raise UsageError(f"{self._program} has no {self._files()}: {VARIABLE} must be bin/px4 of a whole build")
+        self._instance = reserve_instance(self.NAME, MOST_INSTANCES, _ports)
+        self._server = bound(socket.SOCK_STREAM, SIMULATOR_PORT + self._instance)
+        self._server.listen(1)
+        self._server.setblocking(False)
+
+    def _files(self) -> Path:
+        """Return the folder of PX4's startup scripts, beside the program's."""
+        return Path(self._program).resolve().parent.parent / "etc"
+
+    def _close(self) -> None:
+        self._hang_up()
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        if self._instance is not None:
+            release_instance(self.NAME, self._instance)
+            self._instance = None
+
+    def _prepare(self, folder: Path) -> Launch:  # noqa: ARG002  it keeps its parameters where it runs
+        environment = {"PX4_SIM_MODEL": MODEL, "PX4_SYS_AUTOSTART": AIRFRAME, "PX4_SIM_HOSTNAME": LOOPBACK}
+        parameters = PARAMETERS if self.keeps_folder else {**PARAMETERS, **_NO_LOGS}
+        environment.update({f"PX4_PARAM_{name}": value for name, value in parameters.items()})
+        command = (self._program, "-i", str(self._instance), "-d", str(self._files()))
+        return Launch(command, environment)
+
+    def _begin(self) -> None:
+        self._hang_up()
+        self._codec = type(self._codec)(_SYSTEM, _COMPONENT)
+        self._backlog, self._step, self._sent, self._fix = b"", 0, 0, None
+        self._own_us, self._wanted_us = STEP_US, 0
+        self._inertial.clear()
+
+    # Receiving ---------------------------------------------------------------------------------------------------
+
+    def _receive(self, wait_s: float) -> Commands | None:
+        if self._link is None and not self._accept():
+            return None
+        commands: Commands | None = None
+        while (link := self._link) is not None:
+            if wait_s > 0.0 and commands is None and not select.select([link], [], [], wait_s)[0]:
+                break
+            data = self._read(link)
+            if not data:
+                break
+            for message in self._codec.decode(data):
+                if message.get_type() == "HIL_ACTUATOR_CONTROLS" and message.time_usec >= self._wanted_us:
+                    commands = _commands(message.controls)
+            if wait_s > 0.0 and commands is not None:
+                break
+        return commands
+
+    def _accept(self) -> bool:
+        if self._server is None:
+            return False
+        try:
+            link, _ = self._server.accept()
+        except OSError:
+            return False
+        link.setblocking(False)
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._link = link
+        return True
+
+    def _read(self, link: socket.socket) -> bytes:
+        try:
+            data = link.recv(MAX_READ)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            self._hang_up()
+        return data
+
+    def _hang_up(self) -> None:
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    # Sending -----------------------------------------------------------------------------------------------------
+
+    def _send(self, readings: Readings) -> None:
+        self._inertial.append((*readings.gyro_rad_s, *readings.acceleration_m_s2))
+        self._fix = readings.gps or self._fix
+        self._step += 1
+        if self._step % STEPS:
+            return
+        inertial = [sum(column) / len(self._inertial) for column in zip(*self._inertial, strict=True)]
+        self._inertial.clear()
+        if self._link is None:
+            return
+        if self._owed and not self._patient and self._answered_s is not None and self._step % (STEPS * PROBE_EVERY):
+            return  # it hangs: what it would be told now is old when it reads again
+        messages = [*self._due(readings), self._sensor(readings, inertial)]
+        self._transmit(b"".join(self._codec.encode(message) for message in messages))
+        self._wanted_us = self._own_us if self._patient else 0
+        self._sent += 1
+        self._own_us += STEP_US
+        self._owed = True
+
+    def _due(self, readings: Readings) -> list[Any]:
+        """Return what PX4 gets at lower rates, before the message that makes its clock go on."""
+        due = []
+        if self._fix is not None:
+            due.append(self._gps(self._fix))
+            self._fix = None
+        if self._sent % TRUTH_EVERY == 0:
+            due.append(self._truth(readings))
+        if self._sent % RANGE_EVERY == 0 and readings.range_m is not None:
+            due.append(self._range(readings.range_m))
+        return due
+
+    def _transmit(self, data: bytes) -> None:
+        link = self._link
+        if link is None or len(self._backlog) > MAX_BACKLOG:
+            return
+        self._backlog += data
+        try:
+            sent = link.send(self._backlog)
+        except BlockingIOError:
+            return
+        except OSError:
+            self._hang_up()
+            return
+        self._backlog = self._backlog[sent:]
+
+    def _sensor(self, readings: Readings, inertial: list[float]) -> Any:
+        from skyloop.wire.mavlink.codec import dialect
+
+        gyro, acceleration = flip(*inertial[:3]), flip(*inertial[3:])
+        return dialect.MAVLink_hil_sensor_message(
+            self._own_us,
+            *acceleration,
+            *gyro,
+            *flip(*readings.magnetic_gauss),
+            abs_pressure=readings.pressure_pa / 100.0,
+            diff_pressure=0.0,
+            pressure_alt=ALTITUDE_M + readings.position_m[2],
+            temperature=readings.temperature_c,
+            fields_updated=_EVERYTHING,
+        )
+
+    def _gps(self, fix: GpsFix) -> Any:
+        from skyloop.wire.mavlink.codec import dialect
+
+        east, north, up = fix.velocity_m_s
+        speed = math.hypot(east, north)
+        course = (
+            round(math.degrees(math.atan2(east, north)) % 360.0 * 100.0) % 36000 if speed > 0.1 else _UNKNOWN_COURSE
+        )
+        return dialect.MAVLink_hil_gps_message(
+            self._own_us,
+            _FIX_3D,
+            round(fix.latitude_deg * 1e7),
+            round(fix.longitude_deg * 1e7),
+            round(fix.altitude_m * 1000.0),
+            round(fix.horizontal_error_m * 100.0),
+            round(fix.vertical_error_m * 100.0),
+            round(speed * 100.0),
+            round(north * 100.0),
+            round(east * 100.0),
+            round(-up * 100.0),
+            course,
+            fix.satellites,
+        )
+
+    def _truth(self, readings: Readings) -> Any:
+        from skyloop.wire.mavlink.codec import dialect
+
+        latitude, longitude, altitude = geodetic(readings.position_m)
+        north, east, down = swap(*readings.velocity_m_s)
+        speed_cm_s = min(65535, round(math.hypot(north, east, down) * 100.0))
+        return dialect.MAVLink_hil_state_quaternion_message(
+            self._own_us,
+            turned_axes(readings.quaternion),
+            *flip(*readings.rates_rad_s),
+            round(latitude * 1e7),
+            round(longitude * 1e7),
+            round(altitude * 1000.0),
+            *(_short(v * 100.0) for v in (north, east, down)),
+            speed_cm_s,
+            speed_cm_s,
+            *(_short(a / 9.80665 * 1000.0) for a in flip(*readings.acceleration_m_s2)),
+        )
+
+    def _range(self, range_m: float) -> Any:
+        from skyloop.wire.mavlink.codec import dialect
+
+        return dialect.MAVLink_distance_sensor_message(
+            self._own_us // 1000 & 0xFFFFFFFF, 5, 1000, round(range_m * 100.0), 0, 0, _DOWN, 0
+        )
+
+
+def _commands(controls: list[float]) -> Commands | None:
+    """Return rotor commands in the simulation's order; None for what is no command. PX4's X has ArduCopter's order."""
+    motors = controls[:4]
+    if not all(map(math.isfinite, motors)):
+        return None
+    front_right, rear_left, front_left, rear_right = (max(0.0, motor) for motor in motors)
+    return front_left, front_right, rear_left, rear_right
+
+
+def _short(value: float) -> int:
+    return max(-32768, min(32767, round(value)))
+
+
+def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:
+    """Return the ports of an instance: the simulator's; PX4's own; and the one that it sends telemetry to."""
+    return [
+        (socket.SOCK_STREAM, SIMULATOR_PORT + instance),
+        (socket.SOCK_DGRAM, COMPANION_PORT + instance),
+        (socket.SOCK_DGRAM, TELEMETRY_PORT + instance),
+        (socket.SOCK_DGRAM, STATION_PORT + instance),
+    ]

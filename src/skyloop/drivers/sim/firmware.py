@@ -1,0 +1,257 @@
+"""A simulated drone that real firmware flies: its process, and the driver that speaks to it as to a real vehicle."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.autopilots.coupling import CoupledFirmware
+from skyloop.autopilots.kinds import AutopilotKind
+from skyloop.autopilots.program import FirmwareEvent, FirmwareEventKind
+from skyloop.autopilots.registry import make_firmware
+from skyloop.clock import monotonic_ns, nanoseconds
+from skyloop.drivers.base import Driver, ExternalPose, Sink
+from skyloop.drivers.registry import make_driver
+from skyloop.drivers.sim.telemetry import native_of as truth_of
+from skyloop.drivers.sim.telemetry import truth_at
+from skyloop.errors import DriverError, UnsupportedError
+from skyloop.messages import (
+    AnyAction,
+    Capabilities,
+    Encoding,
+    EventKind,
+    Feedback,
+    Intrinsics,
+    LinkState,
+    Severity,
+    Value,
+)
+from skyloop.sim.host import Report, SimHost
+from skyloop.sim.options import SimOptions
+
+#: Of a driver that has not been opened: what its kind of vehicle can do does not depend on where it is.
+_SOMEWHERE: Final = {
+    AutopilotKind.ARDUPILOT: "mavlink://udpin:127.0.0.1:14550",
+    AutopilotKind.BETAFLIGHT: "msp://tcp:127.0.0.1:5761",
+    AutopilotKind.PX4: "mavlink://udpin:127.0.0.1:14550",
+}
+_NAMES: Final = {
+    AutopilotKind.ARDUPILOT: "ArduCopter",
+    AutopilotKind.BETAFLIGHT: "Betaflight",
+    AutopilotKind.PX4: "PX4",
+}
+_SEVERITIES: Final = {
+    FirmwareEventKind.STARTED: Severity.INFO,
+    FirmwareEventKind.ANSWERS: Severity.INFO,
+    FirmwareEventKind.SILENT: Severity.ERROR,
+    FirmwareEventKind.DIED: Severity.ERROR,
+    FirmwareEventKind.FAILED: Severity.ERROR,
+}
+_KEPT_REPORTS: Final = 64
+_POSE_STD_M: Final = 0.001
+#: The state that firmware reports is no older: it comes over loopback. Where the simulation is slower than real time,
+#: so is the firmware's clock, and its driver, which takes it for a good one, would say otherwise.
+_OLDEST_NS: Final = nanoseconds(0.05)
+_LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
+
+
+class FirmwareFlight:
+    """Starts the firmware of one drone, and passes on what its driver reports, with the simulation's truth beside it.
+
+    Args:
+        options: Of the world.
+        inner_options: Of the address of the firmware's own driver, as they were given.
+    """
+
+    def __init__(self, options: SimOptions, inner_options: str) -> None:
+        assert options.autopilot is not None
+        self.kind = AutopilotKind(options.autopilot)
+        self._options = options
+        self._inner_options = inner_options
+        self._pattern = make_driver(self._address(_SOMEWHERE[self.kind]))  # raises for an option that it does not have
+        self._lock = threading.Lock()  # of the inner driver's opening and closing
+        self._sink: Sink | None = None
+        self._host: SimHost | None = None
+        self._drone = 0
+        self._firmware: CoupledFirmware | None = None
+        self._inner: Driver | None = None
+        self._linked = False  # whether the firmware's driver is to be open
+        self._reports: deque[Report] = deque(maxlen=_KEPT_REPORTS)
+
+    def _address(self, address: str) -> str:
+        if not self._inner_options:
+            return address
+        return f"{address}{'&' if '?' in address else '?'}{self._inner_options}"
+
+    @property
+    def firmware(self) -> CoupledFirmware | None:
+        """The firmware, while the driver is open."""
+        return self._firmware
+
+    @property
+    def driver(self) -> Driver:
+        """The driver that speaks to the firmware; before it is opened, one of its kind."""
+        return self._inner or self._pattern
+
+    def capabilities(self, options: SimOptions) -> Capabilities:
+        """Return what the firmware's driver can do, with the simulated cameras."""
+        inner = self._pattern.capabilities()
+        return Capabilities(
+            vehicle="sim",
+            actions=inner.actions,
+            cameras=tuple(model.info() for model in options.cameras),
+            description=f"{_NAMES[self.kind]} in the world {options.world!r}, seed {options.seed}",
+        )
+
+    # Life cycle ------------------------------------------------------------------------------------------------
+
+    def open(self, host: SimHost, drone: int, sink: Sink) -> None:
+        """Start the firmware and let it fly the drone; its driver is opened as soon as its process runs.
+
+        Raises:
+            UsageError: Its program is not here, or no port is free for it.
+        """
+        self._host, self._drone, self._sink = host, drone, sink
+        folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
+        self._firmware = firmware = make_firmware(self.kind, self._happened, folder=folder)
+        self._linked = True
+        sink.link(LinkState.CONNECTING, f"{_NAMES[self.kind]} is being started")
+        firmware.start()
+        host.simulation.fly_by(drone, firmware)
+
+    def close(self) -> None:
+        """Stop the rotors, and end the driver and the firmware. Idempotent."""
+        self._close_driver()
+        host, firmware = self._host, self._firmware
+        if host is not None and host.simulation.flown_by_firmware(self._drone):
+            host.simulation.release(self._drone)
+        if firmware is not None:
+            firmware.close()
+        self._firmware = self._host = self._sink = None
+        self._reports.clear()
+
+    def switch_link(self, *, on: bool) -> None:
+        """Open or close the firmware's driver: without it the vehicle hears nothing, as out of a radio's range."""
+        if on:
+            self._linked = True
+            self._open_driver()
+            return
+        self._close_driver()
+        if self._sink is not None:
+            self._sink.link(LinkState.LOST, _LINK_OFF)
+
+    def _open_driver(self) -> None:
+        with self._lock:
+            firmware, sink = self._firmware, self._sink
+            if not self._linked or self._inner is not None or firmware is None or sink is None:
+                return
+            made = make_driver(self._address(firmware.address))
+            made.open(_InnerSink(self, sink))
+            self._inner = made
+
+    def _close_driver(self) -> None:
+        with self._lock:
+            self._linked = False
+            inner, self._inner = self._inner, None
+            if inner is not None:
+                inner.close()
+
+    def _happened(self, event: FirmwareEvent) -> None:
+        sink = self._sink
+        if sink is not None:
+            sink.event(EventKind.VEHICLE_MESSAGE, event.text, _SEVERITIES[event.kind], reason=f"firmware_{event.kind}")
+        if event.kind is FirmwareEventKind.STARTED:
+            self._open_driver()
+
+    # Flying ----------------------------------------------------------------------------------------------------
+
+    def apply(self, action: AnyAction, *, new: bool) -> AnyAction:
+        """Have the firmware's driver apply an action; without a link nothing arrives."""
+        inner = self._inner
+        return action if inner is None else inner.apply(action, new=new)
+
+    def external_pose(self, pose: ExternalPose) -> None:
+        """Give the firmware's driver a pose from outside."""
+        inner = self._inner
+        if inner is None:
+            raise DriverError(_LINK_OFF)
+        inner.external_pose(pose)
+
+    # Called by the host and by the inner driver ----------------------------------------------------------------
+
+    def report(self, report: Report) -> None:
+        """Keep the truth for the feedback that comes; give it to a vehicle that is told its position from outside."""
+        self._reports.append(report)
+        inner = self._inner
+        if self.kind is AutopilotKind.BETAFLIGHT and self._options.position and inner is not None:
+            truth = report.truth
+            captured_ns = max(report.captured_ns, monotonic_ns() - _OLDEST_NS)  # its clock is the computer's
+            with suppress(DriverError, UnsupportedError):
+                inner.external_pose(
+                    ExternalPose(truth.position_m, truth.quaternion, captured_ns, position_std_m=_POSE_STD_M)
+                )
+
+    def with_truth(self, feedback: Feedback) -> Feedback:
+        """Return the firmware's feedback with the true state at its time, as far as it is known yet."""
+        reports = tuple(self._reports)
+        if not reports:
+            return feedback
+        captured_ns = max(feedback.captured_ns, reports[-1].captured_ns - _OLDEST_NS)
+        native = truth_of(truth_at(reports, captured_ns), self._options)
+        return msgspec.structs.replace(feedback, captured_ns=captured_ns, native={**(feedback.native or {}), **native})
+
+
+class _InnerSink:
+    """Passes on what the firmware's driver reports."""
+
+    def __init__(self, flight: FirmwareFlight, sink: Sink) -> None:
+        self._flight = flight
+        self._sink = sink
+
+    def feedback(self, feedback: Feedback) -> None:
+        self._sink.feedback(self._flight.with_truth(feedback))
+
+    def frame(
+        self,
+        camera: str,
+        pixels: NDArray[np.uint8],
+        captured_ns: int,
+        *,
+        width: int,
+        height: int,
+        encoding: Encoding = Encoding.BGR8,
+        intrinsics: Intrinsics | None = None,
+    ) -> None:
+        raise NotImplementedError  # the simulated cameras' pictures do not come this way
+
+    def wants(self, camera: str) -> bool:  # noqa: ARG002
+        return False
+
+    def stream(
+        self,
+        camera: str,
+        data: bytes,
+        captured_ns: int,
+        *,
+        width: int,
+        height: int,
+        key: bool,
+        intrinsics: Intrinsics | None = None,
+    ) -> None:
+        raise NotImplementedError
+
+    def wants_stream(self, camera: str) -> bool:  # noqa: ARG002
+        return False
+
+    def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
+        self._sink.link(state, reason, remedy)
+
+    def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
+        self._sink.event(kind, text, severity, **data)

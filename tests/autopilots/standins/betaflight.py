@@ -1,0 +1,44 @@
+"""Stands in for Betaflight's program: its command line, its motors and its state, without anything that flies.
+
+STANDIN_PORTS in the environment: its ports for motors, state and MSP. Its motors are those of the other stand-ins.
+"""
+
+import os
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+
+from skyloop.wire.betaflight_sitl import decode_state, encode_motors
+
+assert sys.argv[1] == "127.0.0.1"
+motors_port, state_port, msp_port = map(int, os.environ["STANDIN_PORTS"].split(","))
+
+
+def command_line() -> None:
+    server = socket.create_server(("127.0.0.1", msp_port))
+    while True:
+        link, _ = server.accept()
+        text = b""
+        while data := link.recv(4096):
+            text += data
+            if data == b"#":
+                link.sendall(b"Entering CLI Mode\r\n\r\n# ")
+            elif data == b"save\r\n":
+                Path("eeprom.bin").write_bytes(text)
+                os._exit(0)
+            else:
+                link.sendall(data + b"\r\n# ")
+
+
+time.sleep(0.2)
+threading.Thread(target=command_line, daemon=True).start()
+link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+link.bind(("127.0.0.1", state_port))
+motors = encode_motors((0.1, 0.2, 0.3, 0.4)), ("127.0.0.1", motors_port)
+link.sendto(*motors)  # before any state, as Betaflight does
+with Path("states.txt").open("a", buffering=1) as states:
+    while True:
+        states.write(f"{decode_state(link.recv(4096))}\n")
+        link.sendto(*motors)

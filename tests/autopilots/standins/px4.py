@@ -1,0 +1,38 @@
+"""Stands in for PX4's program: its link to a simulator, without anything that flies.
+
+It answers from its fifth ``HIL_SENSOR`` on, as PX4 needs some to start. Its rotors get 0.1, 0.2, 0.3 and 0.4 in PX4's
+order. A line for each message goes to ``messages.txt`` where it runs.
+"""
+
+import os
+import socket
+import sys
+import time
+from pathlib import Path
+
+from skyloop.wire.mavlink.codec import Codec, dialect
+
+instance = int(sys.argv[sys.argv.index("-i") + 1])
+files = Path(sys.argv[sys.argv.index("-d") + 1])
+assert (files / "init.d-posix").is_dir()
+assert os.environ["PX4_SIM_MODEL"] == "none_iris"
+codec = Codec(1, 1)
+while True:
+    try:
+        link = socket.create_connection(("127.0.0.1", int(os.environ["STANDIN_PORT"]) + instance))
+        break
+    except ConnectionRefusedError:
+        time.sleep(0.01)
+link.sendall(b"no MAVLink at all" + codec.encode(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 0, 3)))
+heard = 0
+with Path("messages.txt").open("a", buffering=1) as messages:
+    while data := link.recv(65536):
+        for message in codec.decode(data):
+            messages.write(f"{message.get_type()} {getattr(message, 'time_usec', 0)}\n")
+            if message.get_type() != "HIL_SENSOR":
+                continue
+            heard += 1
+            if heard >= 5:
+                controls = [0.1, 0.2, 0.3, 0.4, *[0.0] * 12]
+                answer = dialect.MAVLink_hil_actuator_controls_message(message.time_usec, controls, 129, 1)
+                link.sendall(codec.encode(answer))

