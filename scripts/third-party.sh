@@ -22,19 +22,13 @@ environment mavproxy MAVProxy mavproxy==1.8.75 setuptools & jobs+=($!)
 environment dronekit2 dronekit dronekit2==3.0.0 setuptools & jobs+=($!)
 environment djitellopy djitellopy djitellopy==2.5.0 & jobs+=($!)
 environment ray 'ray, skyloop' --editable '.[sim,ray]' & jobs+=($!)
-<<<<<<< HEAD
 # Once with Skyloop, and once for a program that knows nothing of it.
 environment ros2 'rclpy, nav_msgs, std_srvs, rosbags, cv2, skyloop.ros' 'rosbags>=0.11' --editable '.[sim,vision,ros]' & jobs+=($!)
 environment ros2-program 'rclpy, std_srvs, cv2' ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs ros-geometry-msgs \
   ros-std-srvs 'opencv-python-headless>=4.10' & jobs+=($!)
-[[ -e .third-party/node_modules/ar-drone/package.json ]] ||
-  npm install --silent --no-audit --no-fund --prefix .third-party ar-drone@0.3.3 & jobs+=($!)
-=======
-environment ros2 'rclpy, skyloop' ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs --editable . & jobs+=($!)
 [[ -e .third-party/node_modules/ar-drone/package.json && -e .third-party/node_modules/@foxglove/ws-protocol/package.json ]] ||
   npm install --silent --no-audit --no-fund --prefix .third-party \
     ar-drone@0.3.3 @foxglove/ws-protocol@0.8.0 protobufjs@7.6.6 ws@8.23.0 & jobs+=($!)
->>>>>>> main
 # Not the newest OpenCV, whose 5 changed shapes and dtypes of ArUco's results: to be put before the installed one.
 [[ -e .third-party/opencv4/cv2 ]] ||
   "${PYTHON:-python3}" -m pip install --quiet --disable-pip-version-check --no-deps --target .third-party/opencv4 \
