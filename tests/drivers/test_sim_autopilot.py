@@ -8,23 +8,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from skyloop.autopilots.ardupilot import VARIABLE
+from skyloop.clock import NS_PER_S, monotonic_ns
+from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.sim import SimDriver, options_of
+from skyloop.drivers.sim.firmware import FirmwareFlight, _InnerSink
 from skyloop.drivers.sim.telemetry import truth_at
 from skyloop.drivers.uri import parse_uri
-from skyloop.errors import ParameterError, UnknownNameError, UnsupportedError, UsageError
-from skyloop.messages import EventKind, Hover, Land, LinkState, Takeoff
+from skyloop.errors import DriverError, ParameterError, UnknownNameError, UnsupportedError, UsageError
+from skyloop.messages import EventKind, Feedback, Hover, Land, LinkState, Takeoff
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
 from tests.autopilots.rig import program
 
 LONG_S = 60.0
+POSE = ExternalPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)
 ARDUPILOT = "sim://?autopilot=ardupilot&world=empty&wind=0&noise=0&cameras=bottom&width=64&height=48&parameters=0"
 
 
@@ -145,9 +151,12 @@ def test_the_simulated_radio_cuts_the_firmware_s_driver_off() -> None:
         assert sink.links[-1][0] is LinkState.LOST
         count = sink.feedback_count
         assert driver.apply(Hover()) == Hover()
+        with pytest.raises(DriverError, match="radio is switched off"):
+            driver.external_pose(POSE)
         assert driver.set_parameter("sim.link", True) is True
         assert sink.wait(lambda: sink.links[-1] == (LinkState.UP, ""), LONG_S)
         assert sink.wait(lambda: sink.feedback_count > count, LONG_S)
+        driver.external_pose(POSE)
         assert driver.failsafe(Land()) in (True, False)  # as the firmware's driver says
         assert driver.checkup()
         with pytest.raises(ParameterError):
@@ -170,10 +179,42 @@ def test_several_fly_in_one_world() -> None:
 
 
 def test_the_built_in_autopilot_takes_no_poses() -> None:
-    from skyloop.drivers.base import ExternalPose
-
     with pytest.raises(UnsupportedError):
-        made("sim://").external_pose(ExternalPose((0, 0, 0), (0, 0, 0, 1), 0))
+        made("sim://").external_pose(POSE)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_betaflight_is_told_its_position_as_by_motion_capture(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    uri = f"sim://?autopilot=betaflight&world=empty&cameras=none&position={int(known)}&rate=60"
+    options = options_of(parse_uri(uri))
+    flight = FirmwareFlight(options, "")
+    told: list[ExternalPose] = []
+    monkeypatch.setattr(flight, "_inner", SimpleNamespace(external_pose=told.append))
+    simulation = SimHost(SimOptions(world="empty", cameras=())).simulation
+    truth = simulation.truth(0)
+    flight.report(Report(simulation.feedback(0), truth, (), monotonic_ns()))
+    assert [pose.position_m for pose in told] == ([truth.position_m] if known else [])
+    assert all(abs(monotonic_ns() - pose.captured_ns) < 60 * NS_PER_S for pose in told)
+
+
+def test_what_the_firmware_s_driver_reports_has_the_truth_beside_it_once_that_is_known() -> None:
+    flight = FirmwareFlight(options_of(parse_uri(ARDUPILOT)), "")
+    sink = RecordingSink()
+    inner = _InnerSink(flight, sink)
+    inner.feedback(Feedback(captured_ns=monotonic_ns()))
+    assert sink.newest is not None
+    assert sink.newest.native is None
+    simulation = SimHost(SimOptions(world="empty", cameras=())).simulation
+    flight.report(Report(simulation.feedback(0), simulation.truth(0), (), monotonic_ns()))
+    inner.feedback(Feedback(captured_ns=monotonic_ns(), native={"mode": "AUTO"}))
+    assert sink.newest.native is not None
+    assert {"mode", "truth.x"} <= set(sink.newest.native)
+    assert not inner.wants("front")
+    assert not inner.wants_stream("front")
+    with pytest.raises(NotImplementedError):
+        inner.frame("front", np.zeros((2, 2, 3), np.uint8), 1, width=2, height=2)
+    with pytest.raises(NotImplementedError):
+        inner.stream("front", b"", 1, width=2, height=2, key=True)
 
 
 # The truth beside it ---------------------------------------------------------------------------------------------
