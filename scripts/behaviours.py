@@ -24,6 +24,7 @@ import follow_flights
 
 from skyloop.client import Drone
 from skyloop.control import (
+    RACE_TRACK,
     ApproachMarker,
     FlowHover,
     FlyThroughGates,
@@ -32,9 +33,11 @@ from skyloop.control import (
     LandOnMarker,
     OrbitMarker,
     SeeAndAvoid,
+    course_in,
 )
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.messages import Event, EventKind, Feedback, FlightState
+from skyloop.messages.world import WORLD, decode_world
 from skyloop.sim.render import use_one_core
 from skyloop.sim.world import Gate
 from skyloop.sim.world_file import load_world
@@ -45,6 +48,7 @@ FOLLOW_S: Final = 40.0
 FOLLOW_RMS_M: Final = 0.25
 SETTLED_NS: Final = 5_000_000_000  # after the first sighting, from when on the distance counts
 LANDING_M: Final = 0.2
+RACE_FPS: Final = 15.0
 
 
 class Flight(NamedTuple):
@@ -58,9 +62,9 @@ class Flight(NamedTuple):
 
 
 @contextmanager
-def flying(world: str, camera: str, seed: int, gust_m_s: float) -> Iterator[Drone]:
+def flying(world: str, camera: str, seed: int, gust_m_s: float, fps: float = 15.0) -> Iterator[Drone]:
     """A drone of a world, taken off, in nothing but gusts."""
-    uri = f"sim://?world={world}&cameras={camera}&fps=15&seed={seed}"
+    uri = f"sim://?world={world}&cameras={camera}&fps={fps:g}&seed={seed}"
     with rehearse(uri, radio=Radio(seed=seed)) as drone:
         drone.config["sim.wind"] = (0.0, 0.0, 0.0)
         drone.config["sim.gust"] = gust_m_s
@@ -137,6 +141,28 @@ def gates(seed: int, gust_m_s: float) -> Flight:
         touched = hits.count
     order = [number for number, _ in crossings.passed]
     good = order == list(range(len(course))) and flight.passed == len(course) and not touched
+    note = "" if good else f"passed {order}, touched {touched}, believed {flight.passed}"
+    return Flight(good, max((off for _, off in crossings.passed), default=math.nan), run.seconds, note)
+
+
+def race(level: int) -> Callable[[int, float], Flight]:
+    """Return the flight of a race track by the racer's camera; the error is the largest from a gate's middle."""
+    return lambda seed, gust_m_s: fly_race(level, seed, gust_m_s)
+
+
+def fly_race(level: int, seed: int, gust_m_s: float) -> Flight:
+    """The race track of a level, all gates in order and in their direction, without touching anything."""
+    world = load_world(f"race{level}", seed)
+    crossings = Crossings(world.gates)
+    with flying(f"race{level}", "fpv", seed, gust_m_s, RACE_FPS) as drone:
+        hits = Hits(drone)
+        course = course_in(decode_world(str(drone.config[WORLD]))) if level == 3 else RACE_TRACK
+        flight = FlyThroughGates(drone, replace(course, map_m=0.26) if level == 2 else course)
+        with drone.on_feedback(crossings.look):
+            run = flight.run(seconds=150.0)
+        touched = hits.count
+    order = [number for number, _ in crossings.passed]
+    good = order == list(range(len(world.gates))) and flight.passed == len(world.gates) and not touched
     note = "" if good else f"passed {order}, touched {touched}, believed {flight.passed}"
     return Flight(good, max((off for _, off in crossings.passed), default=math.nan), run.seconds, note)
 
@@ -377,6 +403,10 @@ FOLLOWED: Final = "followed: in view 90 %, never mixed up, RMS of the distance w
 GOALS: Final = {
     "follow": Goal(follow, "a carried marker followed at 1.5 m, RMS of the distance within 0.25 m", "RMS", 20),
     "gates": Goal(gates, "a course of five gates passed, nothing touched", "off the middle", 19),
+    **{
+        f"race-{level}": Goal(race(level), f"the race track {level} flown, nothing touched", "off the middle", 18)
+        for level in range(4)
+    },
     "landing": Goal(landing(0.3), "landed on a platform at 0.3 m/s, within 0.2 m of its middle", "off the middle", 18),
     "landing-0.5": Goal(landing(0.5), "landed on a platform at 0.5 m/s", "off the middle", 18),
     **{

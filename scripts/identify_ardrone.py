@@ -3,10 +3,12 @@
     python scripts/identify_ardrone.py
     python scripts/identify_ardrone.py --data ../shared/fixtures/ardrone-flights --picture steps.png
 
-The recordings are no part of the project: docs/ardrone-model.md says where they come from. The parameters are fitted to
-the recordings but one, and judged on that one, for each of them in turn. What the code has, ``AR_DRONE`` in
-``skyloop.sim.vehicles``, is the fit that is judged on ``1sImpulseNH1``; it is compared with all recordings, and drawn.
-Figures are RMS over 3 s. Needs scipy and matplotlib (requirements-dev.txt).
+The recordings are no part of the project: docs/ardrone-model.md says where they come from. The parameters, and how the
+drone's own estimate of its speed follows the speed, are fitted to the recordings but one, and judged on that one, for
+each of them in turn. What the code has, ``AR_DRONE`` in ``skyloop.sim.vehicles`` and ``AR_DRONE_ESTIMATE`` in
+``skyloop.sim.identification``, is fitted to five and judged on three; it is compared with all, beside the vehicle by
+default, and drawn. Figures are RMS over 3 s, and the reported speed 3 s after the step, simulated and recorded. Needs
+scipy and matplotlib (requirements-dev.txt), and some five minutes.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +26,31 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from skyloop.sim import VehicleParameters
-from skyloop.sim.identification import WINDOW_S, Misfit, Recording, Response, compare, read_recording, replay
+from skyloop.sim.identification import (
+    AR_DRONE_ESTIMATE,
+    WINDOW_S,
+    Recording,
+    SpeedEstimate,
+    compare,
+    read_recording,
+    replay,
+)
 from skyloop.sim.parameters import Limits
 from skyloop.sim.streams import Floats
 from skyloop.sim.vehicles import AR_DRONE
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("SKYLOOP_FIXTURES") or ROOT.parent / "shared" / "fixtures") / "ardrone-flights"
-RUNS = ("0.5sImpulseNH5", "1sImpulseNH1", "8sStepHalfMagNH1")
+FITTED = ("0.4sImpulseNoHover", "0.5sImpulseNH5", "1sImpulseHalfMagNH2", "1sImpulseNH3", "8sStepHalfMagNH1")
+#: What the code has not seen: every second run in order of names, but the long step, of which there is only one.
+JUDGED = ("0.5sImpulseHalfMagNH1", "0.5sImpulseNH6", "1sImpulseNH1")
+RUNS = tuple(sorted(FITTED + JUDGED))
+DRAWN = ("0.5sImpulseHalfMagNH1", "0.5sImpulseNH6", "1sImpulseNH1", "8sStepHalfMagNH1")
 PICTURE = ROOT / "docs" / "pictures" / "ardrone-identification.png"
-JUDGED = "1sImpulseNH1"  # the run that the parameters in the code have not seen
 AGREES_PITCH_RAD = np.radians(2.0)
 AGREES_FORWARD_M_S = 0.25
 SHOWN_S = (-0.4, 4.2)
+LABELS = ("command", "pitch, nose down [°]", "forward speed, reported [m/s]")
 INK, FAINT, REAL, MODEL = "#24292f", "#8c959f", "#1f6feb", "#d9730d"
 
 
@@ -55,88 +69,136 @@ FREE = (
     Free("attitude_damping", 0.6, 0.2, 2.0),
     Free("linear_drag_per_s", 0.3, 0.0, 2.0),
     Free("airspeed_tilt_rad_s2_per_m2", 0.01, 0.0, 0.1),
-    Free("level_brake_per_m", 0.1, 0.0, 1.0),
+    Free("level_brake_per_s", 0.3, 0.0, 2.0),
+    # Of the estimate.
+    Free("lag_s", 0.1, 0.01, 0.5),
+    Free("scale", 1.1, 0.5, 2.0),
 )
+
+Model = tuple[VehicleParameters, SpeedEstimate]
+IN_THE_CODE: Model = (AR_DRONE, AR_DRONE_ESTIMATE)
+BY_DEFAULT: Model = (VehicleParameters(), AR_DRONE_ESTIMATE)
+BY_DEFAULT_PLAIN: Model = (VehicleParameters(), SpeedEstimate(1e-9, 1.0))
 
 
 def main() -> None:
     usage = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     usage.add_argument("--data", type=Path, default=DATA, help="folder of the recordings, one folder each")
     usage.add_argument("--picture", type=Path, default=PICTURE, help="where the picture goes")
+    usage.add_argument("--only-compare", action="store_true", help="don't fit: compare and draw what the code has")
+    usage.add_argument("--hold", action="append", default=[], metavar="NAME=VALUE", help="don't fit this parameter")
     given = usage.parse_args()
+    held = {name: float(value) for name, _, value in (one.partition("=") for one in given.hold)}
+    if unknown := held.keys() - {one.name for one in FREE}:
+        usage.error(f"--hold {', '.join(unknown)}: none of {', '.join(one.name for one in FREE)}")
+    free, base = [one for one in FREE if one.name not in held], changed(IN_THE_CODE, held.items())
     folders = [given.data / name for name in RUNS]
     missing = [str(folder) for folder in folders if not folder.is_dir()]
     if missing:
         usage.error(f"no recording at {', '.join(missing)}: give the folder that holds them with --data")
     runs = [from_first_step(read_recording(folder)) for folder in folders]
-    for left_out in runs:
-        fitted = fit([run for run in runs if run is not left_out])
-        print(f"\nFitted to the runs but {left_out.name}:")
-        print("  " + ", ".join(f"{free.name} {getattr(fitted, free.name):.4g}" for free in FREE))
+    if not given.only_compare:
+        print("\nEach run, judged by the fit to all others:")
+        faster = []
         for run in runs:
-            print(f"  {line(run, fitted)}{'   <- judged' if run is left_out else ''}")
-    print(f"\nIn the code (judged on {JUDGED}):")
+            fitted = fit([other for other in runs if other is not run], free, base)
+            print(f"  {line(run, fitted)}   {values(fitted)}", flush=True)
+            faster.append(judge(run, fitted))
+        print("  {:>24}: {:5.2f}°  {:5.3f} m/s  {:+5.2f} m/s".format("mean, faster by", *np.mean(faster, axis=0)))
+        if held:
+            return
+        fitted = fit([run for run in runs if run.name in FITTED])
+        print(f"\nFitted to {', '.join(FITTED)}:\n  {values(fitted)}")
+        for run in runs:
+            print(f"  {line(run, fitted)}")
     stamped = [from_first_step(read_recording(folder, as_stamped=True)) for folder in folders]
+    for title, model in (
+        ("In the code", IN_THE_CODE),
+        ("The vehicle by default", BY_DEFAULT),
+        ("The vehicle by default, its speed not estimated but known", BY_DEFAULT_PLAIN),
+    ):
+        print(f"\n{title}:")
+        for run in runs:
+            print(f"  {line(run, model)}")
+    print("\nIn the code, with the times of receipt, and counted from the release:")
     for run, raw in zip(runs, stamped, strict=True):
-        print(f"  {line(run, AR_DRONE)}")
-        print(f"  {'with the times of receipt':>24}: {figures(raw, AR_DRONE)}")
-        release_s = run.steps()[1]
-        print(f"  {'after the release':>24}: {figures(run, AR_DRONE, release_s)}")
-    draw(runs, stamped, given.picture)
+        print(f"  {line(raw, IN_THE_CODE)}   |{figures(run, IN_THE_CODE, run.steps()[1])}")
+    drawn = [number for number, run in enumerate(runs) if run.name in DRAWN]
+    draw([runs[number] for number in drawn], [stamped[number] for number in drawn], given.picture)
 
 
 def from_first_step(recording: Recording) -> Recording:
     return recording.since(recording.steps()[0])
 
 
-def fit(runs: Sequence[Recording]) -> VehicleParameters:
-    """The vehicle that comes nearest to these runs by least squares: each run, and within it pitch and speed in shares
-    of the agreement that is wanted, weighs the same. Differential quotients come from drones that fly side by side."""
-    start = np.array([free.start for free in FREE])
+def fit(runs: Sequence[Recording], free: Sequence[Free] = FREE, base: Model = IN_THE_CODE) -> Model:
+    """The vehicle and estimate that come nearest to these runs by least squares: each run, and within it pitch and
+    speed in shares of the agreement that is wanted, weighs the same. Differential quotients come from drones that fly
+    side by side."""
+    start = np.array([one.start for one in free])
+
+    def models(candidates: Sequence[Floats]) -> list[Model]:
+        return [changed(base, zip((one.name for one in free), values, strict=True)) for values in candidates]
 
     def jacobian(values: Floats) -> Floats:
         steps = 0.01 * np.maximum(values, 0.2 * start)
-        here, *aside = residuals(runs, [values, *(values + np.diag(steps))])
+        here, *aside = residuals(runs, models([values, *(values + np.diag(steps))]))
         return np.stack([(there - here) / step for there, step in zip(aside, steps, strict=True)], axis=1)
 
     found = least_squares(
-        lambda values: residuals(runs, [values])[0],
+        lambda values: residuals(runs, models([values]))[0],
         start,
         jacobian,
-        bounds=([free.least for free in FREE], [free.most for free in FREE]),
+        bounds=([one.least for one in free], [one.most for one in free]),
         x_scale=start,
     )
-    return vehicle(found.x)
+    [fitted] = models([found.x])
+    return fitted
 
 
-def vehicle(values: Iterable[float]) -> VehicleParameters:
-    changes: dict[str, Any] = {free.name: float(value) for free, value in zip(FREE, values, strict=True)}
-    return replace(AR_DRONE, **changes)
+def changed(model: Model, parameters: Iterable[tuple[str, float]]) -> Model:
+    vehicle, estimate = model
+    changes: dict[str, Any] = {name: float(value) for name, value in parameters}
+    own = {field.name: changes.pop(field.name) for field in fields(estimate) if field.name in changes}
+    return replace(vehicle, **changes), replace(estimate, **own)
 
 
-def residuals(runs: Sequence[Recording], candidates: Sequence[Floats]) -> list[Floats]:
-    """One array for each candidate."""
-    parts: list[list[Floats]] = [[] for _ in candidates]
+def values(model: Model) -> str:
+    both = asdict(model[0]) | asdict(model[1])
+    return ", ".join(f"{free.name} {both[free.name]:.4g}" for free in FREE)
+
+
+def residuals(runs: Sequence[Recording], models: Sequence[Model]) -> list[Floats]:
+    """One array for each model."""
+    parts: list[list[Floats]] = [[] for _ in models]
     for run in runs:
-        response = replay(run.command, [vehicle(candidate) for candidate in candidates])
-        for own, misfit in zip(parts, compare(response, run), strict=True):
+        response = replay(run.command, [vehicle for vehicle, _ in models])
+        for number, (own, (_, estimate)) in enumerate(zip(parts, models, strict=True)):
+            misfit = compare(response, run, estimate=estimate)[number]
             own.append(misfit.pitch / AGREES_PITCH_RAD / len(misfit.pitch) ** 0.5)
             own.append(misfit.forward / AGREES_FORWARD_M_S / len(misfit.forward) ** 0.5)
     return [np.concatenate(own) for own in parts]
 
 
-def line(run: Recording, parameters: VehicleParameters) -> str:
-    return f"{run.name:>24}: {figures(run, parameters)}"
+def line(run: Recording, model: Model) -> str:
+    return f"{run.name:>24}: {figures(run, model)}{'  judged' if run.name in JUDGED else '        '}"
 
 
-def figures(run: Recording, parameters: VehicleParameters, begin_s: float = 0.0) -> str:
-    """RMS over the window that begins at a time of the run."""
-    misfit = misfit_of(run, replay(run.command, [parameters], begin_s + WINDOW_S), begin_s)
-    return f"{np.degrees(misfit.pitch_rms):4.2f}°  {misfit.forward_rms:5.3f} m/s"
+def figures(run: Recording, model: Model, begin_s: float = 0.0) -> str:
+    """RMS over the window that begins at a time of the run, and the speeds at its end."""
+    pitch, forward, faster = judge(run, model, begin_s)
+    recorded = float(np.interp(begin_s + WINDOW_S, run.forward.times_s, run.forward.values))
+    return f"{pitch:5.2f}°  {forward:5.3f} m/s  {recorded + faster:5.2f} for {recorded:5.2f} m/s"
 
 
-def misfit_of(run: Recording, response: Response, begin_s: float = 0.0) -> Misfit:
-    return compare(response, run, begin_s, begin_s + WINDOW_S)[0]
+def judge(run: Recording, model: Model, begin_s: float = 0.0) -> tuple[float, float, float]:
+    """RMS of pitch [°] and speed [m/s] over the window, and by how much the simulated drone is faster at its end."""
+    vehicle, estimate = model
+    response = replay(run.command, [vehicle], begin_s + WINDOW_S)
+    misfit = compare(response, run, begin_s, begin_s + WINDOW_S, estimate)[0]
+    recorded = float(np.interp(begin_s + WINDOW_S, run.forward.times_s, run.forward.values))
+    faster = float(estimate.of(response)[0, -1]) - recorded
+    return float(np.degrees(misfit.pitch_rms)), misfit.forward_rms, faster
 
 
 # The picture ----------------------------------------------------------------------------------------------------------
@@ -147,11 +209,13 @@ def draw(runs: Sequence[Recording], stamped: Sequence[Recording], path: Path) ->
     mpl.use("Agg")  # needs no display
     plt.rcParams.update({"font.family": "DejaVu Sans", "font.size": 9.5, "text.color": INK, "axes.labelcolor": INK})
     figure, axes = plt.subplots(
-        3, len(runs), figsize=(12, 7.4), sharex=True, sharey="row", height_ratios=(0.55, 1.25, 1), squeeze=False
+        3, len(runs), figsize=(15, 7.4), sharex=True, sharey="row", height_ratios=(0.55, 1.25, 1), squeeze=False
     )
     for column, run, raw in zip(axes.T, runs, stamped, strict=True):
         _column(column, run, raw)
-    for plot, label in zip(axes[:, 0], ("command", "pitch, nose down [°]", "forward speed [m/s]"), strict=True):
+    for plot, label in zip(
+        axes[:, 0], ("command", "pitch, nose down [°]", "forward speed, reported [m/s]"), strict=True
+    ):
         plot.set_ylabel(label)
     axes[2, 0].set_ylim(-0.3, 3.3)
     handles, labels = axes[1, 0].get_legend_handles_labels()
@@ -166,16 +230,16 @@ def draw(runs: Sequence[Recording], stamped: Sequence[Recording], path: Path) ->
 
 def _column(plots: Sequence[Any], run: Recording, raw: Recording) -> None:
     response = replay(run.command, [AR_DRONE], SHOWN_S[1])
-    misfit = misfit_of(run, response)
+    [misfit] = compare(response, run)
     lead = np.arange(SHOWN_S[0], 0, 0.1)  # the simulated drone hovers until the step
     times, still = np.append(lead, response.times_s), np.zeros_like(lead)
     pairs = (
         (run.pitch, raw.pitch, response.pitch[0], np.degrees(1.0), f"{np.degrees(misfit.pitch_rms):.2f}°", 0.05),
-        (run.forward, raw.forward, response.forward[0], 1.0, f"{misfit.forward_rms:.3f} m/s", 0.92),
+        (run.forward, raw.forward, AR_DRONE_ESTIMATE.of(response)[0], 1.0, f"{misfit.forward_rms:.3f} m/s", 0.92),
     )
     command = run.command.between(*SHOWN_S)
     plots[0].step(command.times_s, command.values, where="post", color=INK, lw=1.4)
-    plots[0].set_title(f"{run.name}  ({'judged' if run.name == JUDGED else 'fitted'})", loc="left", fontsize=10)
+    plots[0].set_title(f"{run.name}  ({'judged' if run.name in JUDGED else 'fitted'})", loc="left", fontsize=10)
     for plot, (recorded, received, simulated, scale, rms, height) in zip(plots[1:], pairs, strict=True):
         received = received.between(*SHOWN_S)
         recorded = recorded.between(*SHOWN_S)

@@ -92,6 +92,7 @@ def test_ports_count_from_a_base() -> None:
             ("--firmware", "ardrone3"),
             "'ardrone3' is none of 'ardrone1', 'ardrone2', 'arducopter', 'betaflight', 'px4', 'tello'",
         ),
+        (("--firmware", "betaflight", "--lose", "0.1"), "--lose and --delay are for datagrams"),
         (("--firmware", "ardrone2", "--lose", "1.5"), "--lose: must be at most 1"),
         (("--firmware", "ardrone2", "--port-base", "0", "--bind", "no such host"), "can't be opened"),
     ],

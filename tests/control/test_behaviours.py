@@ -6,17 +6,32 @@ import importlib.util
 import math
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import msgspec
+import numpy as np
 import pytest
 
-from skyloop.control import FlowHover, FlyThroughGates, GateKind, ImageServo, LandOnMarker, SeeAndAvoid
-from skyloop.control.gate_law import GatePhase
+from skyloop.control import (
+    RACE_TRACK,
+    FlowHover,
+    FlyThroughGates,
+    GateKind,
+    ImageServo,
+    LandOnMarker,
+    SeeAndAvoid,
+    course_in,
+)
+from skyloop.control.course_law import CourseSettings
+from skyloop.control.gate_law import GatePhase, GateSettings
 from skyloop.control.landing_law import LandingPhase
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Annotation, FlightState, Land, LinkState, Severity, Velocity
+from skyloop.sim.geometry import geometry_of
+from skyloop.sim.world_file import load_world
 from skyloop.stepping.rehearsal import Radio, rehearse
 from tests.client.scripted import WAIT_S, flown, scripted
 
@@ -41,6 +56,9 @@ def script() -> Iterator[ModuleType]:
     [
         ("gates", 0, 0.0),
         ("gates", 3, 1.0),
+        ("race-0", 1, 0.0),
+        ("race-2", 1, 0.0),
+        ("race-3", 1, 0.0),
         ("landing", 0, 0.0),
         ("landing", 3, 1.0),
         ("landing-1-turning", 0, 1.0),
@@ -173,6 +191,10 @@ def test_what_makes_no_sense_is_refused() -> None:
             FlyThroughGates(drone, [])
         with pytest.raises(UsageError, match="too grey"):
             FlyThroughGates(drone, [GateKind("grey", (100, 100, 100))])
+        with pytest.raises(UsageError, match="give a Course"):
+            FlyThroughGates(drone, settings=CourseSettings())
+        with pytest.raises(UsageError, match="not by GateSettings"):
+            FlyThroughGates(drone, RACE_TRACK, settings=GateSettings())
         with pytest.raises(UnknownNameError, match="bottom"):
             LandOnMarker(drone)
         with pytest.raises(UsageError, match="distance_m"):
@@ -183,3 +205,29 @@ def test_what_makes_no_sense_is_refused() -> None:
         with pytest.raises(UsageError, match="does not look forward"):
             ImageServo(drone, 7, camera="bottom")
         assert FlowHover(drone).off_m is None
+
+
+def test_a_course_is_that_of_a_world_by_the_names_of_its_gates() -> None:
+    course = course_in(geometry_of(load_world("race0")))
+    assert course.gates == RACE_TRACK.gates
+    assert np.array(course.places) == pytest.approx(np.array(RACE_TRACK.places), abs=0.002)
+    assert np.array(course.poles) == pytest.approx(np.array(RACE_TRACK.poles))
+    assert course.start == RACE_TRACK.start
+    with pytest.raises(UsageError, match="has no gate 1, gate 2"):
+        course_in(geometry_of(load_world("empty")))
+    with pytest.raises(UsageError, match="each needs one"):
+        replace(RACE_TRACK, places=RACE_TRACK.places[:1])
+    with pytest.raises(UsageError, match="has no start"):
+        course_in(msgspec.structs.replace(geometry_of(load_world("race0")), starts=()))
+
+
+@pytest.mark.slow
+def test_a_course_whose_gates_are_not_seen_ends_with_a_warning() -> None:
+    with rehearse("sim://?world=empty&cameras=fpv&fps=15&wind=0") as drone:
+        told: list[tuple[str, Severity]] = []
+        drone.takeoff()
+        pilot = FlyThroughGates(drone, replace(RACE_TRACK, start=(-1.0, 2.0), poles=()))
+        with drone.on_event(lambda event: told.append((event.text, event.severity))):
+            pilot.run(seconds=90.0)
+        assert ("gates: the gate is not seen where it should be", Severity.WARNING) in told
+        assert pilot.passed == 0

@@ -14,11 +14,13 @@ from skyloop.errors import UsageError
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.sim.camera import (
     BOTTOM_CAMERA,
+    FPV_CAMERA,
     FRONT_CAMERA,
     LOOKING_DOWN,
     LOOKING_FORWARD,
     CameraModel,
     distort,
+    looking_up,
     undistort,
 )
 
@@ -129,3 +131,14 @@ def test_a_large_picture_is_undistorted_in_parts_as_it_is_at_once() -> None:
     np.testing.assert_allclose(distort(straight, bent), points, atol=1e-9)
     folded = np.vstack([points, [(9.0, 9.0)]])
     assert undistort(folded, (-0.3, 0.0, 0.0, 0.0, 0.0)) is None
+
+
+def test_the_racers_camera_is_wide_and_looks_up() -> None:
+    camera = FPV_CAMERA
+    assert (camera.width, camera.height) == (320, 240)
+    left, right = camera.rays(np.array([[-0.5, 119.5], [319.5, 119.5]]))[:, 0]
+    assert np.degrees(np.arctan(right) - np.arctan(left)) == pytest.approx(100.0, abs=1.5)
+    ahead = camera.rotation_matrix @ [0.0, 0.0, 1.0]
+    assert np.degrees(np.arctan2(ahead[2], ahead[0])) == pytest.approx(25.0)
+    assert camera.rotation_matrix @ [1.0, 0.0, 0.0] == pytest.approx([0.0, -1.0, 0.0])  # its right is the body's
+    assert looking_up(0.0) == pytest.approx(LOOKING_FORWARD)

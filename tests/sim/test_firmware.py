@@ -180,7 +180,7 @@ def test_who_cannot_be_flown_by_firmware_is_told_why() -> None:
     with pytest.raises(UsageError, match="RACER, IRIS and CRAZYFLIE"):
         Simulation(HALL).fly_by(0, Scripted(idle))
     simulation = flying(parameters=ideal(IRIS))
-    with pytest.raises(UsageError, match="hovering: firmware takes over on the ground"):
+    with pytest.raises(UsageError, match=r"in the air \(hovering\): firmware takes over on the ground"):
         simulation.fly_by(0, Scripted(idle))
     with pytest.raises(UsageError, match="no firmware flies drone 0"):
         simulation.release(0)
@@ -192,6 +192,9 @@ def test_its_state_is_landed_while_it_stands_idle_and_flying_else() -> None:
     firmware = Scripted(idle)
     simulation = standing(firmware, ideal(IRIS))
     simulation.step()
+    assert simulation.state(0) is FlightState.LANDED
+    firmware.fly = lambda _: (0.1, 0.1, 0.1, 0.1)  # armed, and idle
+    simulation.step(steps(0.5))
     assert simulation.state(0) is FlightState.LANDED
     firmware.fly = lambda _: (0.3, 0.3, 0.3, 0.3)  # turns, and still stands
     simulation.step(steps(0.5))
@@ -232,10 +235,21 @@ def test_released_in_the_air_it_falls_in_an_emergency_and_firmware_may_take_it_a
     simulation.release(0)
     assert simulation.state(0) is FlightState.EMERGENCY
     assert simulation.feedback(0).emergency_reason == "taken from its firmware in the air"
+    with pytest.raises(UsageError, match="emergency"):
+        simulation.fly_by(0, Scripted(idle))  # it falls
     simulation.step(steps(3))
     assert simulation.truth(0).position_m[2] == pytest.approx(IRIS.half_height_m, abs=1e-3)
     simulation.fly_by(0, Scripted(idle))
     assert simulation.state(0) is FlightState.LANDED
+
+
+def test_with_an_empty_battery_the_rotors_stop() -> None:
+    simulation = standing(Scripted(lambda _: (0.9, 0.9, 0.9, 0.9)), ideal(RACER))
+    simulation.step(steps(0.5))
+    simulation.set_charge(0, 0.0)
+    simulation.step(steps(0.5))
+    assert simulation.truth(0).thrust < 0.01
+    assert simulation.feedback(0).battery_v == 0.0
 
 
 def test_a_drone_beside_it_is_flown_as_ever() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 
@@ -221,3 +222,63 @@ def test_the_bars_of_a_gate_leave_the_opening_free() -> None:
         overlaps_upright = height.min() < 0.4 - 1e-9 and height.max() > -0.4 + 1e-9
         assert not (overlaps_across and overlaps_upright), bar.name
         assert bar.corners()[:, 2].min() >= -1e-9
+
+
+# What the seed places ------------------------------------------------------------------------------------------------
+
+VARIED = """
+[room]
+size = [20, 20, 5]
+[vary]
+apart = 2.0
+[[gate]]
+position = [0, 0, 1.5]
+inner_size = [1, 1]
+vary = [6, 6, 0.3]
+vary_yaw_deg = 40
+[[gate]]
+position = [0, 0, 1.5]
+inner_size = [1, 1]
+vary = [6, 6, 0]
+[[box]]
+name = "pole"
+stands_at = [0, 0]
+size = [0.1, 0.1, 2]
+vary = [6, 6, 0]
+[[spawn]]
+position = [9, 9, 0]
+"""
+
+
+def test_the_seed_places_what_varies_within_its_ranges_and_apart(tmp_path: Path) -> None:
+    path = tmp_path / "varied.toml"
+    path.write_text(VARIED)
+    worlds = [load_world(path, seed) for seed in range(20)]
+    assert load_world(path, 3) == worlds[3]
+    assert len({world.gates[0].position_m for world in worlds}) == 20
+    for world in worlds:
+        places = [*(gate.position_m for gate in world.gates), world.boxes[0].position_m]
+        assert all(max(abs(x), abs(y)) <= 6.0 for x, y, _ in places)
+        assert all(math.dist(one[:2], other[:2]) >= 2.0 for one, other in itertools.combinations(places, 2))
+        assert 1.2 <= world.gates[0].position_m[2] <= 1.8
+        assert abs(world.gates[0].yaw_rad) <= math.radians(40)
+        assert (world.gates[1].position_m[2], world.gates[1].yaw_rad) == (1.5, 0.0)
+        assert world.boxes[0].position_m[2] == 1.0
+        assert world.spawns[0].position_m == (9.0, 9.0, 0.0)
+
+
+def test_what_finds_no_room_is_told() -> None:
+    with pytest.raises(FileFormatError, match=r"\[vary\], key 'apart': no room was found for 3 things at 15 m"):
+        parse_world(VARIED.replace("apart = 2.0", "apart = 15.0"))
+    with pytest.raises(FileFormatError, match=r"position.*missing"):
+        parse_world(VARIED.replace("stands_at = [0, 0]\n", ""))
+
+
+@pytest.mark.parametrize("level", range(4))
+def test_race_tracks_leave_room_to_fly(level: int) -> None:
+    for seed in range(10):
+        world = load_world(f"race{level}", seed)
+        assert (len(world.gates), len(world.boxes)) == (4, 4)
+        Simulation(world, 1)  # the start is free
+    assert (load_world(f"race{level}", 1).spawns == load_world(f"race{level}", 2).spawns) == (level == 0)
+    assert (load_world(f"race{level}", 1).gates == load_world(f"race{level}", 2).gates) == (level < 2)

@@ -9,7 +9,7 @@ from skyloop.control.controller import Controller, RunSummary
 from skyloop.control.flow_hover import FlowHover
 from skyloop.control.follow import FollowMarker
 from skyloop.control.follow_target import FollowTarget
-from skyloop.control.gates import FIVE_GATES, FlyThroughGates, GateKind
+from skyloop.control.gates import FIVE_GATES, RACE_GATES, RACE_TRACK, Course, FlyThroughGates, GateKind, course_in
 from skyloop.control.heading import AlongPath, FixedYaw, LookAt, YawMode
 from skyloop.control.image_servo import ImageServo
 from skyloop.control.landing import LandOnMarker
@@ -30,6 +30,7 @@ __all__ = [
     "ChaseSettings",
     "Circle",
     "Controller",
+    "Course",
     "DeadReckoning",
     "FIVE_GATES",
     "Finding",
@@ -60,6 +61,8 @@ __all__ = [
     "PolicyNetwork",
     "PolicyPhase",
     "PositionSource",
+    "RACE_GATES",
+    "RACE_TRACK",
     "Route",
     "RouteCheck",
     "RouteWaypoint",
@@ -71,6 +74,7 @@ __all__ = [
     "Waypoint",
     "Waypoints",
     "YawMode",
+    "course_in",
     "load_route",
     "save_route",
 ]

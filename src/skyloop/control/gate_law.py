@@ -33,6 +33,7 @@ class GatePhase(StrEnum):
     SEARCHING = "searching the gate"  #: turning on the spot, at one height after the other
     ALIGNING = "going to the gate's axis"  #: seen a moment ago
     RECOVERING = "lost the gate: holding the place, turning to where it must be"
+    GOING = "flying to before the gate"  #: where the map says, or where it was seen
     PASSING = "flying through"  #: aligned and near: what is left is flown by odometry
     PASSED = "through"
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from skyloop.control.behaviour import Behaviour
+from skyloop.control.course_law import CourseLaw, CourseSettings, GatePlace, Pole
 from skyloop.control.gate_law import GateLaw, GatePhase, GateSettings
 from skyloop.errors import UsageError
-from skyloop.messages import Polyline, Text
+from skyloop.messages import Polyline, Severity, Text
 from skyloop.messages.annotation import Colour, Shape
-from skyloop.vision import GateDetector, GateSighting
+from skyloop.messages.world import WorldGeometry
+from skyloop.vision import GateDetector, GateSighting, PoleDetector
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
@@ -43,8 +46,84 @@ FIVE_GATES = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Course:
+    """A course whose gates and poles have places on a map: x, y, z [m], yaw as the vehicle's own.
+
+    Attributes:
+        gates: In order.
+        places: Of the gates.
+        poles: What else stands about.
+        pole_colour: Red, green, blue, 0 to 255; None where the camera can't tell poles by their colour.
+        start: Where the vehicle takes off, x and y.
+        map_m: Standard deviation of these places [m].
+    """
+
+    gates: tuple[GateKind, ...]
+    places: tuple[GatePlace, ...]
+    poles: tuple[Pole, ...] = ()
+    pole_colour: tuple[int, int, int] | None = None
+    start: tuple[float, float] = (0.0, 0.0)
+    map_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        if len(self.gates) != len(self.places):
+            raise UsageError(f"{len(self.gates)} gates have {len(self.places)} places; each needs one")
+
+
+#: The gates of the worlds ``race0`` to ``race3``.
+RACE_GATES = (
+    GateKind("gate 1", (31, 143, 224)),
+    GateKind("gate 2", (224, 194, 31)),
+    GateKind("gate 3", (57, 181, 74)),
+    GateKind("gate 4", (194, 63, 180)),
+)
+RACE_POLES = (208, 31, 31)  #: the colour of their poles
+#: The track of the worlds ``race0`` and ``race1``. In ``race2`` all of it is moved by up to 0.45 m.
+RACE_TRACK = Course(
+    RACE_GATES,
+    (
+        GatePlace(1.5, 0.75, 1.05, math.radians(-44.7)),
+        GatePlace(3.15, 2.25, 1.8, math.radians(134.6)),
+        GatePlace(-3.0, -0.75, 1.05, math.radians(179.9)),
+        GatePlace(0.0, -2.25, 1.8, 0.0),
+    ),
+    (Pole(0.0, 2.25), Pole(3.0, 0.75), Pole(-4.5, -0.75), Pole(-1.5, -2.25)),
+    RACE_POLES,
+    start=(-4.5, 2.25),
+)
+
+
+def course_in(geometry: WorldGeometry, gates: Sequence[GateKind] = RACE_GATES) -> Course:
+    """Return the course whose map is that of a simulated world: its gates by name, its first start, its poles.
+
+    Args:
+        geometry: As a simulated drone tells it in its parameter ``world.geometry``.
+        gates: The course, in order, by the names that the gates have in the world.
+
+    Raises:
+        UsageError: The world has no such gate, or no start.
+    """
+    openings = {opening.name: opening for opening in geometry.gates}
+    if missing := [gate.name for gate in gates if gate.name not in openings]:
+        raise UsageError(f"world {geometry.name!r} has no {', '.join(missing)}; its gates are {', '.join(openings)}")
+    if not geometry.starts:
+        raise UsageError(f"world {geometry.name!r} has no start")
+    places = (openings[gate.name] for gate in gates)
+    return Course(
+        tuple(gates),
+        tuple(GatePlace(*place.position, place.yaw) for place in places),
+        tuple(Pole(*s.position[:2], s.size[0] / 2, s.size[2]) for s in geometry.solids if s.name.startswith("pole")),
+        RACE_POLES,
+        geometry.starts[0].position[:2],
+    )
+
+
 class FlyThroughGates(Behaviour):
     """Flies through gates of known colours, one after the other, and hovers behind the last.
+
+    With a :class:`Course` it flies by its map, which is corrected by what the camera sees: to before each gate, round
+    poles and other gates, and through it in its direction. Where a gate is not seen it hovers and ends with a warning.
 
     Each gate is searched by its colour. A gate that is lost on the way makes the vehicle hold its position and turn to
     where the gate must be, then search for it again. The vehicle must be airborne when :meth:`run` is called.
@@ -59,30 +138,41 @@ class FlyThroughGates(Behaviour):
     def __init__(
         self,
         drone: Drone,
-        gates: Sequence[GateKind] = FIVE_GATES,
+        gates: Sequence[GateKind] | Course = FIVE_GATES,
         *,
         camera: str | None = None,
-        settings: GateSettings | None = None,
+        settings: GateSettings | CourseSettings | None = None,
     ) -> None:
         """Initialise the behaviour.
 
         Args:
             drone: The drone to fly.
-            gates: The course, in order.
+            gates: The course, in order; or with a map.
             camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults.
+            settings: Of the law, which a map decides; None are the defaults.
 
         Raises:
-            UsageError: There is no gate, or a colour has no hue.
+            UsageError: There is no gate, a colour has no hue, or the settings are the other law's.
             UnknownNameError: The vehicle has no such camera.
             MissingExtraError: OpenCV is not installed.
         """
-        if not gates:
+        course = gates if isinstance(gates, Course) else None
+        self._gates = gates.gates if isinstance(gates, Course) else tuple(gates)
+        if not self._gates:
             raise UsageError("there is no gate to fly through")
-        self._gates = tuple(gates)
         self._detectors = [GateDetector(gate.colour, gate.inner_size_m) for gate in self._gates]
-        self._gate_law = GateLaw(settings)
-        self._gate_law.next_gate(turning=self._gates[0].turning)
+        self._poles: PoleDetector | None = None
+        if course is None:
+            if isinstance(settings, CourseSettings):
+                raise UsageError("CourseSettings are of a course with a map; give a Course, or GateSettings")
+            self._gate_law: GateLaw | CourseLaw = GateLaw(settings)
+            self._gate_law.next_gate(turning=self._gates[0].turning)
+        else:
+            if isinstance(settings, GateSettings):
+                raise UsageError("a course with a map is flown by CourseSettings, not by GateSettings")
+            self._gate_law = _law_of(course, settings)
+            if course.poles and course.pole_colour is not None:
+                self._poles = PoleDetector(course.pole_colour)
         self.passed = 0
         super().__init__(drone, self._gate_law, camera)
 
@@ -113,7 +203,16 @@ class FlyThroughGates(Behaviour):
                 frame.captured_ns,
                 trust=1.0 - nearest.ambiguity,
             )
+        if isinstance(self._gate_law, CourseLaw):
+            self._look_for_poles(self._gate_law, frame)
         return self._drawing(gate, seen)
+
+    def _look_for_poles(self, law: CourseLaw, frame: Frame) -> None:
+        if self._poles is not None and frame.feedback is not None:
+            for pole in self._poles.detect(frame):
+                law.see_pole(pole.ray_in_body(self._mounting), frame.feedback, frame.captured_ns)
+        if law.stuck is not None and not self.done:
+            self.finish(law.stuck, Severity.WARNING)
 
     def _next(self) -> None:
         before = self._gates[self.passed]
@@ -123,7 +222,10 @@ class FlyThroughGates(Behaviour):
             self.finish(f"through {before.name}, the last of {len(self._gates)}")
         else:
             self.emit(f"through {before.name}, on to {gate.name}")
-            self._gate_law.next_gate(turning=gate.turning)
+            if isinstance(self._gate_law, CourseLaw):
+                self._gate_law.next_gate()
+            else:
+                self._gate_law.next_gate(turning=gate.turning)
 
     def _drawing(self, gate: GateKind, seen: list[GateSighting]) -> list[Shape]:
         colour = _COLOURS.get(self.phase, _SEEN)
@@ -132,3 +234,9 @@ class FlyThroughGates(Behaviour):
             x, y = one.outline[3]
             shapes += [Polyline(one.outline, True, colour), Text(f"{one.distance_m:.2f} m", (x, y + 14.0), colour)]
         return shapes
+
+
+def _law_of(course: Course, settings: CourseSettings | None) -> CourseLaw:
+    settings = settings or replace(CourseSettings(), map_m=course.map_m)
+    widths = [gate.inner_size_m[0] for gate in course.gates]
+    return CourseLaw(course.places, widths, course.poles, course.start, settings)

@@ -93,6 +93,11 @@ class Autopilot:
         self._loops.start(drone, altitude_m)
         self._advance(drone, Happening.HOVER, Hover(), time_s)
 
+    def grounded(self, drone: int, time_s: float) -> bool:
+        """Whether a drone stands: landed, or fallen in an emergency."""
+        fallen = time_s - self._stood_s[drone] <= _STANDING_S
+        return self.states[drone] is FlightState.LANDED or (self.states[drone] is FlightState.EMERGENCY and fallen)
+
     def hand_over(self, drone: int) -> None:
         """Leave a drone that stands to firmware."""
         if self.states[drone] is FlightState.EMERGENCY:

@@ -28,6 +28,12 @@ LOOKING_FORWARD: Rotation9 = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
 LOOKING_DOWN: Rotation9 = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
+def looking_up(tilt_rad: float) -> Rotation9:
+    """Return body from optical of a camera that looks forward and by an angle up, with the image's top up."""
+    s, c = math.sin(tilt_rad), math.cos(tilt_rad)
+    return (0.0, s, c, -1.0, 0.0, 0.0, 0.0, -c, s)
+
+
 @dataclass(frozen=True, slots=True)
 class CameraPose:
     """The pose of a camera in the world.
@@ -255,4 +261,23 @@ BOTTOM_CAMERA = CameraModel(
     noise_sigma=3.0,
     exposure_s=0.006,
     vignetting=0.15,
+)
+# What a racer's pilot sees: 100° by 76° and 120° across the corners, as of a wide 2.1 mm lens, at the tilt of a quick
+# flight; rate, latency and short exposure are estimates of an analogue camera's.
+FPV_CAMERA = CameraModel(
+    name="fpv",
+    width=320,
+    height=240,
+    fps=90.0,
+    fx=172.0,
+    fy=172.0,
+    cx=159.5,
+    cy=119.5,
+    distortion=(-0.2, 0.03, 0.0, 0.0, 0.0),
+    position_m=(0.08, 0.0, 0.02),
+    rotation=looking_up(math.radians(25.0)),
+    latency_s=0.02,
+    noise_sigma=4.0,
+    exposure_s=0.004,
+    vignetting=0.3,
 )

@@ -59,7 +59,7 @@ class ControlLoops:
         self._reference, self._integral, self._behind = table[11], table[12:14], table[14]
         self._rows = tuple(table)
         self._by_velocity[:] = 1.0
-        brake = column(parameters, lambda p: p.level_brake_per_m) / GRAVITY_M_S2
+        brake = column(parameters, lambda p: p.level_brake_per_s) / GRAVITY_M_S2
         self._any_level_brake = bool(brake.any())
         self._gains = _Gains(
             velocity=column(parameters, lambda p: p.velocity_gain_per_s),
@@ -178,7 +178,7 @@ class ControlLoops:
         lean = gains.velocity * aside - sin_yaw * east + cos_yaw * north
         roll = do.least(do.most(lean / -GRAVITY_M_S2, least_tilt), tilt_limit)
         if self._any_level_brake:  # against the speed, of drones that fly by attitude
-            brake = gains.level_brake * do.root(forward * forward + left * left)
+            brake = gains.level_brake
             first = first + _brake(do, left * brake, first, tilt_limit)
             second = second + _brake(do, -forward * brake, second, tilt_limit)
         flies = by_velocity > 0.0

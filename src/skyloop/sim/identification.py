@@ -12,6 +12,7 @@ wrote them, one line a sample: Unix time of receipt [s] and a value.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,8 +96,38 @@ class Response:
 
 
 @dataclass(frozen=True, slots=True)
+class SpeedEstimate:
+    """How the recorded drone's own estimate of its speed follows the speed: first order.
+
+    Attributes:
+        lag_s: Time constant [s].
+        scale: Of the estimate; the recordings can't tell it from a pitch that reads too small by the same share.
+    """
+
+    lag_s: float
+    scale: float
+
+    def of(self, response: Response) -> Floats:
+        """Return what the vehicles would report as their speed, shape (vehicles, samples) [m/s]."""
+        share = 1.0 - math.exp(-STEP_S / self.lag_s)
+        reported = np.empty_like(response.forward)
+        last = response.forward[:, 0]
+        for number, forward in enumerate(response.forward.T):
+            last = last + share * (forward - last)
+            reported[:, number] = last
+        return self.scale * reported
+
+
+#: As ``scripts/identify_ardrone.py`` fits it together with the vehicle.
+AR_DRONE_ESTIMATE = SpeedEstimate(lag_s=0.124, scale=1.15)
+
+
+@dataclass(frozen=True, slots=True)
 class Misfit:
-    """Simulated minus recorded, at the times of the recorded samples: ``pitch`` [rad], ``forward`` [m/s]."""
+    """Simulated minus recorded, at the times of the recorded samples: ``pitch`` [rad], ``forward`` [m/s].
+
+    The speed is the reported one.
+    """
 
     pitch: Floats
     forward: Floats
@@ -202,7 +233,13 @@ def _held(command: Track, times_s: Floats) -> list[float]:
     return [float(value) for value in values]
 
 
-def compare(response: Response, recorded: Recording, begin_s: float = 0.0, end_s: float = WINDOW_S) -> list[Misfit]:
+def compare(
+    response: Response,
+    recorded: Recording,
+    begin_s: float = 0.0,
+    end_s: float = WINDOW_S,
+    estimate: SpeedEstimate = AR_DRONE_ESTIMATE,
+) -> list[Misfit]:
     """Return how each vehicle differs from a recording with times like the response's, between two of them."""
     pitch, forward = recorded.pitch.between(begin_s, end_s), recorded.forward.between(begin_s, end_s)
     return [
@@ -210,5 +247,5 @@ def compare(response: Response, recorded: Recording, begin_s: float = 0.0, end_s
             np.interp(pitch.times_s, response.times_s, own_pitch) - pitch.values,
             np.interp(forward.times_s, response.times_s, own_forward) - forward.values,
         )
-        for own_pitch, own_forward in zip(response.pitch, response.forward, strict=True)
+        for own_pitch, own_forward in zip(response.pitch, estimate.of(response), strict=True)
     ]

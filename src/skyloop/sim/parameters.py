@@ -55,8 +55,8 @@ class VehicleParameters:
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s
     # By roll and pitch set-points near level, firmware may lean against the speed on its own: this deceleration per
-    # square of the speed when the set-point is level, less in proportion to it, and none at the full tilt.
-    level_brake_per_m: float = 0.0
+    # speed when the set-point is level, less in proportion to it, and none at the full tilt.
+    level_brake_per_s: float = 0.0
     climb_gain_per_s: float = 3.0  # estimate; the AR.Drone's whole response is softer, [E] c7 = 1.4 1/s
     altitude_gain_per_s: float = 1.2  # damps the altitude hold with ζ = 0.8 at the climb gain above
     velocity_gain_per_s: float = 2.0  # estimate

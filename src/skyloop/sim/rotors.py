@@ -38,6 +38,7 @@ _TURNING, _SPEEDS, _FORCE, _VOLTAGE, _CURRENT = 0, 7, 11, 14, 15
 _TARGETS, _WANTED, _THRUST, _KNOCK, _SAG, _OPEN = 16, 20, 23, 24, 27, 28
 _ROWS = 29
 _AIR, _LEAST_COS = 19, 1e-6  # first row of BodyTable's air, thrust, position, velocity; near the vertical
+_IDLE_COMMAND = 0.15  # armed firmware idles with 5 to 15 %
 _ROTOR_MARGIN_M_S2 = 60.0  # of gravity, ground effect, and drag in a fast dive
 
 
@@ -123,8 +124,10 @@ class RotorBodies(BodyTable):
         self._targets[:, drone] = [idle + span * min(one, 1.0) if one > 0.0 else 0.0 for one in commands]
 
     def idles(self, drone: int) -> bool:
-        """Whether no rotor of a flown drone is commanded to be faster than idle."""
-        return bool((self._targets[:, drone] <= self._constants[drone].idle_speed).all())
+        """Whether no rotor of a flown drone is commanded more than what armed firmware idles with."""
+        constants = self._constants[drone]
+        idle = constants.idle_speed + _IDLE_COMMAND * (constants.full_speed - constants.idle_speed)
+        return bool((self._targets[:, drone] <= idle + 1e-9).all())
 
     def set_unloaded_voltage(self, voltage: Floats) -> None:
         """Set the batteries' voltage without load, (n,) [V]; empty ones have none."""

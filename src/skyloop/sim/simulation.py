@@ -153,7 +153,7 @@ class Simulation:
     def _supply(self) -> None:
         """Give the rotors the batteries' present voltage."""
         if self._rotors is not None:
-            self._rotors.set_unloaded_voltage(self._batteries.open_voltage())
+            self._rotors.set_unloaded_voltage(self._batteries.open_voltage() * (self._batteries.charge > 0))
 
     # Flying ----------------------------------------------------------------------------------------------------
 
@@ -191,8 +191,8 @@ class Simulation:
     def fly_by(self, drone: int, firmware: Firmware) -> None:
         """Let firmware fly a drone from now on, in place of the built-in autopilot, which refuses commands meanwhile.
 
-        The drone counts as landed while it stands and no rotor is commanded to be faster than idle, and as flying
-        otherwise. Collisions are reported as always, and stop no rotor.
+        The drone counts as landed while it stands and no rotor is commanded more than 15 %, as armed firmware idles
+        with, and as flying otherwise. Collisions are reported as always, and stop no rotor.
 
         Args:
             drone: Its number. It stands on the ground; a drone in an emergency is reset.
@@ -208,8 +208,9 @@ class Simulation:
                     "firmware needs a drone that is modelled down to its rotors: "
                     "one of RACER, IRIS and CRAZYFLIE of skyloop.sim.vehicles, or parameters with rotors"
                 )
-            if self._autopilot.states[drone].airborne:
-                raise UsageError(f"drone {drone} is {self._autopilot.states[drone]}: firmware takes over on the ground")
+            if not self._autopilot.grounded(drone, self.time_s):
+                state = self._autopilot.states[drone]
+                raise UsageError(f"drone {drone} is in the air ({state}): firmware takes over on the ground")
             solids, rotors = self._solids, self._rotors
 
             def ranging(point: Vec3, direction: Vec3) -> float:

@@ -25,7 +25,8 @@ class Purpose(IntEnum):
     CAMERA = 6
     LIGHT = 7
     LABELS = 8
-    INSTRUMENTS = 9
+    LAYOUT = 9
+    INSTRUMENTS = 10
 
 
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:

@@ -74,6 +74,7 @@ from skyloop.sim.world_tables import (
     WorldTable,
     YawTable,
 )
+from skyloop.sim.world_variation import place_varied
 from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
 
 _NEAREST_M = 0.01  # of two way points
@@ -129,6 +130,7 @@ def _read_world(text: str, source: str, name: str, seed: int = 0) -> World:
         if isinstance(each, dict):
             each.setdefault("kind", "board")
     table = read_tables(values, source, WorldTable)
+    place_varied(table, seed, Place(source))
     room = Room(table.room.size, table.room.floor, table.room.walls, table.room.ceiling, table.room.enclosed)
     names: set[str] = set()
 

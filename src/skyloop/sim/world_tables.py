@@ -60,7 +60,14 @@ class WindTable(_Table, kw_only=True):
     time_constant: Annotated[float, Meta(ge=0.05, le=1000.0)] = 1.0
 
 
-class BoxTable(Named, kw_only=True):
+class VariedTable(Named, kw_only=True):
+    """What the seed may place anywhere up to so far from where it is written."""
+
+    vary: tuple[Amplitude, Amplitude, Amplitude] = (0.0, 0.0, 0.0)
+    vary_yaw_deg: Annotated[float, Meta(ge=0.0, le=180.0)] = 0.0
+
+
+class BoxTable(VariedTable, kw_only=True):
     size: Size
     stands_at: Spot | None = None  #: on the floor, the usual case
     position: Position | None = None
@@ -69,7 +76,7 @@ class BoxTable(Named, kw_only=True):
     colour: str | None = None
 
 
-class GateTable(Named, kw_only=True):
+class GateTable(VariedTable, kw_only=True):
     position: Position
     inner_size: tuple[Opening, Opening]
     yaw_deg: Degrees = 0.0
@@ -198,13 +205,18 @@ class LightTable(_Table, kw_only=True):
     period: Annotated[float, Meta(ge=1.0, le=3600.0)] = 60.0
 
 
-class SpawnTable(Named, kw_only=True):
+class SpawnTable(VariedTable, kw_only=True):
     position: Position
     yaw_deg: Degrees = 0.0
 
 
+class VaryTable(_Table, kw_only=True):
+    apart: Annotated[float, Meta(ge=0.0, le=1000.0)] = 0.0  #: least distance in plan between what varies
+
+
 class WorldTable(_Table, kw_only=True):
     room: RoomTable
+    vary: VaryTable = field(default_factory=VaryTable)
     box: list[BoxTable] = []
     gate: list[GateTable] = []
     panel: list[PanelTable] = []

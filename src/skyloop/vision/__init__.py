@@ -19,6 +19,7 @@ from skyloop.vision.median_flow import MedianFlowTracker
 from skyloop.vision.object_tracks import ObjectTracks, TrackedObject
 from skyloop.vision.onnx_detector import OnnxDetector
 from skyloop.vision.planar import PlanarSighting
+from skyloop.vision.poles import PoleDetector, PoleSighting
 from skyloop.vision.simulated import simulated_detector
 from skyloop.vision.tracking import Tracker, TrackResult
 
@@ -44,6 +45,8 @@ __all__ = [
     "ObjectTracks",
     "OnnxDetector",
     "PlanarSighting",
+    "PoleDetector",
+    "PoleSighting",
     "TrackResult",
     "TrackedObject",
     "Tracker",

@@ -13,6 +13,7 @@ import struct
 import subprocess
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
 
@@ -86,6 +87,8 @@ class Sitl:
         assert path is not None
         self._log = (self._folder / "log").open("wb")
         self._process = subprocess.Popen([path], cwd=self._folder, stdout=self._log, stderr=subprocess.STDOUT)
+        with suppress(OSError):  # only root may; its scheduler starves its receiver where others keep the processor
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, -10)
         end = time.monotonic() + 20
         while time.monotonic() < end:
             with socket.socket() as probe:

@@ -198,21 +198,30 @@ def test_a_question_is_asked_three_times() -> None:
 
 
 def test_states_are_asked_for_singly_or_together() -> None:
-    single = Telemetry({1: 50.0, 2: 50.0, 3: 50.0}, bundled=False)
+    single = Telemetry({1: 50.0, 2: 50.0, 3: 50.0})
     assert single.requests(0) == [Frame(1), Frame(2)], "two without an answer are the most"
     assert single.requests(1) == []
     assert single.on_frame(Frame(2, b"b", Direction.REPLY)) == [(2, b"b")], "and the one before it is lost"
     assert single.unanswered == 1
-    assert single.requests(2)[0] == Frame(3)
+    assert single.requests(2) == [Frame(3)]
     assert single.on_frame(Frame(3, b"", Direction.ERROR)) == [(3, None)]
     single.drop(3)
     assert all(frame.function != 3 for frame in single.requests(NS_PER_S))
-    together = Telemetry({1: 50.0, 2: 50.0}, bundled=True)
-    assert together.requests(0) == [Frame(Function.MULTIPLE, b"\1\2")]
-    assert together.on_frame(Frame(Function.MULTIPLE, b"\1a\1b", Direction.REPLY)) == [(1, b"a"), (2, b"b")]
+    single.forget()
+    assert single.on_frame(Frame(1, b"a", Direction.REPLY)) == []
+
+
+def test_a_lost_answer_makes_no_other_be_mistaken() -> None:
+    together = Telemetry({1: 50.0, 2: 25.0, 3: 10.0}, (1, 2))
+    assert together.requests(0) == [Frame(Function.MULTIPLE, b"\1\2"), Frame(3)]
+    reply = Frame(Function.MULTIPLE, b"\1a\1b", Direction.REPLY)
+    assert together.on_frame(reply) == [(1, b"a"), (2, b"b")]
     together.requests(NS_PER_S)
-    together.requests(2 * NS_PER_S)
-    assert together.unanswered == 1
+    together.requests(2 * NS_PER_S)  # the answers of a second ago never came
+    assert together.unanswered == 2 + 1
+    assert together.on_frame(reply) == [(1, b"a"), (2, b"b")]
+    assert together.on_frame(Frame(Function.MULTIPLE, b"", Direction.ERROR)) == []
+    assert together.due_ns() is not None
 
 
 # INAV ----------------------------------------------------------------------------------------------------------------
@@ -250,7 +259,7 @@ def inav_reply(frame: Frame, flags: int) -> Frame:
 
 def test_inav_is_read_and_armed() -> None:
     session, parser, sink = MspSession(options_of(parse_uri("msp:///dev/ttyACM0")), 0), Parser(), RecordingSink()
-    flags, sticks = 0, [0]
+    flags, sticks, now_ns = 0, [0], 0
 
     def run(seconds: float) -> None:
         nonlocal now_ns, sticks
@@ -264,7 +273,6 @@ def test_inav_is_read_and_armed() -> None:
             for publish in session.drain():
                 publish(sink)
 
-    now_ns = 0
     run(1.0)
     assert sink.link_state is LinkState.UP
     assert session.setup is not None

@@ -152,19 +152,19 @@ def _silence(line: Line) -> None:
     """What ``docs/msp.md`` says of the time after the last stick: held, throttle off, disarmed."""
     line.send_until(1000, lambda: not line.state()[1])
     line.send_until(2000, lambda: line.state()[0])
-    begun = time.monotonic()
     line.sticks(1090, 2000)
+    begun = time.monotonic()
     seen: list[tuple[float, bool, set[str], int]] = []
-    while time.monotonic() - begun < 2.5:
+    while not seen or seen[-1][1]:
         seen.append((time.monotonic() - begun, *line.state()))
+        assert seen[-1][0] < PATIENCE_S, "it is never disarmed"
         time.sleep(0.01)
-
-    def at(low_s: float, high_s: float) -> list[tuple[bool, set[str], int]]:
-        return [each[1:] for each in seen if low_s <= each[0] <= high_s]
-
-    assert all(armed for armed, _, _ in at(0.0, 1.2)), "armed until the failsafe begins"
-    assert all(throttle == 1090 for _, _, throttle in at(0.05, 0.2)), "the last sticks are held"
-    assert all("RXLOSS" in flags for _, flags, _ in at(0.35, 1.2))
-    assert all(throttle < 1000 for _, _, throttle in at(0.5, 1.2)), "no throttle"
-    assert all(not armed and "FAILSAFE" in flags for armed, flags, _ in at(2.0, 2.5)), "dropped"
+    # What comes when: on a busy machine all of it comes later, and in the same order.
+    lost_s = next(at_s for at_s, _, flags, _ in seen if "RXLOSS" in flags)
+    low_s = next(at_s for at_s, _, _, throttle in seen if throttle < 1000)
+    assert 0.1 < lost_s <= low_s < seen[-1][0]
+    assert low_s > 0.2, "the last sticks are held at first"
+    assert all(throttle == 1090 for at_s, _, _, throttle in seen if 0.05 < at_s < low_s)
+    assert seen[-1][0] > 1.2, "armed until the failsafe begins"
+    assert "FAILSAFE" in line.state()[1]
     line.send_until(1000, lambda: not line.state()[1])

@@ -43,6 +43,7 @@ class TestBetaflight(DriverSuite):
         self.firmware.start()
 
 
+@pytest.mark.slow
 class TestBetaflightSeenByCameras(TestBetaflight):
     """Poses from outside tell height, climb and velocity."""
 

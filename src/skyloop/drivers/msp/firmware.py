@@ -216,6 +216,9 @@ class Setup:
 
     def _held(self) -> list[Diagnostic]:
         """Judge what the sticks are set to between the loss of the receiver and the failsafe."""
+        if self.identity.variant == BETAFLIGHT and len(self.on_loss) < len(USUAL_MAP):
+            unknown = "what it does without sticks, before its failsafe, is not known"
+            return [Diagnostic("held sticks", False, unknown, _DOCS, severe=True)]
         held = [
             name
             for name, (mode, _) in zip(("roll", "pitch", "yaw", "throttle"), self.on_loss, strict=False)

@@ -14,7 +14,7 @@ from skyloop.drivers.msp.protocol import MspSession
 from skyloop.drivers.vehicle_link import VehicleLink
 from skyloop.drivers.vehicle_session import SinkCallback
 
-RETRY_NS: Final = nanoseconds(0.5)  #: between attempts to connect
+RETRY_NS: Final = nanoseconds(0.25)  #: between attempts to connect
 SILENT_NS: Final = nanoseconds(3.0)  #: a connection on which nothing comes for so long is opened anew
 EXTRA: Final = "msp"
 

@@ -69,6 +69,7 @@ class MspSession(VehicleSession):
         self._questions = Questions()
         self._identification: Identification | None = None
         self._telemetry: Telemetry | None = None
+        self._known = False  # who it is was asked since it was found
         self._refused_variant = ""
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns
@@ -269,7 +270,7 @@ class MspSession(VehicleSession):
         made = self._due_sticks(now_ns)
         if self._telemetry is not None:
             made += b"".join(encode(frame) for frame in self._telemetry.requests(now_ns))
-        else:
+        if not self._known:
             self._begin(now_ns)
         question = self._questions.due(now_ns)
         if question is not None:
@@ -335,7 +336,7 @@ class MspSession(VehicleSession):
             self._set_link_state(LinkState.DEGRADED, text)
 
     def _on_setup(self, setup: Setup) -> None:
-        self.setup = setup
+        self.setup, self._known = setup, True
         self.reported.cells = setup.cells
         diagnostics = setup.diagnose(override=self.options.override)
         self.setpoints.set_up(setup, hindrances(diagnostics))
@@ -354,7 +355,9 @@ class MspSession(VehicleSession):
             Function.RAW_GPS: GPS_HZ,
             Function.BATTERY_STATE if betaflight else Function.INAV_ANALOG: BATTERY_HZ,
         }
-        self._telemetry = Telemetry(streams, bundled=betaflight and setup.identity.api >= BUNDLING_API)
+        bundles = betaflight and setup.identity.api >= BUNDLING_API
+        bundle = (Function.ATTITUDE, Function.ALTITUDE, Function.STATUS_EX) if bundles else ()
+        self._telemetry = Telemetry(streams, bundle)
 
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events()
@@ -362,11 +365,18 @@ class MspSession(VehicleSession):
     # Losing --------------------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        """Ask who it is anew; sticks go on as they were, for what flies may still hear them."""
+        """Ask who it is anew, and meanwhile for its state as before, so that what flies is soon steered again.
+
+        Sticks go on as they were, for what flies may still hear them.
+        """
         del now_ns
         self._received_ns = self._asked_ns = self._identification = None
-        self._telemetry, self._refused_variant = None, ""
+        self._known, self._refused_variant = False, ""
         self._questions.clear()
+        if self._telemetry is not None:
+            self._telemetry.forget()
+        if self.setup is not None:
+            self.setpoints.set_up(self.setup, "its settings are being read again")
         self._sticks.clear()
         self.motion.lost()
         self.setpoints.lost()

@@ -22,7 +22,7 @@ Handler = Callable[[bytes | None], None]
 class Asked:
     """A request whose answer is waited for."""
 
-    functions: tuple[int, ...]
+    function: int
     sent_ns: int
 
 
@@ -74,68 +74,81 @@ class Questions:
 
 @dataclass(slots=True)
 class Stream:
-    """A state that is asked for again and again."""
+    """States that are asked for again and again, in one frame."""
 
-    function: int
+    functions: tuple[int, ...]
     period_ns: int
     due_ns: int = 0
 
+    @property
+    def frame(self) -> Frame:
+        """The request."""
+        if len(self.functions) > 1:
+            return Frame(Function.MULTIPLE, bytes(self.functions))
+        return Frame(self.functions[0])
+
 
 class Telemetry:
-    """Asks for states at their rates, several in one frame where the firmware can, few at a time.
+    """Asks for states at their rates, few at a time.
 
     A flight controller answers some tens of requests a second, whatever the line could carry: more would wait in its
-    buffers, and so would the sticks behind them.
+    buffers, and so would the sticks behind them. The answer to ``MULTIPLE`` does not say what it holds, so there is one
+    bundle only: an answer that was lost makes no other one be mistaken.
 
     Args:
         streams: Rates in hertz, by function.
-        bundled: Whether the firmware knows ``MULTIPLE``.
+        bundle: Functions that are asked for together, for firmware that knows ``MULTIPLE``; at the rate of the first.
         most: Requests that may be without an answer.
     """
 
-    def __init__(self, streams: dict[int, float], *, bundled: bool, most: int = 2) -> None:
-        self._streams = {function: Stream(function, nanoseconds(1 / rate)) for function, rate in streams.items()}
-        self._bundled = bundled
+    def __init__(self, streams: dict[int, float], bundle: tuple[int, ...] = (), *, most: int = 2) -> None:
+        rates: dict[tuple[int, ...], float] = {
+            (function,): rate for function, rate in streams.items() if function not in bundle
+        }
+        if bundle:
+            rates = {bundle: streams[bundle[0]], **rates}
+        self._streams = [Stream(functions, nanoseconds(1 / rate)) for functions, rate in rates.items()]
+        self._bundle = bundle
         self._most = most
         self._asked: deque[Asked] = deque()
         self.unanswered = 0
 
     def drop(self, function: int) -> None:
         """No longer ask for a state: the firmware does not know it."""
-        self._streams.pop(function, None)
+        self._streams = [stream for stream in self._streams if stream.functions != (function,)]
+
+    def forget(self) -> None:
+        """Wait for no answer any more: they were lost with the connection."""
+        self._asked.clear()
 
     def due_ns(self) -> int | None:
         """Return when something is to be asked for next; None: never."""
-        return min((stream.due_ns for stream in self._streams.values()), default=None)
+        return min((stream.due_ns for stream in self._streams), default=None)
 
     def requests(self, now_ns: int) -> list[Frame]:
-        """Return what is to be sent now."""
+        """Return what is to be sent now: what waits longest first."""
         while self._asked and now_ns - self._asked[0].sent_ns >= PATIENCE_NS:
             self._asked.popleft()
             self.unanswered += 1
-        due = [stream for stream in self._streams.values() if stream.due_ns <= now_ns]
         made: list[Frame] = []
-        while due and len(self._asked) < self._most:
-            taken = due if self._bundled else due[:1]
-            due = due[len(taken) :]
-            for stream in taken:
-                stream.due_ns = max(stream.due_ns + stream.period_ns, now_ns)
-            functions = tuple(stream.function for stream in taken)
-            self._asked.append(Asked(functions, now_ns))
-            bundle = self._bundled and len(functions) > 1
-            made.append(Frame(Function.MULTIPLE, bytes(functions)) if bundle else Frame(functions[0]))
+        for stream in sorted(self._streams, key=lambda each: each.due_ns):
+            if stream.due_ns > now_ns or len(self._asked) >= self._most:
+                break
+            stream.due_ns = max(stream.due_ns + stream.period_ns, now_ns)
+            frame = stream.frame
+            self._asked.append(Asked(frame.function, now_ns))
+            made.append(frame)
         return made
 
     def on_frame(self, frame: Frame) -> list[tuple[int, bytes | None]]:
         """Handle a frame; returns the states that it answers, None in the place of one that is not known."""
         for number, asked in enumerate(self._asked):
-            bundle = len(asked.functions) > 1
-            if frame.function != (Function.MULTIPLE if bundle else asked.functions[0]):
+            if frame.function != asked.function:
                 continue
             for _ in range(number + 1):
                 self._asked.popleft()
             self.unanswered += number
-            if frame.direction is Direction.ERROR:
-                return [] if bundle else [(frame.function, None)]
-            return list(multiple(frame.payload, asked.functions)) if bundle else [(frame.function, frame.payload)]
+            if frame.function == Function.MULTIPLE:
+                return [] if frame.direction is Direction.ERROR else list(multiple(frame.payload, self._bundle))
+            return [(frame.function, None if frame.direction is Direction.ERROR else frame.payload)]
         return []

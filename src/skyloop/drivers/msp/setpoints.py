@@ -36,6 +36,8 @@ PASSING: Final = frozenset(
     {"RXLOSS", "FAILSAFE", "NOT_DISARMED", "CALIB", "BOOTGRACE", "RC_LINK", "SENSORS_CALIBRATING", ARM_SWITCH}
 )
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] that shows it, precise or not
+LATE_S: Final = 0.15  #: so long after the throttle carried it a lift-off shows
+OTHER: Final = 0.15  #: share by which the throttle that was learnt may differ from the one that lifted it
 GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: without headway a descent met something
 HEADWAY: Final = 0.4  #: of the descent that is asked for
 SINK_PER_S: Final = 0.5  #: how fast the throttle is taken away then
@@ -355,7 +357,10 @@ class SetpointController:
             return
         high, fast = LIFTED[motion.precise]
         if motion.climb_m_s > fast or (motion.height_m is not None and motion.height_m > high):
-            self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, self.throttle))
+            carried = max(SPOOL_FROM * self.throttle, self.throttle - SPOOL_PER_S * LATE_S)
+            if self.hover is not None:  # of an earlier flight
+                carried = max((1 - OTHER) * carried, min((1 + OTHER) * carried, self.hover))
+            self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, carried))
             self._enter(Phase.FLYING, now_ns)
         elif self.throttle >= self.limits.throttle:
             self._give_up(f"it did not leave the ground at {self.limits.throttle:.0%} throttle", now_ns)

@@ -1,6 +1,7 @@
 """Options of a ``sim://`` address. Pure.
 
 Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds of simulation a second (1); ``cameras``
+<<<<<<< HEAD
 (``front,bottom``, or ``none``); ``width``, ``height``, ``fps`` of all cameras; ``latency`` of all cameras [s];
 ``noise`` a factor on every sensor's and camera's noise (1); ``wind`` a factor on the world's wind (1); ``battery``
 charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar`` or ``mujoco`` (``planar``);
@@ -13,6 +14,17 @@ down to its rotors, ``racer``, ``iris`` or ``crazyflie`` (``quadrotor``); ``auto
 ``ardupilot``, ``betaflight`` or ``px4`` (none), on an ``iris``, or a ``racer`` for Betaflight, if no other is named;
 ``autopilot_folder`` where it keeps its settings (they last as long as the drone). With ``autopilot`` all other options,
 and ``rate``, are those of the driver that speaks to the firmware, ``mavlink://`` or ``msp://``.
+=======
+(``front,bottom``; ``fpv`` is a racer's, wide and tilted up; or ``none``); ``width``, ``height``, ``fps`` of all
+cameras; ``latency`` of all cameras [s]; ``noise`` a factor on every sensor's and camera's noise (1); ``wind`` a factor
+on the world's wind (1); ``battery`` charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar``
+or ``mujoco`` (``planar``); ``quality`` of the planar ones, ``fast``, ``smooth`` or ``best`` (``smooth``); ``native``
+the actions that the vehicle itself takes, the others being left to the proxy (all); ``position`` whether the vehicle
+knows its position, as with an indoor positioning system (1; ``none`` for one without); ``velocity`` whether it reports
+its velocity (1; ``none`` for one that does not); ``truth`` whether feedback carries the true state too (1); ``rate`` of
+feedback [1/s] (40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified,
+or that is modelled down to its rotors, ``racer``, ``iris`` or ``crazyflie`` (``quadrotor``).
+>>>>>>> main
 """
 
 from __future__ import annotations
@@ -25,11 +37,11 @@ from skyloop.autopilots.kinds import AutopilotKind
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
+from skyloop.sim.camera import BOTTOM_CAMERA, FPV_CAMERA, FRONT_CAMERA, CameraModel
 from skyloop.sim.options import EVERY_ACTION, SimOptions
 from skyloop.sim.vehicles import VEHICLES
 
-CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA)}
+CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA, FPV_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
 RENDERERS: Final = ("planar", "mujoco")
 ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})

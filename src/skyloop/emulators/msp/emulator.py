@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
 from skyloop.clock import monotonic_ns
@@ -98,10 +97,6 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
         running = RunningFirmware(self.host, self.drone, self._bind, self._port, self.settings, self._loop)
         self._port = running.port  # found again after a restart
         return running
-
-    def set_up(self, **changes: object) -> None:
-        """Change settings, of :class:`BoardSettings`; in force from the next start."""
-        self.settings = replace(self.settings, **changes)  # type: ignore[arg-type]
 
     @property
     def port(self) -> int:

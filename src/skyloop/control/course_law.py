@@ -1,0 +1,447 @@
+"""The law that flies a course whose map is known, and corrected by what the camera sees. Pure: no clock, no thread.
+
+Gates and poles have places on a map. The vehicle knows its own place by odometry only, from where it starts; each gate
+that it sees says how far the map and the odometry are off, and each pole is put where it is seen. The way to the next
+gate leads round poles and other gates, to a place before the opening; the rest is flown along the gate's axis.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.control.detour import Point, Wall, detour
+from skyloop.control.gate_law import Axis, GatePhase
+from skyloop.control.kalman import ConstantVelocityFilter
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.target import Motion, Odometry
+from skyloop.messages import Feedback, Velocity
+from skyloop.messages.geometry import wrap_angle
+
+Array = NDArray[np.float64]
+_SURE = 3.0  # standard deviations within which a sighting is of that pole
+_TILT_RAD = 0.012  # standard deviation of an elevation: of the attitude, and of where a pole ends in the image
+_REPEATED = 3.0  # what is wrong with one sighting is wrong with the next ones too: each counts as so much worse
+_SIDES = 3  # from straight before a gate, and from both sides of that
+
+
+class GatePlace(NamedTuple):
+    """Where a gate is on the map: the centre of its opening [m], and the heading of the way through it [rad]."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    heading_rad: float
+
+
+class Pole(NamedTuple):
+    """An upright post on the map."""
+
+    x_m: float
+    y_m: float
+    radius_m: float = 0.045
+    height_m: float = 2.325
+
+
+@dataclass(frozen=True, slots=True)
+class CourseSettings:
+    """Gains, limits and distances of :class:`CourseLaw`.
+
+    The defaults suit a vehicle of half a metre and openings of 1.2 m.
+    """
+
+    lead_s: float = 0.12  #: from a command's decision to its taking hold
+    velocity_gain: float = 1.0  #: share of the velocity's error that is asked for on top
+    cruise_m_s: float = 0.8
+    climb_m_s: float = 0.5
+    turn_rad_s: float = 1.4
+    acceleration_m_s2: float = 2.0
+    aside_gain: float = 1.3  #: [1/s]
+    height_gain: float = 1.3  #: [1/s]
+    yaw_gain: float = 1.8  #: [1/s]
+    body_m: float = 0.27  #: the vehicle's radius
+    clearance_m: float = 0.2  #: kept beyond it
+    frame_m: float = 0.12  #: thickness of a gate's bars, ahead and across
+    before_m: tuple[float, ...] = (1.2, 0.9, 0.65)  #: places before the opening: the first one that is free
+    views_m: tuple[float, ...] = (3.0, 2.5, 3.8)  #: from so far a gate that was not seen yet is looked at
+    beyond_m: float = 0.45  #: distance behind the gate at which it counts as passed
+    aligned_m: float = 0.12  #: off the axis, across and in height
+    map_m: float = 0.05  #: standard deviation of what the map says, horizontally and in height
+    start_m: float = 0.2  #: standard deviation of the start
+    sightings: int = 3  #: of a gate, before it is flown through
+    waiting_s: float = 2.5  #: at each place that it is looked at from; after waiting in vain at all nothing is flown
+    braking_per_s: float = 1.3  #: speed towards what stands about, for each metre of room beyond half the clearance
+    plan_s: float = 0.4  #: between two plans of the way
+
+
+class CourseLaw:
+    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
+
+    Attributes:
+        phase: As of the last step.
+        axis: Where the vehicle is, in the gate's axes, as of the last step.
+        way: The points that it flies to, in odometry axes.
+        stuck: Why it can't go on; None while it can.
+    """
+
+    def __init__(
+        self,
+        gates: Sequence[GatePlace],
+        widths_m: Sequence[float],
+        poles: Sequence[Pole] = (),
+        start: Point = (0.0, 0.0),
+        settings: CourseSettings | None = None,
+    ) -> None:
+        """Initialise the law.
+
+        Args:
+            gates: In order.
+            widths_m: Of their openings.
+            poles: What else stands about.
+            start: Where the vehicle is at the first feedback, on the map; its yaw is the map's.
+            settings: None are the defaults.
+        """
+        self.settings = s = settings or CourseSettings()
+        self.phase, self.axis = GatePhase.SEARCHING, Axis(0.0, 0.0, 0.0)
+        self.way: list[Point] = []
+        self.stuck: str | None = None
+        self._gates, self._widths = tuple(gates), tuple(widths_m)
+        self._shift = np.array([-start[0], -start[1], 0.0])  # odometry axes from the map's
+        self._shift_m = s.start_m
+        self._poles = [_Spot(np.array(pole[:2]) + self._shift[:2], pole, s) for pole in poles]
+        self._number = 0
+        self._odometry = Odometry()
+        self._lift: float | None = None  # of the ground's altitude over the odometry's
+        self._limiter = SetpointLimiter(
+            SetpointLimits(s.cruise_m_s * 1.3, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2)
+        )
+        self._last_ns: int | None = None
+        self._planned_ns: int | None = None
+        self._waiting_ns: int | None = None
+        self._view = 0  # from which place the gate is looked at
+        self._begin_gate(0)
+
+    @property
+    def number(self) -> int:
+        """The number of the gate that is next, from 0."""
+        return self._number
+
+    def next_gate(self) -> None:
+        """Go on to the next gate: what was learnt about the last one's place corrects the others'."""
+        if self._seen >= self.settings.sightings:
+            learnt = self._gate_at(self._number) - self._nominal(self._number)
+            share = self._shift_m**2 / (self._shift_m**2 + self.settings.map_m**2)
+            for spot in self._poles:
+                spot.move(share * learnt[:2])
+            self._shift = self._shift + share * learnt
+            self._shift_m = max(0.1, self._shift_m * math.sqrt(1.0 - share))
+        self._begin_gate(self._number + 1)
+
+    def _begin_gate(self, number: int) -> None:
+        self._number, self._seen, self._view = number, 0, 0
+        self.phase, self.way, self._planned_ns, self._waiting_ns = GatePhase.GOING, [], None, None
+        self._passing_ns: int | None = None
+        self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.001, speed_m_s=0.02, gate=5.0)
+        if number < len(self._gates):
+            heading = self._gates[number].heading_rad
+            self._heading = np.array([math.cos(heading), math.sin(heading)])
+
+    def feedback(self, feedback: Feedback) -> None:
+        """Update with the vehicle's newest state."""
+        self._odometry.add(feedback)
+        newest = self._odometry.newest
+        if newest is None or feedback.altitude_m is None:
+            return
+        lift = feedback.altitude_m - float(newest.position[2])
+        self._lift = lift if self._lift is None else self._lift + 0.1 * (lift - self._lift)
+
+    def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
+        """Update with a sighting of the gate that is next; ignored where that gate can't be.
+
+        Args:
+            position: The opening's centre in body axes, (3,) [m].
+            normal: Normal of the side that is seen, in body axes, (3,).
+            at_capture: Feedback with the attitude at the capture.
+            captured_ns: Capture of the frame.
+            trust: How sure the normal is, 0 to 1.
+        """
+        motion = self._motion(captured_ns)
+        if motion is None or self._number >= len(self._gates) or at_capture.pitch_rad is None:
+            return
+        to_level = at_capture.rotation
+        distance = float(np.linalg.norm(position))
+        across = (to_level @ normal)[:2]
+        across = across / max(1e-6, float(np.linalg.norm(across)))
+        if float(across @ self._heading) < 0.0:  # from behind it looks the same
+            across = -across
+        # What is seen through the opening ends at the far edges of the bars: half their thickness behind the middle.
+        seen = to_level @ position
+        off = float(across @ seen[:2]) / max(distance, 1e-6) * self.settings.frame_m / 2
+        middle = motion.position + seen - np.array([*(off * across), 0.0])
+        if self._filter.newest is None:
+            expected = math.hypot(self.settings.map_m, self._shift_m, 0.05)
+            self._filter.start(self._nominal(self._number), expected, captured_ns)
+        if not self._filter.update(middle, 0.03 + 0.008 * distance**2, captured_ns):
+            return
+        weight = 0.15 * trust / max(1.0, 0.4 * distance)
+        mixed = (1.0 - weight) * self._heading + weight * across
+        self._heading = mixed / max(1e-6, float(np.linalg.norm(mixed)))
+        self._seen += 1
+
+    def see_pole(self, top: Array, at_capture: Feedback, captured_ns: int) -> None:
+        """Update with a sighting of a pole; ignored where none can be.
+
+        Args:
+            top: Where its top is seen, in body axes, (3,), of any length.
+            at_capture: Feedback with the attitude at the capture.
+            captured_ns: Capture of the frame.
+        """
+        motion = self._motion(captured_ns)
+        if motion is None or at_capture.pitch_rad is None or not self._poles:
+            return
+        ray = at_capture.rotation @ top
+        level = float(np.linalg.norm(ray[:2]))
+        if level < 1e-6:
+            return
+        ahead, rise = ray[:2] / level, float(ray[2]) / level
+        sightings = [spot.sighting(motion.position, ahead, rise) for spot in self._poles]
+        nearest = min(range(len(sightings)), key=lambda number: sightings[number].deviations)
+        if sightings[nearest].deviations < _SURE:
+            self._poles[nearest].update(sightings[nearest])
+
+    def step(self, now_ns: int) -> Velocity:
+        """Compute the set-point for now. All zero until the vehicle's motion is known, and where it can't go on."""
+        motion = self._motion(now_ns)
+        if motion is None or self._number >= len(self._gates):
+            return Velocity()
+        wanted = self._wanted(motion.moved_to(now_ns + nanoseconds(self.settings.lead_s)), now_ns)
+        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
+        self._last_ns = now_ns
+        return self._limiter.step(wanted, dt_s)
+
+    def _motion(self, at_ns: int) -> Motion | None:
+        """Return the vehicle's motion, its height above the ground."""
+        motion = self._odometry.at(at_ns)
+        if motion is None or self._lift is None:
+            return None
+        place = motion.position + np.array([0.0, 0.0, self._lift])
+        return Motion(motion.at_ns, place, motion.velocity, motion.yaw, motion.yaw_rate)
+
+    def _nominal(self, number: int) -> Array:
+        place: Array = np.array(self._gates[number][:3]) + self._shift
+        return place
+
+    def _gate_at(self, number: int) -> Array:
+        newest = self._filter.newest if number == self._number else None
+        place: Array = self._nominal(number) if newest is None else newest.position
+        return place
+
+    def _wanted(self, own: Motion, now_ns: int) -> Array:
+        """Return forward, left, up [m/s] and yaw rate [rad/s]; sets the phase."""
+        s = self.settings
+        gate, ahead = self._gate_at(self._number), self._heading
+        left = np.array([-ahead[1], ahead[0]])
+        offset = own.position - gate
+        self.axis = axis = Axis(float(offset[:2] @ ahead), float(offset[:2] @ left), float(offset[2]))
+        if self.phase is GatePhase.PASSED or (self.phase is GatePhase.PASSING and axis.along_m > s.beyond_m):
+            self.phase = GatePhase.PASSED
+            return np.zeros(4)
+        if self.phase is GatePhase.PASSING:
+            if self._passing_ns is None:
+                self._passing_ns = now_ns
+            elif seconds(now_ns - self._passing_ns) > 3.0 * (s.before_m[0] + s.beyond_m) / s.cruise_m_s:
+                self.stuck = "it does not get through"
+            heading = math.atan2(ahead[1], ahead[0])
+            return self._to_velocity(
+                own, s.cruise_m_s * ahead - s.aside_gain * axis.aside_m * left, -axis.above_m, heading
+            )
+        look = math.atan2(-offset[1], -offset[0])
+        walls = [*self._walls_of_gates(), *self._walls_of_poles()]
+        self._plan(own, walls, now_ns)
+        seen = self._seen >= s.sightings
+        if not self.way:
+            self._wait(now_ns)
+            return self._to_velocity(own, self._kept_off(np.zeros(2), own.position[:2], walls), -axis.above_m, look)
+        goal = np.array(self.way[-1])
+        left_m = float(np.linalg.norm(goal - own.position[:2]))
+        here = left_m < 0.2 and abs(axis.above_m) < s.aligned_m
+        if here and seen and abs(axis.aside_m) < s.aligned_m and abs(wrap_angle(look - own.yaw)) < 0.3:
+            self.phase = GatePhase.PASSING
+        elif here and not seen:
+            self._wait(now_ns)
+        else:
+            self.phase, self._waiting_ns = GatePhase.GOING, None
+        horizontal = self._kept_off(self._along(own.position[:2]), own.position[:2], walls)
+        return self._to_velocity(own, horizontal, -axis.above_m, look)
+
+    def _wait(self, now_ns: int) -> None:
+        self.phase = GatePhase.SEARCHING
+        if self._waiting_ns is None:
+            self._waiting_ns = now_ns
+        elif seconds(now_ns - self._waiting_ns) > self.settings.waiting_s:
+            self._waiting_ns, self._planned_ns, self._view = None, None, self._view + 1
+            if self._view >= _SIDES * len(self.settings.views_m):
+                self.stuck = "the gate is not seen where it should be"
+
+    def _kept_off(self, velocity: Array, place: Array, walls: Sequence[Wall]) -> Array:
+        """Take out of a horizontal velocity what leads too fast to what stands about."""
+        s = self.settings
+        for wall in walls:
+            away = place - np.array(_nearest(place, wall))
+            far = float(np.linalg.norm(away))
+            away = away / max(far, 1e-6)
+            room = far - (wall.reach_m - s.clearance_m / 2)
+            towards, most = -float(velocity @ away), s.braking_per_s * room
+            if towards > most:
+                velocity = velocity + (towards - max(most, -0.3)) * away
+        return velocity
+
+    def _to_velocity(self, own: Motion, horizontal: Array, up_m: float, look: float) -> Array:
+        s = self.settings
+        turn = clamped(s.yaw_gain * wrap_angle(look - own.yaw), s.turn_rad_s)
+        up = clamped(s.height_gain * up_m, s.climb_m_s)
+        velocity = own.stiffened(np.array([*shortened(horizontal, s.cruise_m_s), up]), s.velocity_gain)
+        return np.array([*own.to_body(velocity[:2]), velocity[2], turn])
+
+    def _along(self, place: Array) -> Array:
+        """Return the horizontal velocity along the way."""
+        while len(self.way) > 1 and math.dist(self.way[0], place) < 0.2:
+            del self.way[0]
+        aim = np.array(self.way[0]) - place
+        far = float(np.linalg.norm(aim))
+        rest = far + sum(math.dist(a, b) for a, b in zip(self.way[:-1], self.way[1:], strict=True))
+        speed = min(self.settings.cruise_m_s, 1.0 * rest)
+        if len(self.way) > 1:  # slower round a corner
+            speed = min(speed, 0.35 + 0.8 * far)
+        return aim * (speed / max(far, 1e-6))
+
+    def _plan(self, own: Motion, walls: Sequence[Wall], now_ns: int) -> None:
+        """Find the way to before the gate anew, now and then."""
+        s = self.settings
+        if self._planned_ns is not None and seconds(now_ns - self._planned_ns) < s.plan_s:
+            return
+        self._planned_ns = now_ns
+        gate, ahead = self._gate_at(self._number)[:2], self._heading
+        here: Point = (float(own.position[0]), float(own.position[1]))
+        if self._seen >= s.sightings:
+            goals = [gate - ahead * before for before in s.before_m]
+        else:
+            goals = [gate - _turned(ahead, side) * far for far in s.views_m for side in (0.0, 0.5, -0.5)]
+            goals = sorted(goals, key=lambda goal: self._hides(goal, gate, ahead))  # (keeps the order of equals)
+            goals = goals[self._view :] + goals[: self._view]
+        free = [goal for goal in goals if _room(goal, walls) >= 0.0]
+        for goal in free or sorted(goals, key=lambda goal: -_room(goal, walls)):
+            way = detour(here, (float(goal[0]), float(goal[1])), walls)
+            if way is not None:
+                self.way = way
+                return
+        self.way = []
+
+    def _hides(self, place: Array, gate: Array, ahead: Array) -> bool:
+        """Return whether a pole stands between a place and the gate's opening."""
+        half = np.array([-ahead[1], ahead[0]]) * (self._widths[self._number] / 2 + self.settings.frame_m)
+        corners = [place, gate - half, gate + half]
+        edges = [
+            (b - a) / max(1e-6, float(np.linalg.norm(b - a)))
+            for a, b in zip(corners, corners[1:] + corners[:1], strict=True)
+        ]
+        inward = [np.array([-edge[1], edge[0]]) for edge in edges]
+        if float(inward[0] @ (corners[2] - corners[0])) < 0.0:
+            inward = [-one for one in inward]
+        return any(
+            all(
+                float(one @ (spot.place - corner)) > -spot.radius_m - 0.05
+                for one, corner in zip(inward, corners, strict=True)
+            )
+            for spot in self._poles
+        )
+
+    def _walls_of_gates(self) -> list[Wall]:
+        s = self.settings
+        walls = []
+        for number, (place, width) in enumerate(zip(self._gates, self._widths, strict=True)):
+            middle = self._gate_at(number)[:2]
+            along = (
+                self._heading
+                if number == self._number
+                else np.array([math.cos(place.heading_rad), math.sin(place.heading_rad)])
+            )
+            half = np.array([-along[1], along[0]]) * (width / 2 + s.frame_m / 2)
+            (x, y), (u, v) = (middle - half).tolist(), (middle + half).tolist()
+            spread = s.map_m if number != self._number or not self._seen else 0.0
+            walls.append(Wall((x, y), (u, v), s.frame_m / 2 + s.body_m + s.clearance_m + spread))
+        return walls
+
+    def _walls_of_poles(self) -> list[Wall]:
+        s = self.settings
+        return [
+            Wall(place, place, spot.radius_m + s.body_m + s.clearance_m + spot.spread_m)
+            for spot in self._poles
+            for place in [(float(spot.place[0]), float(spot.place[1]))]
+        ]
+
+
+class _Sighting(NamedTuple):
+    miss: Array  #: of where a pole is believed, (2,) [m]
+    spread: Array  #: covariance of that, (2, 2) [m²]
+    deviations: float  #: how far off that is
+
+
+class _Spot:
+    """A pole's place and how sure it is: a Kalman filter of a point that stands still, in two dimensions."""
+
+    def __init__(self, place: Array, pole: Pole, settings: CourseSettings) -> None:
+        self.place, self.radius_m, self._height = place, pole.radius_m, pole.height_m
+        self._covariance = np.eye(2) * (settings.map_m**2 + 0.05**2)
+
+    @property
+    def spread_m(self) -> float:
+        """The standard deviation along its worst direction."""
+        return float(math.sqrt(np.linalg.eigvalsh(self._covariance)[-1]))
+
+    def move(self, by: Array) -> None:
+        self.place = self.place + by
+
+    def sighting(self, own: Array, ahead: Array, rise: float) -> _Sighting:
+        """Compare a bearing and the slope up to a top with where this pole is believed: higher tops are nearer."""
+        height = self._height - float(own[2])
+        if rise * height <= 0.01 or abs(height) < 0.2:
+            return _Sighting(np.zeros(2), np.eye(2), math.inf)
+        distance = height / rise
+        aside = np.array([-ahead[1], ahead[0]])
+        along_m = 0.05 + _TILT_RAD * (distance**2 + height**2) / abs(height)
+        noise = np.outer(ahead, ahead) * along_m**2 + np.outer(aside, aside) * (0.03 + 0.02 * distance) ** 2
+        miss, spread = own[:2] + distance * ahead - self.place, self._covariance + noise
+        off = float(miss @ np.linalg.solve(spread, miss)) ** 0.5
+        return _Sighting(miss, self._covariance + noise * _REPEATED**2, off)
+
+    def update(self, sighting: _Sighting) -> None:
+        gain = self._covariance @ np.linalg.inv(sighting.spread)
+        self.place = self.place + gain @ sighting.miss
+        # The odometry drifts: nothing is known better than to some centimetres.
+        self._covariance = (np.eye(2) - gain) @ self._covariance + np.eye(2) * 1e-5
+
+
+def _turned(vector: Array, angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+
+
+def _room(place: Array, walls: Sequence[Wall]) -> float:
+    """Return how much farther than it must be a place is from the nearest wall [m]; below 0 if it is too near."""
+    return min((math.dist(place, _nearest(place, wall)) - wall.reach_m for wall in walls), default=math.inf)
+
+
+def _nearest(place: Array, wall: Wall) -> Point:
+    """Return the wall's point that is nearest to a place."""
+    (x, y), (u, v) = wall.begin, wall.end
+    along, aside = u - x, v - y
+    share = ((float(place[0]) - x) * along + (float(place[1]) - y) * aside) / max(along**2 + aside**2, 1e-12)
+    share = max(0.0, min(1.0, share))
+    return x + share * along, y + share * aside

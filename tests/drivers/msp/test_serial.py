@@ -1,0 +1,80 @@
+"""A flight controller on a serial port: a pseudo-terminal with the emulated one behind it."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import sys
+import threading
+import tty
+from collections.abc import Iterator
+
+import pytest
+
+from skyloop.drivers.msp import MspDriver
+from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.drivers.uri import parse_uri
+from skyloop.emulators.msp import BetaflightFirmware
+from skyloop.errors import MissingExtraError
+from skyloop.messages import Idle, LinkState, ResetEmergency
+from tests.drivers.msp.rig import world
+
+
+class Wire(threading.Thread):
+    """Carries bytes between a pseudo-terminal and the emulated firmware."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__(daemon=True)
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
+        self._line = socket.create_connection(("127.0.0.1", port), 5)
+        self._ending = threading.Event()
+
+    def run(self) -> None:
+        while not self._ending.is_set():
+            for ready in select.select([self._master, self._line.fileno()], [], [], 0.05)[0]:
+                if ready == self._master:
+                    self._line.sendall(os.read(self._master, 4096))
+                else:
+                    os.write(self._master, self._line.recv(4096))
+
+    def cut(self) -> None:
+        self._ending.set()
+        self.join()
+        self._line.close()
+        os.close(self._master)
+        os.close(self._slave)
+
+
+@pytest.fixture
+def firmware() -> Iterator[BetaflightFirmware]:
+    with BetaflightFirmware(world(), port=0) as firmware:
+        yield firmware
+
+
+def test_a_serial_port_is_read_and_lost(firmware: BetaflightFirmware) -> None:
+    pytest.importorskip("serial")
+    wire = Wire(firmware.port)
+    wire.start()
+    driver, sink = MspDriver(parse_uri(f"msp://{wire.path}?baud=230400")), RecordingSink()
+    driver.open(sink)
+    try:
+        assert sink.wait(lambda: sink.link_state is LinkState.UP, 20.0), sink.links
+        assert sink.wait(lambda: sink.feedback_count > 5, 10.0)
+        assert driver.apply(Idle()) == Idle()
+        assert driver.apply(ResetEmergency()) == ResetEmergency()
+        assert driver.left_to() == ""
+        wire.cut()
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, 10.0), sink.links
+        assert sink.wait(lambda: f"there is no {wire.path}" in sink.links[-1][1], 10.0), sink.links
+    finally:
+        driver.close()
+
+
+def test_without_pyserial_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "serial", None)
+    driver = MspDriver(parse_uri("msp:///dev/ttyACM0"))
+    with pytest.raises(MissingExtraError, match=r"pip install 'skyloop\[msp\]'"):
+        driver.open(RecordingSink())
