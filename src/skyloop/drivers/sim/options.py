@@ -1,20 +1,6 @@
 """Options of a ``sim://`` address. Pure.
 
 Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds of simulation a second (1); ``cameras``
-<<<<<<< HEAD
-(``front,bottom``, or ``none``); ``width``, ``height``, ``fps`` of all cameras; ``latency`` of all cameras [s];
-``noise`` a factor on every sensor's and camera's noise (1); ``wind`` a factor on the world's wind (1); ``battery``
-charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar`` or ``mujoco`` (``planar``);
-``quality`` of the planar ones, ``fast``, ``smooth`` or ``best`` (``smooth``); ``native`` the actions that the vehicle
-itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its position, as with an
-indoor positioning system (1; ``none`` for one without); ``velocity`` whether it reports its velocity (1;
-``none`` for one that does not); ``truth`` whether feedback carries the true state too (1); ``rate`` of feedback [1/s]
-(40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified, or that is modelled
-down to its rotors, ``racer``, ``iris`` or ``crazyflie`` (``quadrotor``); ``autopilot`` the real firmware that flies it,
-``ardupilot``, ``betaflight`` or ``px4`` (none), on an ``iris``, or a ``racer`` for Betaflight, if no other is named;
-``autopilot_folder`` where it keeps its settings (they last as long as the drone). With ``autopilot`` all other options,
-and ``rate``, are those of the driver that speaks to the firmware, ``mavlink://`` or ``msp://``.
-=======
 (``front,bottom``; ``fpv`` is a racer's, wide and tilted up; or ``none``); ``width``, ``height``, ``fps`` of all
 cameras; ``latency`` of all cameras [s]; ``noise`` a factor on every sensor's and camera's noise (1); ``wind`` a factor
 on the world's wind (1); ``battery`` charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar``
@@ -23,8 +9,11 @@ the actions that the vehicle itself takes, the others being left to the proxy (a
 knows its position, as with an indoor positioning system (1; ``none`` for one without); ``velocity`` whether it reports
 its velocity (1; ``none`` for one that does not); ``truth`` whether feedback carries the true state too (1); ``rate`` of
 feedback [1/s] (40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified,
-or that is modelled down to its rotors, ``racer``, ``iris`` or ``crazyflie`` (``quadrotor``).
->>>>>>> main
+or that is modelled down to its rotors, ``racer``, ``iris`` or ``crazyflie`` (``quadrotor``); ``autopilot`` the real
+firmware that flies it, ``ardupilot``, ``betaflight`` or ``px4`` (none), on an ``iris``, or a ``racer`` for Betaflight,
+if no other is named; ``autopilot_folder`` where it keeps its settings (they last as long as the drone). With
+``autopilot`` all other options, and ``rate``, are those of the driver that speaks to the firmware, ``mavlink://`` or
+``msp://``.
 """
 
 from __future__ import annotations
