@@ -85,7 +85,8 @@ class Betaflight(CoupledFirmware):
     def _prepare(self, folder: Path) -> Launch:
         if not (folder / SETTINGS_FILE).exists():
             self._configure(folder)
-        return Launch((self._program, LOOPBACK))
+        # Its scheduler drops the flight control loop when it comes late by two periods of 125 µs, and finds back by chance.
+        return Launch((self._program, LOOPBACK), prompt=True)
 
     def _configure(self, folder: Path) -> None:
         """Write :data:`SETTINGS` as a person would, by the command line on its serial port; it ends when it saves them.

@@ -16,6 +16,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
+from skyloop.autopilots.keeper import PROMPT
 from skyloop.child_process import ChildProcess
 from skyloop.errors import SkyloopError, UsageError
 
@@ -47,10 +48,11 @@ class FirmwareEvent:
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """How a firmware is started: its command line, and what its environment has besides this process's."""
+    """How a firmware is started."""
 
     command: Sequence[str]
-    environment: Mapping[str, str] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=dict)  #: what it has besides this process's
+    prompt: bool = False  #: whether it must be woken on time; see :func:`~skyloop.autopilots.prompt.become_prompt`
 
 
 class Program:
@@ -139,7 +141,8 @@ class Program:
     def _run_once(self, folder: Path) -> str:
         """Run it until it ends; return how, for people."""
         launch = self._prepare(folder)
-        settings = [f"{name}={value}" for name, value in launch.environment.items()]
+        settings = [PROMPT] if launch.prompt else []
+        settings += [f"{name}={value}" for name, value in launch.environment.items()]
         keeper = [sys.executable, "-m", "skyloop.autopilots.keeper", str(folder), str(folder / LOG), *settings]
         with self._lock:
             if self._ending.is_set():
