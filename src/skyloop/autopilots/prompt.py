@@ -15,8 +15,10 @@ _PR_SET_TIMERSLACK: Final = 29  # linux/prctl.h
 
 
 def become_prompt() -> None:
-    """Have this process, and what it starts, woken soon. Without rights, that is less sure; elsewhere than on Linux,
-    nothing happens. Never raises."""
+    """Have this process, and what it starts, woken on time: surely as root, less so else. Never raises.
+
+    Only Linux is told.
+    """
     if sys.platform != "linux":
         return
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, SLACK_NS)
