@@ -12,6 +12,7 @@ from typing import Final
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.hosts.impairments import Impairments
 from benchmarks.hosts.namespaces import Host, Lab
@@ -58,10 +59,12 @@ class PathCase(msgspec.Struct, frozen=True):
     contender: str
     carried_kbit_s: float  #: by the path, on average over all the time
     sent_kbit_s: float  #: of it that were used by all that the vehicle sent
-    good_share: float  #: of the time, in which the path carried enough; the following is of that time
+    good_share: float  #: of the time, in which the path carried enough; what follows is of that time, but for two
     video: Ages | None  #: age of each picture when the application has it; None: there was none
     frozen_share: float | None
     unavoidable_share: float  #: in which nobody could have shown a picture that is not frozen
+    frozen_of_all: float | None  #: of all the time, however little the path carried …
+    unavoidable_of_all: float  #: … and as much of that as nobody could have avoided
     pictures_per_s: float
     psnr_db: float | None
     feedback: Ages | None
@@ -174,8 +177,12 @@ def judge(contender: str, trace: Trace, seconds: float, begin_ns: int, arrivals:
     in_time = [age for at, age in shown if good[int(at // _SECOND_MS)]]
     qualities = [(float(name.removeprefix(QUALITY)), pairs) for name, pairs in arrivals.items() if QUALITY in name]
     judged = sum(len(pairs) for _, pairs in qualities)
-    steps = [ms for ms in np.arange(0.0, seconds * _SECOND_MS, _STEP_MS) if good[int(ms // _SECOND_MS)]]
+    # What was captured before the begin is not known: until it would count as frozen, nothing does.
+    steps = np.arange(FROZEN_MS, seconds * _SECOND_MS, _STEP_MS)
+    counts = np.array([good[int(ms // _SECOND_MS)] for ms in steps])
     commands, delay_ms = arrivals.get(COMMAND, []), DELAY_S * 1e3
+    frozen = _frozen(shown, steps)
+    unavoidable = np.array([trace.waits_ms(ms - delay_ms) + delay_ms > FROZEN_MS for ms in steps])
     return PathCase(
         trace=trace.name,
         contender=contender,
@@ -183,8 +190,10 @@ def judge(contender: str, trace: Trace, seconds: float, begin_ns: int, arrivals:
         sent_kbit_s=sent_bytes * 8e-3 / seconds,
         good_share=sum(good) / len(good),
         video=_ages(in_time),
-        frozen_share=_frozen(shown, steps) if in_time else None,
-        unavoidable_share=float(np.mean([trace.waits_ms(ms - delay_ms) + delay_ms > FROZEN_MS for ms in steps])),
+        frozen_share=float(np.mean(frozen[counts])) if in_time else None,
+        unavoidable_share=float(np.mean(unavoidable[counts])) if counts.any() else 0.0,
+        frozen_of_all=float(np.mean(frozen)) if in_time else None,
+        unavoidable_of_all=float(np.mean(unavoidable)),
         pictures_per_s=len(in_time) / max(1, sum(good)),
         psnr_db=sum(decibel * len(pairs) for decibel, pairs in qualities) / judged if judged else None,
         feedback=_ages(_in_good(arrivals.get(FEEDBACK, []), good, begin_ns)),
@@ -219,13 +228,15 @@ def _ages(ages_ms: list[float]) -> Ages | None:
     return Ages(*(float(value) for value in np.percentile(ages_ms, [50, 95, 99]))) if ages_ms else None
 
 
-def _frozen(shown: list[tuple[float, float]], steps: list[float]) -> float:
-    """Return the share of the steps at which the newest picture shown is too old."""
+def _frozen(shown: list[tuple[float, float]], steps: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return for each of the steps [ms] whether the newest picture shown is too old."""
+    if not shown:
+        return np.ones(len(steps), dtype=np.bool_)
     came = np.array([at for at, _ in shown])
     captured = np.array([at - age for at, age in shown])
     index = np.searchsorted(came, steps, side="right") - 1
-    ages = np.where(index >= 0, np.asarray(steps) - captured[np.maximum(index, 0)], np.inf)
-    return float(np.mean(ages > FROZEN_MS))
+    found: NDArray[np.bool_] = np.where(index >= 0, steps - captured[np.maximum(index, 0)], np.inf) > FROZEN_MS
+    return found
 
 
 def table(results: VideoPath) -> Table:
@@ -237,7 +248,9 @@ def table(results: VideoPath) -> Table:
                 case.trace,
                 case.contender,
                 _three(case.video),
-                UNKNOWN if case.frozen_share is None else f"{case.frozen_share:.1%} ({case.unavoidable_share:.1%})",
+                f"{case.good_share:.0%}",
+                _frozen_share(case.frozen_share, case.unavoidable_share),
+                _frozen_share(case.frozen_of_all, case.unavoidable_of_all),
                 f"{case.pictures_per_s:.1f}",
                 f"{case.sent_kbit_s:.0f} / {case.carried_kbit_s:.0f}",
                 UNKNOWN if case.psnr_db is None else f"{case.psnr_db:.0f}",
@@ -247,10 +260,14 @@ def table(results: VideoPath) -> Table:
             ]
         )
     columns = [
-        *("uplink", "video", "its age", "frozen (unavoidably)", "pictures a second", "kbit/s used / carried"),
-        *("PSNR in dB", "age of feedback", "age of commands", "executed"),
+        *("uplink", "video", "its age", "seconds of 300 kbit/s", "frozen in these (unavoidably)", "in all"),
+        *("pictures a second", "kbit/s used / carried", "PSNR in dB", "age of feedback", "age of commands", "executed"),
     ]
     return Table("Ages in ms: median, 95th and 99th percentile, while the uplink carries 300 kbit/s", columns, rows)
+
+
+def _frozen_share(share: float | None, unavoidable: float) -> str:
+    return UNKNOWN if share is None else f"{share:.1%} ({unavoidable:.1%})"
 
 
 def _three(ages: Ages | None) -> str:

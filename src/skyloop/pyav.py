@@ -70,7 +70,7 @@ def limit_memory(context: CodecContext) -> None:
 _TICK: Final = Fraction(1, 1_000_000)  # of the stamps that the encoder's rate control goes by [s]
 #: How much of a second at its rate a stream may send at once: what a key picture takes. A slow link has to carry it
 #: before the next picture.
-_BURST_S: Final = 0.25
+_BURST_S: Final = 0.15
 _GROWS: Final = 3
 _FALLS: Final = 12  # below this share of the most it may send, a single picture takes the path for too long
 _KEY_EVERY_S: Final = 10.0  #: who comes later asks for one

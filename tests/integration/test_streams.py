@@ -5,19 +5,23 @@ from __future__ import annotations
 import itertools
 import queue
 import threading
+import time
 from collections.abc import Iterator
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
 import pytest
 
-from skyloop.client import Drone
-from skyloop.client.streams import MOST_WAITING, StreamChannel
+from skyloop.client import Drone, streams
+from skyloop.client.streams import MOST_WAITING, StreamChannel, StreamDecoder
 from skyloop.errors import UsageError
 from skyloop.messages import EncodedFrame
 from skyloop.messages.encoded import Chain
 from skyloop.proxy.streams import IDLE_S, MAX_FORMS
+from skyloop.pyav import H264Encoder
 from skyloop.transport.base import Pixels
+from skyloop.transport.testing import wait_until
 from tests.integration.test_fabric import WAIT_S, Node, far, near_node, node, take
 
 av = pytest.importorskip("av", reason="H.264 needs the extra 'video'")
@@ -177,6 +181,21 @@ def test_a_decoder_that_is_too_slow_goes_on_with_a_key(far: Node) -> None:
         assert len(decoder._waiting) <= MOST_WAITING
         slow.set()
         assert take(frames, 2)
+
+
+def test_after_a_silence_the_stream_goes_on_without_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "_IDLE_S", 0.01)
+    encoder, stream = H264Encoder(32, 24, 30.0, 200), Mock(spec=StreamChannel)
+    shown: queue.Queue[int] = queue.Queue()
+    decoder = StreamDecoder(stream, lambda header, _pixels, _came_ns: shown.put(header.seq), time.monotonic_ns, "d")
+    for seq in (1, 2, 3):
+        data, key = encoder.encode(np.full((24, 32, 3), 40 * seq, np.uint8), "bgr24", seq * 33_000_000)
+        assert key == (seq == 1)
+        decoder.put(EncodedFrame("front", seq, seq, seq, 32, 24, "h264", key, data))
+        assert shown.get(timeout=WAIT_S) == seq
+        wait_until(lambda: not decoder._running, "its thread has ended")
+    assert decoder.dropped == 0
+    assert all(not call.kwargs for call in stream.report.call_args_list), "no key picture was asked for"
 
 
 def test_the_encoder_ends_with_its_last_subscriber(node: Node) -> None:

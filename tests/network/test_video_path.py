@@ -105,8 +105,10 @@ def test_only_the_time_in_which_the_path_carries_enough_counts() -> None:
     assert case.video == video_path.Ages(50, 50, 50)
     assert (case.pictures_per_s, case.psnr_db, case.feedback) == (9, 30, None)
     assert (case.carried_kbit_s, case.sent_kbit_s) == (400, 200)
-    assert case.frozen_share == pytest.approx(100 / 2000, abs=0.01), "at first, and until the third second's first"
-    assert case.unavoidable_share == pytest.approx(20 / 2000, abs=0.01)
+    assert case.frozen_share == pytest.approx(50 / 1717, abs=0.01), "until the third second's first picture"
+    assert case.unavoidable_share == pytest.approx(20 / 1717, abs=0.01)
+    assert case.frozen_of_all == pytest.approx((2050 - 1083) / 2717, abs=0.01)
+    assert case.unavoidable_of_all == pytest.approx((2020 - 1263) / 2717, abs=0.01)
     assert "50, 50, 50" in video_path.table(video_path.VideoPath(_machine(), 3.0, [case])).markdown()
 
 

@@ -180,6 +180,22 @@ def test_a_form_for_one_follows_what_it_acknowledges(bench: Bench) -> None:
     assert form.skipped >= 12
 
 
+def test_who_comes_again_over_a_new_link_gets_a_key_at_once(bench: Bench) -> None:
+    app = watcher(bench, MINE)
+    for _ in range(20):  # the link is lost: nothing is acknowledged
+        shoot(bench)
+        time.sleep(0.002)
+    skipped = bench.proxy.publisher.streams.known[0].skipped
+    assert skipped
+    app.end.subscribe(MINE, False)
+    app.sync()
+    again = watcher(bench, MINE, "again")  # no frame in between: there was a subscriber each time
+    bench.clock.advance(KEY_NS / 1e9)
+    (picture,) = shown(bench, again, 1)
+    assert picture.key
+    assert bench.proxy.publisher.streams.known[0].skipped == skipped
+
+
 def test_a_slow_path_gets_smaller_pictures_and_larger_ones_only_after_a_while(bench: Bench) -> None:
     app = watcher(bench, MINE)
     (form,) = bench.proxy.publisher.streams.known

@@ -16,10 +16,13 @@ import zenoh
 from skyloop.messages import Command, Hello, ReleaseAuthority, Request, Takeoff, encode
 from skyloop.transport.base import FEEDBACK, MAX_PACKET, Peer, results, video
 from skyloop.transport.fabric import FabricServer, FabricSettings, dial, layout, packets
+from skyloop.transport.fabric.client import STALLED_S as CLIENT_STALLED_S
 from skyloop.transport.fabric.client import FabricClient
 from skyloop.transport.fabric.config import free_port
 from skyloop.transport.fabric.connection import ServerConnection
+from skyloop.transport.fabric.delivery import Outgoing
 from skyloop.transport.fabric.registry import STALLED_S
+from skyloop.transport.fabric.settings import LEASE_S
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 
 LOCAL = "127.0.0.1"
@@ -37,16 +40,17 @@ def stranger(**sections: list[str]) -> zenoh.Session:
 class Scene:
     """A server and an application that keep to the protocol, and a stranger who is connected to both."""
 
-    def __init__(self, ends: ExitStack) -> None:
+    def __init__(self, ends: ExitStack, lease_s: float = LEASE_S) -> None:
         place, lair = (f"{LOCAL}:{free_port(LOCAL)}" for _ in range(2))
         self.intruder = stranger(listen=[f"tcp/{lair}"], connect=[f"tcp/{place}"])
         ends.callback(self.intruder.close)
-        self.server = FabricServer("alpha", FabricSettings(listen=(place,), multicast=False))
+        self.server = FabricServer("alpha", FabricSettings(listen=(place,), multicast=False, lease_s=lease_s))
         self.log = ServerLog()
         self.server.start(self.log)
         ends.callback(self.server.stop)
         self.app_log = ClientLog()
-        self.app = dial("alpha", FabricSettings(connect=(place, f"tcp/{lair}"), multicast=False))(self.app_log)
+        settings = FabricSettings(connect=(place, f"tcp/{lair}"), multicast=False, lease_s=lease_s)
+        self.app = dial("alpha", settings)(self.app_log)
         ends.callback(self.app.close)
         wait_until(lambda: self.log.joined, "the application joined")
         for topic in (FEEDBACK, video(FRONT)):
@@ -149,6 +153,24 @@ def test_an_application_that_takes_nothing_is_let_go_and_counted(scene: Scene, m
     wait_until(lambda: scene.log.left, "it is let go")
     assert "it took nothing of what was sent to it for 3 s" in str(scene.log.left)
     assert scene.server.counters["network.dropped"] == 1
+
+
+def test_with_a_longer_lease_both_ends_wait_longer_for_acknowledgements(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ExitStack() as ends:
+        scene = Scene(ends, LEASE_S + 2.0)
+        stalled_s, looked = [STALLED_S + 1.9], threading.Event()
+
+        def stalled(connection: ServerConnection, now_s: float) -> float:
+            looked.set()
+            return stalled_s[0]
+
+        monkeypatch.setattr(ServerConnection, "stalled_s", stalled)
+        assert looked.wait(10)
+        scene.still_serves()
+        monkeypatch.setattr(Outgoing, "stalled_s", lambda _outgoing, _now: CLIENT_STALLED_S + 1.9)
+        scene.still_serves()
+        stalled_s[0] = STALLED_S + 2.1
+        wait_until(lambda: scene.log.left, "it is let go")
 
 
 def test_topics_that_do_not_exist_are_refused_and_leave_nothing(scene: Scene) -> None:

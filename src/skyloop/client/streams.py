@@ -136,9 +136,7 @@ class StreamDecoder:
         with self._changed:
             if self._changed.wait_for(lambda: bool(self._waiting), _IDLE_S):
                 return self._waiting.popleft()
-            self._running = False
-            self._context = None
-            self._chain.restart()
+            self._running = False  # what comes after a silence of the path still follows: the decoder stays
             return None
 
     def _leave_out(self) -> None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
     from skyloop.cockpit.stream import PageCounts
 
-SEND_HZ: Final = 25.0  #: messages in a second, at most
+SEND_HZ: Final = 60.0  #: messages in a second, at most
 GATHER_S: Final = 0.005  #: a picture waits so long for those of other cameras, which often come together
 MAX_SHOWN: Final = 64  #: cameras that one page can show at a time
 _BAD_MESSAGE: Final = 1008

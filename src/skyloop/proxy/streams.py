@@ -121,6 +121,13 @@ class StreamForm:
         """Encode from here on, beginning with a key picture. The lock is held."""
         self._passing, self._wants_key, self._anew = False, True, True
 
+    def asked(self) -> None:
+        """Note that somebody subscribes. Who comes again after a lost link acknowledges nothing of before."""
+        with self._changed:
+            self._wants_key = True
+            if self._rate is not None:
+                self._rate.forget()
+
     def wants(self, header: FrameHeader, subscribers: int) -> bool:
         """Return whether a frame is to be encoded. On the thread that publishes it; call it once for each.
 
@@ -320,6 +327,8 @@ class Streams:
         except MissingExtraError as error:
             return str(error)
         if self._forms.claim(topic, lambda: StreamForm(topic, request, camera, self.publish, self._fail, self._clock)):
+            if (form := self._forms.find(topic)) is not None:
+                form.asked()
             return ""
         return (
             f"this proxy encodes video in {MAX_FORMS} forms at most at a time, and all are in use: subscribe to one of "

@@ -1,10 +1,12 @@
 """How much of an encoded stream a path carries: judged by what a subscriber acknowledges, the time passed as argument.
 
-Delay comes first. Each acknowledgement gives a round trip, and how much was delivered meanwhile (as in Cardwell et al.,
-"BBR: Congestion-Based Congestion Control", ACM Queue 14(5), 2016). What the round trip takes above the shortest of
-late is taken for waiting in the path: while that is long the rate falls below what was delivered, and otherwise it
-grows. No picture is begun while more is under way than the path delivers in :data:`MOST_WAIT_S`, so that a path that
-stalls holds a few pictures and not seconds of them, and nothing has to be thrown away after it was encoded.
+Delay comes first. What a picture's round trip takes above the shortest of late is taken for waiting in the path. A
+queue that stands brings the rate below what is delivered (as in Cardwell et al., "BBR: Congestion-Based Congestion
+Control", ACM Queue 14(5), 2016). A mobile network carries ten times as much in one tenth of a second as in the next,
+so near the average pictures are often late: each time the rate falls, too, and it grows so slowly that few are.
+No picture is begun while more is under way than the path delivers in :data:`MOST_WAIT_S`, so that one that stalls holds
+a few pictures and not seconds of them, and nothing has to be thrown away after it was encoded. While it stands still a
+picture is sent now and then, so that a young one is there as soon as anything passes.
 """
 
 from __future__ import annotations
@@ -16,16 +18,26 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 
 LEAST_KBIT_S: Final = 60
+#: The rate at first, and that below which single pictures that waited don't bring it: less helps them little, as most
+#: of such a wait is the path's own silence.
 START_KBIT_S: Final = 300
-GOOD_WAIT_S: Final = 0.03  #: waiting in the path below which the rate grows …
-LONG_WAIT_S: Final = 0.06  #: … and above which it falls
+STANDING_S: Final = 0.25  #: the shortest wait within so long is that of a queue that stays …
+LONG_WAIT_S: Final = 0.06  #: … and the rate falls where it is longer …
+FALL: Final = 0.85  #: … to so much of what is delivered …
+GOOD_WAIT_S: Final = 0.03  #: … and grows where it is shorter
+LATE_S: Final = 0.1  #: a single picture that waited so long is late …
+LATE_FALL: Final = 0.7  #: … and the rate falls to so much of what it was …
+LATE_EVERY_S: Final = 0.15  #: … once for all that were held up together
+GROWTH_1_S: Final = 0.1  #: of the rate, each second …
+SEARCH_1_S: Final = 2.0  #: … and below the first rate, or as long as nothing was late
 MOST_WAIT_S: Final = 0.08  #: as much is under way, beside what the shortest round trip holds
-GROWTH_1_S: Final = 0.5  #: of the rate, each second …
-SEARCH_1_S: Final = 2.0  #: … and from the start, or an outage, up to the first long wait
-STANDING_S: Final = 0.1  #: the shortest wait within so long is judged: only a queue that stays is ours
+SILENT_S: Final = 0.3  #: a path of which nothing was heard for so long stands still, through no fault of the rate …
+SILENT_FALL: Final = 0.5  #: … which is no longer known for what it may carry after it
+PROBE_S: Final = 0.15  #: while it stands still there is a picture as often …
+PROBES_S: Final = 0.1  #: … as long as no more is under way than the rate gives in this time
 LOST_S: Final = 1.0  #: what is not acknowledged for so long is taken for lost
 SHORTEST_S: Final = 10.0  #: how long a shortest round trip counts
-_MEAN_S: Final = 0.5  # time over which the delivery is averaged
+_FEWEST: Final = 3  # pictures by which a queue is judged
 
 
 @dataclass(slots=True)
@@ -33,8 +45,6 @@ class _Sent:
     seq: int
     size: int
     sent_ns: int
-    delivered: int  # bytes that were delivered when it was sent …
-    delivered_ns: int  # … and when the last of them was
 
 
 class StreamRate:
@@ -47,34 +57,40 @@ class StreamRate:
 
     def __init__(self, most_kbit_s: int, now_ns: int) -> None:
         self.kbit_s = float(min(START_KBIT_S, most_kbit_s))  #: the present rate
-        self.wait_s = 0.0  #: how long the newest acknowledged picture waited in the path [s]
+        self.wait_s = 0.0  #: how long pictures wait in the path at present, at the least [s]
         self.lost = 0  #: pictures that were never acknowledged
         self._most_kbit_s = most_kbit_s
-        self._growth_1_s = SEARCH_1_S
+        self._searches = True  # nothing was late yet
+        self._silent = False  # the path stands still
         self._under_way: deque[_Sent] = deque()
         self._bytes = 0  # of these
+        self._sent_ns = now_ns - nanoseconds(LOST_S)  # when the newest of them was
         self._delivered = 0
-        self._delivered_ns = now_ns
-        self._capacity_kbit_s = self.kbit_s  # as delivered, averaged
         self._shortest: deque[tuple[int, int]] = deque()  # round trips [ns] and when, each longer than those before it
+        self._waits: deque[tuple[float, int, int]] = deque()  # [s], when, and what was delivered until then
         self._changed_ns = now_ns
-        self._waits: deque[tuple[float, int]] = deque()  # [s], and when
+        self._late_ns = now_ns - nanoseconds(LATE_EVERY_S)
 
     def may_send(self, now_ns: int) -> bool:
         """Return whether another picture may be begun now."""
-        while self._under_way and now_ns - self._under_way[0].sent_ns > nanoseconds(LOST_S):
-            self._bytes -= self._under_way.popleft().size
+        under_way = self._under_way
+        while under_way and now_ns - under_way[0].sent_ns > nanoseconds(LOST_S):
+            self._bytes -= under_way.popleft().size
             self.lost += 1
-            self.kbit_s = max(LEAST_KBIT_S, self.kbit_s / 2)
-            self._growth_1_s = SEARCH_1_S
-            self._capacity_kbit_s = min(self._capacity_kbit_s, self.kbit_s)
-        if not self._under_way:
+            self._stands_still()
+        if not under_way:
             return True
         least_ns = self._least_ns()
-        if now_ns - self._under_way[0].sent_ns >= least_ns + nanoseconds(MOST_WAIT_S):
-            return False
-        most_kbit = min(self.kbit_s, self._capacity_kbit_s) * (seconds(least_ns) + MOST_WAIT_S)
-        return len(self._under_way) < 2 or self._bytes * 8e-3 <= most_kbit
+        waits_s = seconds(now_ns - under_way[0].sent_ns - least_ns)
+        if waits_s >= MOST_WAIT_S:
+            if waits_s >= SILENT_S:
+                self._stands_still()
+            return now_ns - self._sent_ns >= nanoseconds(PROBE_S) and self._holds(PROBES_S)
+        return len(under_way) < 2 or self._holds(seconds(least_ns) + MOST_WAIT_S)
+
+    def _holds(self, time_s: float) -> bool:
+        """Return whether no more is under way than the rate gives in so long [s]."""
+        return self._bytes * 8e-3 <= self.kbit_s * time_s
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:
         """Note a picture.
@@ -84,10 +100,9 @@ class StreamRate:
             size: Its bytes.
             now_ns: When it was handed to the transport.
         """
-        if not self._under_way:
-            self._delivered_ns = now_ns  # the path had nothing to do until now
-        self._under_way.append(_Sent(seq, size, now_ns, self._delivered, self._delivered_ns))
+        self._under_way.append(_Sent(seq, size, now_ns))
         self._bytes += size
+        self._sent_ns = now_ns
 
     def acknowledged(self, seq: int, now_ns: int) -> None:
         """Note that the subscriber has a picture.
@@ -105,30 +120,50 @@ class StreamRate:
                 self.lost += 1
         if newest is None or newest.seq != seq:
             return
-        self._delivered_ns = now_ns
         trip_ns = now_ns - newest.sent_ns
         self._add_trip(trip_ns, now_ns)
-        waits = self._waits
-        waits.append((seconds(trip_ns - self._least_ns()), now_ns))
-        while now_ns - waits[0][1] > nanoseconds(STANDING_S):
-            waits.popleft()
-        self.wait_s = min(wait_s for wait_s, _ in waits)
-        passed_s = max(seconds(now_ns - newest.delivered_ns), 0.001)
-        delivered_kbit_s = (self._delivered - newest.delivered) * 8e-3 / passed_s
+        wait_s = seconds(trip_ns - self._least_ns())
         step_s = min(seconds(now_ns - self._changed_ns), 0.2)
         self._changed_ns = now_ns
-        share = min(1.0, step_s / _MEAN_S)
-        if self.wait_s > GOOD_WAIT_S:  # the path was busy all the time: what came is what it carries
-            self._capacity_kbit_s += (delivered_kbit_s - self._capacity_kbit_s) * max(share, 0.25)
-        else:
-            self._capacity_kbit_s = max(self._capacity_kbit_s, delivered_kbit_s, self.kbit_s)
-        if self.wait_s > LONG_WAIT_S:
-            self.kbit_s = min(self.kbit_s, 0.85 * self._capacity_kbit_s)
+        waits = self._waits
+        if wait_s > SILENT_S:
+            self._stands_still()
+            waits.clear()
+            self.wait_s = wait_s
+            return
+        self._silent = False
+        waits.append((wait_s, now_ns, self._delivered))
+        while len(waits) > _FEWEST and now_ns - waits[0][1] > nanoseconds(STANDING_S):
+            waits.popleft()
+        self.wait_s = min(wait for wait, _, _ in waits)
+        if self.wait_s > LONG_WAIT_S and len(waits) >= _FEWEST:
+            _, since_ns, before = waits[0]
+            delivered_kbit_s = (self._delivered - before) * 8e-3 / max(seconds(now_ns - since_ns), 0.001)
+            self._fall(FALL * delivered_kbit_s)
             waits.clear()  # and look again
-            self._growth_1_s = GROWTH_1_S
+        elif wait_s > LATE_S:
+            if now_ns - self._late_ns >= nanoseconds(LATE_EVERY_S):
+                self._late_ns = now_ns
+                self._fall(max(LATE_FALL * self.kbit_s, START_KBIT_S))
         elif self.wait_s < GOOD_WAIT_S:
-            self.kbit_s *= 1.0 + self._growth_1_s * step_s
-        self.kbit_s = min(max(self.kbit_s, LEAST_KBIT_S), self._most_kbit_s)
+            growth_1_s = SEARCH_1_S if self._searches or self.kbit_s < START_KBIT_S else GROWTH_1_S
+            self.kbit_s = min(self.kbit_s * (1.0 + growth_1_s * step_s), self._most_kbit_s)
+
+    def forget(self) -> None:
+        """Forget what is under way: it will not be acknowledged."""
+        self._under_way.clear()
+        self._waits.clear()
+        self._bytes = 0
+
+    def _stands_still(self) -> None:
+        if not self._silent:
+            self._silent = True
+            self._fall(SILENT_FALL * self.kbit_s)
+
+    def _fall(self, kbit_s: float) -> None:
+        """Send less from now on, where it is less."""
+        self._searches = False
+        self.kbit_s = min(self.kbit_s, max(kbit_s, LEAST_KBIT_S))
 
     def _add_trip(self, trip_ns: int, now_ns: int) -> None:
         while self._shortest and self._shortest[-1][0] >= trip_ns:

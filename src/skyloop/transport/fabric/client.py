@@ -27,7 +27,7 @@ from skyloop.transport.fabric.discovery import SYNC_S, proxy_reached, renew
 from skyloop.transport.fabric.joining import ProxyWatch, join
 from skyloop.transport.fabric.sealing import contents
 from skyloop.transport.fabric.session import Session, acquire, load, release, retire, undeclare
-from skyloop.transport.fabric.settings import LEASE_S, FabricSettings
+from skyloop.transport.fabric.settings import FabricSettings
 from skyloop.transport.fabric.subscription import Subscription
 
 if TYPE_CHECKING:
@@ -249,7 +249,7 @@ class FabricClient(TransportClient):
 
     @property
     def excused_s(self) -> float:
-        return self._session.settings.lease_s - LEASE_S
+        return self._session.settings.excused_s
 
     @property
     def address(self) -> str:
@@ -454,8 +454,9 @@ class FabricClient(TransportClient):
             with self._lock:
                 self._send_due()
                 waits, stalled_s = self._outgoing.under_way, self._outgoing.stalled_s(time.monotonic())
-            if stalled_s > STALLED_S and not self._ended:
-                self._end(f"the proxy took nothing of what was sent to it for {STALLED_S:g} s")
+            most_s = STALLED_S + self.excused_s
+            if stalled_s > most_s and not self._ended:
+                self._end(f"the proxy took nothing of what was sent to it for {most_s:g} s")
             try:
                 return self._inbox.get(timeout=POLL_S if waits else self._pause_s)
             except Empty:

@@ -16,8 +16,6 @@ from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from skyloop.clock import Clock, nanoseconds
 from skyloop.errors import LinkError, MissingExtraError, UsageError
 from skyloop.messages import FrameHeader
@@ -129,7 +127,7 @@ class FramePublisher:
             wanted = [v for v in variants.values() if v.readers and v.filter.wants(header.seq, header.captured_ns)]
         if not wanted:
             return 0
-        copy = np.frombuffer(pixels.tobytes(), np.uint8)
+        copy = pixels.reshape(-1).copy()  # other threads run meanwhile, as they would not with tobytes()
         now_ns = self._clock()
         missed = due = 0
         with self._changed:

@@ -50,6 +50,7 @@ class ConnectionRegistry:
         publisher: Has the subscriptions.
         sender: Sends to single applications.
         queue: Of the thread that calls the handler.
+        excused_s: How much longer than :data:`STALLED_S` an application may acknowledge nothing [s].
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class ConnectionRegistry:
         publisher: Publisher,
         sender: Sender,
         queue: HandlerQueue[Item],
+        excused_s: float = 0.0,
     ) -> None:
         self._name = name
         self._run = run
@@ -70,6 +72,7 @@ class ConnectionRegistry:
         self._publisher = publisher
         self._sender = sender
         self._queue = queue
+        self._stalled_s = STALLED_S + excused_s
         self._lock = threading.RLock()  # guards what follows
         self._open = False
         self._tokens = Tokens(by_key=ring is not None)  # connections that show that they live
@@ -262,8 +265,8 @@ class ConnectionRegistry:
         for connection in self.connections:
             if not connection.confirmed and now - connection.joined_s > CONFIRM_S:
                 self._shut_out(connection, "no token of it was seen")
-            elif connection.stalled_s(now) > STALLED_S:
-                self.drop(connection, f"it took nothing of what was sent to it for {STALLED_S:g} s")
+            elif connection.stalled_s(now) > self._stalled_s:
+                self.drop(connection, f"it took nothing of what was sent to it for {self._stalled_s:g} s")
 
     def _check_keys(self) -> None:
         """End the connections whose keys were shut out or have expired.

@@ -73,7 +73,14 @@ class FabricServer(TransportServer):
         self._sender = Sender(self._put_to, name)
         self._publisher = Publisher(name, self._run, topic_keys or PLAIN)
         self._registry = ConnectionRegistry(
-            name, self._run, ring, topic_keys, publisher=self._publisher, sender=self._sender, queue=self._queue
+            name,
+            self._run,
+            ring,
+            topic_keys,
+            publisher=self._publisher,
+            sender=self._sender,
+            queue=self._queue,
+            excused_s=self._settings.excused_s,
         )
         self._lock = threading.Lock()  # guards starting and stopping
         self._started = False

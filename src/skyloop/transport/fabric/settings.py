@@ -67,6 +67,11 @@ class FabricSettings:
         return secured(self, credentials)
 
     @property
+    def excused_s(self) -> float:
+        """By how much longer a silence is borne than usual [s]."""
+        return self.lease_s - LEASE_S
+
+    @property
     def reach(self) -> str:
         """Where proxies are searched for, for people."""
         ways = [*self.connect, *(["multicast"] if self.multicast else [])]
