@@ -111,7 +111,7 @@ class Betaflight(CoupledFirmware):
         firmware = ChildProcess(keeper_command(self._launch(), folder, "configuring.log"))
         saved = False
         try:
-            with _connected(MSP_PORT, b"#", PROMPT) as link:
+            with connected(MSP_PORT, b"#", PROMPT) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
                     if b"ERROR" in _read_until(link, PROMPT):
@@ -127,7 +127,7 @@ class Betaflight(CoupledFirmware):
 
     def _verify(self) -> None:
         """Ask it something on its serial port: one in twenty never listens there, by a race between its threads."""
-        with _connected(MSP_PORT, encode(Frame(Function.API_VERSION)), b"$M>"):
+        with connected(MSP_PORT, encode(Frame(Function.API_VERSION)), b"$M>"):
             pass
         time.sleep(_PAUSE_S)  # until it is ready for the next: it takes one
 
@@ -185,7 +185,7 @@ class Betaflight(CoupledFirmware):
             time.sleep(min(ahead_s, STEP_S))
 
 
-def _connected(port: int, words: bytes, answer: bytes) -> socket.socket:
+def connected(port: int, words: bytes, answer: bytes) -> socket.socket:
     """Return a connection to a serial port that is opened soon, once these words got an answer that has this in it.
 
     What comes before the port works is lost, or ends the connection: so it is tried again.
