@@ -101,7 +101,7 @@ def test_it_follows_the_marker_and_is_safe_without_link_pilot_or_firmware(
             assert angle.rms < MOST_RMS_DEG, row
         assert row.position_m is not None
         assert row.position_m.rms < MOST_RMS_M, row
-        print(score, row)
+        print(f"in view {score.share_in_view:.1%}", row)
 
 
 def _is_refused_by_name(drone: skyloop.Drone) -> None:
