@@ -81,7 +81,7 @@ def test_its_death_stops_the_rotors_and_it_is_started_again(rig: Rig) -> None:
     assert rig.firmware.program.starts == 2
 
 
-def test_other_packets_are_ignored(rig: Rig, patience: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_other_packets_are_ignored(rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("STANDIN", "garbage")
     with flying(lambda on_event: ArduCopter(on_event)) as second:
         second.answered()

@@ -139,8 +139,6 @@ class ArduCopter(CoupledFirmware):
 
     def _begin(self) -> None:
         self._peer, self._asked, self._owed = None, False, True  # it speaks first
-        self._receive(0.0)  # what the process before may have sent last
-        self._asked = False
 
     def _receive(self, wait_s: float) -> Commands | None:
         until_s = time.monotonic() + wait_s

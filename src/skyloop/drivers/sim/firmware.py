@@ -16,7 +16,7 @@ from skyloop.autopilots.coupling import CoupledFirmware
 from skyloop.autopilots.kinds import AutopilotKind
 from skyloop.autopilots.program import FirmwareEvent, FirmwareEventKind
 from skyloop.autopilots.registry import make_firmware
-from skyloop.clock import nanoseconds
+from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.drivers.base import Driver, ExternalPose, Sink
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.sim.telemetry import native_of as truth_of
@@ -192,9 +192,10 @@ class FirmwareFlight:
         inner = self._inner
         if self.kind is AutopilotKind.BETAFLIGHT and self._options.position and inner is not None:
             truth = report.truth
+            captured_ns = max(report.captured_ns, monotonic_ns() - _OLDEST_NS)  # its clock is the computer's
             with suppress(DriverError, UnsupportedError):
                 inner.external_pose(
-                    ExternalPose(truth.position_m, truth.quaternion, report.captured_ns, position_std_m=_POSE_STD_M)
+                    ExternalPose(truth.position_m, truth.quaternion, captured_ns, position_std_m=_POSE_STD_M)
                 )
 
     def with_truth(self, feedback: Feedback) -> Feedback:
