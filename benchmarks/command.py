@@ -71,16 +71,19 @@ def load(
     encoded: Annotated[
         bool, typer.Option("--encoded/--no-encoded", help="8 viewers of H.264, one of them stopped")
     ] = True,
+    viewed: Annotated[
+        bool, typer.Option("--viewed/--no-viewed", help="A viewer of skyloop view --foxglove, and one that is stopped")
+    ] = True,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
 ) -> None:
-    """Measure what observers, a slow processor, a recorder and pages of the cockpit do to the pilot.
+    """Measure what observers, a slow processor, a recorder, pages of the cockpit and a viewer do to the pilot.
 
     It starts up to 35 processes. Nothing else should run meanwhile.
     """
     from benchmarks import load, tables
-    from benchmarks.onlookers import cockpit_problem, recorder_problem
+    from benchmarks.onlookers import cockpit_problem, recorder_problem, view_problem
     from benchmarks.targets import judge_load
 
     wanted_s, numbers = duration_s(seconds, minutes), parse_numbers(observers)
@@ -94,6 +97,9 @@ def load(
     if encoded and find_spec("av") is None:
         skipped[load.ENCODED] = str(MissingExtraError("encoding H.264", "video"))
         encoded = False
+    if viewed and (problem := view_problem()):
+        skipped[load.VIEWED] = problem
+        viewed = False
     cases = load.cases_of(
         numbers,
         slow_processor=slow_processor,
@@ -102,6 +108,7 @@ def load(
         disk_full=disk_full,
         pages=pages,
         encoded=encoded,
+        viewed=viewed,
     )
     with measuring("load", output) as progress:
         results = load.measure(wanted_s, cases, record_to=record_to, skipped=skipped, progress=progress)
@@ -223,6 +230,24 @@ def warmth(seconds: Seconds = None, minutes: Minutes = None, output: Output = No
     finish("warmth", results, as_rich([warmth.table(results)], str(results.machine)), output)
 
 
+def ros(
+    ros_python: Annotated[
+        str | None,
+        typer.Option(help="The Python that has rclpy and Skyloop [default: $SKYLOOP_ROS_PYTHON or this one]"),
+    ] = None,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    output: Output = None,
+) -> None:
+    """Measure what the bridge to ROS 2 adds to the delays of commands and images."""
+    from benchmarks import ros
+
+    wanted_s = duration_s(seconds, minutes)
+    with measuring("ros", output) as progress:
+        results = ros.measure(wanted_s, ros_python, progress)
+    finish("ros", results, as_rich([ros.table(results)], str(results.machine)), output)
+
+
 def recordings(
     encode: Annotated[
         bool, typer.Option("--encode/--no-encode", help="Also the export that encodes each picture")
@@ -264,7 +289,7 @@ def video_path(
 
 BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
     function.__name__: function
-    for function in (peers, load, codecs, network, swarm, scale, fleet, learning, warmth, recordings, video_path)
+    for function in (peers, load, codecs, network, swarm, scale, fleet, learning, warmth, ros, recordings, video_path)
 }
 
 

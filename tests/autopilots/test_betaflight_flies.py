@@ -158,5 +158,5 @@ def test_it_flies_a_course_of_gates(proxy: Callable[..., Process]) -> None:
         take_off(drone)
         course = FlyThroughGates(drone, FIVE_GATES[:3])
         course.run(seconds=90.0)
-        assert course.passed == 3
+        assert course.passed == 3, [event.text for event in drone.recent_events()]
         assert not [event for event in drone.recent_events() if event.kind == "collision"]

@@ -12,7 +12,7 @@ import pytest
 from benchmarks import load
 from benchmarks.disk import DISK_MB, small_disk
 from benchmarks.load import FULL, KILLED, RECORDED, Case, cases_of, pages_name
-from benchmarks.onlookers import cockpit_problem, recorder_problem
+from benchmarks.onlookers import cockpit_problem, recorder_problem, view_problem
 from benchmarks.slow import SLOW_VIDEO
 from skyloop.bench.schedule import CHANNELS, MIDDLE, Turn
 from skyloop.errors import UsageError
@@ -111,3 +111,14 @@ def test_pages_of_a_cockpit() -> None:
     assert 2 <= seen.samples <= seen.samples + seen.lost == 2 * turn.count("video")
     assert 0 < seen.median_us < 1e6
     assert {"cockpit", "pages"} <= set(result.cpu)
+
+
+def test_a_viewer_of_foxglove_s_server_that_is_stopped() -> None:
+    if problem := view_problem():
+        pytest.skip(problem)
+    every = cases_of([], slow_processor=False, stuck=False, recorder=False, disk_full=False, viewed=True)
+    [_, _, case] = [case for case in every if case.size == MIDDLE]
+    [result] = load.measure(SHORT_S, [case]).cases
+    assert (result.case, result.size) == (load.VIEWED_STUCK, str(MIDDLE))
+    plausible(result.channels["command"], Turn(0, SHORT_S).count("command"))
+    assert "view" in result.cpu

@@ -13,6 +13,7 @@ from skyloop.drivers.ardrone import options as ardrone_options
 from skyloop.drivers.mavlink import options as mavlink_options
 from skyloop.drivers.msp import options as msp_options
 from skyloop.drivers.replay import options as replay_options
+from skyloop.drivers.ros2 import options as ros2_options
 from skyloop.drivers.sim import options as sim_options
 from skyloop.drivers.tello import options as tello_options
 from skyloop.drivers.uri import parse_uri
@@ -71,6 +72,7 @@ ADDRESSES = [
     ("docs/ardrone.md", "### `ardrone://`", ardrone_options, "ardrone://192.168.1.1"),
     ("docs/tello.md", "### `tello://`", tello_options, "tello://192.168.10.1"),
     ("docs/mavlink.md", "### `mavlink://`", mavlink_options, "mavlink://udpin:127.0.0.1:14540?camera=/dev/video0"),
+    ("docs/ros.md", "### `ros2://`", ros2_options, "ros2://robot"),
     ("docs/msp.md", "### `msp://`", msp_options, "msp:///dev/ttyACM0"),
     ("docs/replay.md", "## `replay://`", replay_options, "replay:///home/me/flight.mcap"),
 ]

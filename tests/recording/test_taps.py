@@ -29,8 +29,8 @@ class Rig:
     def __init__(self) -> None:
         self.items: list[Item] = []
         self.sink: Callable[[EncodedFrame], None] | None = None
-        topic = SimpleNamespace(add=self._add, remove=self._remove)
-        drone = SimpleNamespace(_core=SimpleNamespace(stream=lambda name: topic))
+        topic = SimpleNamespace(add=self._add, remove=self._remove, report=lambda seq, *, wants_key: None)
+        drone = SimpleNamespace(_core=SimpleNamespace(stream=lambda name, *, subscriber: topic))
         self.stream = Stream(self._put, cast(Any, drone), "front")
         self.stream.start()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -58,6 +59,16 @@ def absent(reason: str) -> NoReturn:
     if os.environ.get("SKYLOOP_THIRD_PARTY") == "required":
         pytest.fail(reason)
     pytest.skip(reason)
+
+
+def node_modules(package: str, version: str) -> Path:
+    """The folder of npm's packages: SKYLOOP_NODE_MODULES, or where scripts/third-party.sh installs them."""
+    modules = Path(os.environ.get("SKYLOOP_NODE_MODULES", INSTALLED / "node_modules"))
+    described = modules / package / "package.json"
+    if shutil.which("node") is None or not described.exists():
+        absent(f"node or its package {package} is not installed (run scripts/third-party.sh)")
+    assert json.loads(described.read_text())["version"] == version
+    return modules
 
 
 def private_address() -> str:

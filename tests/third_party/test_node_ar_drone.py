@@ -7,14 +7,11 @@ bytes.
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
 from pathlib import Path
 
 import pytest
 
-from tests.third_party.conftest import HERE, INSTALLED, Emulated, absent
+from tests.third_party.conftest import HERE, Emulated, node_modules
 
 VERSION = "0.3.3"
 OPTIONS_OF_FULL_NAVDATA = {"rawMeasures", "physMeasures", "pwm", "altitude", "magneto", "windSpeed", "wifi", "gps"}
@@ -24,13 +21,7 @@ pytestmark = pytest.mark.process
 
 @pytest.fixture
 def modules() -> Path:
-    """The folder of packages: SKYLOOP_NODE_MODULES, or where scripts/third-party.sh installs them."""
-    modules = Path(os.environ.get("SKYLOOP_NODE_MODULES", INSTALLED / "node_modules"))
-    package = modules / "ar-drone" / "package.json"
-    if shutil.which("node") is None or not package.exists():
-        absent("node or its package ar-drone is not installed (run scripts/third-party.sh)")
-    assert json.loads(package.read_text())["version"] == VERSION
-    return modules
+    return node_modules("ar-drone", VERSION)
 
 
 def test_it_takes_off_moves_sees_configures_and_lands(modules: Path, drone: Emulated) -> None:

@@ -76,6 +76,7 @@ class CoupledFirmware(ABC):
             self._starts = self.program.starts
             self._owed, self._patient, self._answered_s = False, False, None
             self._begin()
+            return STOPPED  # for a step at least, also where its end was not noticed in time
         commands = self._receive(WAIT_S if self._owed and self._patient else 0.0)
         if commands is not None:
             self._on_answer(readings.time_s)

@@ -74,6 +74,7 @@ COMMANDS: Final = {
     "cockpit": Entry(
         Task.SEE, "cockpit", "cockpit", "A page in the browser to watch and fly drones", "cockpit --port 8000"
     ),
+    "view": Entry(Task.SEE, "view", "view", "Show drones live in Foxglove or Rerun", "view alpha --foxglove"),
     "process": Entry(
         Task.SEE,
         "process",
@@ -115,6 +116,7 @@ COMMANDS: Final = {
         "Who may join the network: make, issue, revoke keys",
         "keys issue jane --role pilot",
     ),
+    "ros": Entry(Task.SHARE, "ros", "ros", "Drones as nodes of ROS 2", "ros --drone alpha --priority 16"),
     "audit": Entry(Task.SHARE, "audit", "audit", "Who flew which drone when", "audit alpha --last 20"),
     "record": Entry(Task.RECORD, "record", "record", "Record drones to an MCAP file", "record alpha -o flight.mcap"),
     "log": Entry(Task.RECORD, "log", "log", "Inspect, export, compare and repair recordings", "log info flight.mcap"),

@@ -33,6 +33,8 @@ EXTRAS: Final = (
     ("mavlink", "ArduCopter and PX4", ("pymavlink", "serial")),
     ("cockpit", "page in the browser", ("starlette", "uvicorn", "websockets", "cv2")),
     ("record", "recordings", ("mcap", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
+    ("foxglove", "drones live in Foxglove", ("foxglove", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
+    ("rerun", "drones and recordings in Rerun", ("rerun", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
     ("parquet", "tables as Parquet", ("pyarrow",)),
     ("network", "network and its keys", ("zenoh", "cryptography", "cv2")),
     ("metrics", "metrics for Prometheus", ("prometheus_client",)),

@@ -38,6 +38,7 @@ class Form(StrEnum):
     NPZ = "npz"
     MP4 = "mp4"
     LEROBOT = "lerobot"
+    RRD = "rrd"
 
 
 class Which(StrEnum):
@@ -145,10 +146,11 @@ def export(
     fps: Annotated[float | None, typer.Option(help="For lerobot: rows a second (default: 10)")] = None,
     task: Annotated[str | None, typer.Option(help="For lerobot: what was to be done, in words")] = None,
 ) -> None:
-    """Write the samples as tables, a camera's frames as a video with their own times, or flights to learn from.
+    """Write the samples as tables, a camera's frames as a video, flights to learn from, or all of it for Rerun.
 
     H.264 is copied as it was recorded, in seconds, unless the time is written into the frames. To lerobot, flights
-    become episodes of a LeRobotDataset: pictures, the state at their capture, and what was commanded.
+    become episodes of a LeRobotDataset: pictures, the state at their capture, and what was commanded. rrd is a file
+    that Rerun's viewer opens, of all drones.
     """
     from skyloop.cli import log_tables
     from skyloop.recording.review import export as ways
@@ -159,10 +161,17 @@ def export(
         _export_lerobot(files, output, drone, camera, fps, task)
         return
     _refuse({"--fps": fps is not None, "--task": task is not None}, to)
+    if to is Form.RRD:
+        _refuse(
+            {"--channel": bool(channel), "--camera": bool(camera), "--burn-time": burn_time, "--encode": encode}, to
+        )
     if len(files) > 1:
         raise UsageError(f"{len(files)} recordings were given: {to.value} is made of one at a time")
     (file,) = files
     recording = _open(file)
+    if to is Form.RRD:
+        _export_rrd(recording, output or file.with_suffix(".rrd"), drone)
+        return
     name = recording.drone(drone).name
     if to is Form.MP4:
         _refuse({"--channel": bool(channel)}, to)
@@ -285,6 +294,15 @@ def _export_lerobot(
         f"{target}: {found.episodes} episodes, {found.rows} rows: {', '.join(found.form.state)}; "
         f"{', '.join(found.form.cameras) or 'no camera'}; action: {', '.join(found.form.action)}{repeated}"
     )
+
+
+def _export_rrd(recording: Recording, target: Path, drone: str | None) -> None:
+    from skyloop.recording.review.rrd import export_rrd
+
+    with _progress("exporting") as progress:
+        found = export_rrd(recording, target, drone=drone, progress=progress)
+    lost = f"; {found.left_out} pictures that can't be decoded are left out" if found.left_out else ""
+    _print(f"{target}: {', '.join(found.drones)}: {found.samples} samples, {found.pictures} pictures{lost}")
 
 
 # Inside --------------------------------------------------------------------------------------------------------

@@ -59,6 +59,25 @@ class Message:
     sequence: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """How messages of a kind are described to a program that does not know them."""
+
+    name: str
+    encoding: str  #: of the description
+    data: bytes
+    message_encoding: str
+
+    @classmethod
+    def of(cls, kind: type[Any]) -> Schema:
+        """Return the schema of a :class:`Message`'s kind."""
+        if issubclass(kind, msgspec.Struct):
+            return cls(layout.schema_name(kind), layout.JSON_SCHEMA, layout.schema(kind), layout.JSON)
+        from skyloop.recording import foxglove
+
+        return cls(kind.DESCRIPTOR.full_name, layout.PROTOBUF, foxglove.schema(kind), layout.PROTOBUF)
+
+
 class Output:
     """The stream of the MCAP writer: nothing reaches the file before :meth:`flush`, and then all of it or nothing."""
 
@@ -190,19 +209,11 @@ class RecordingFile:
             self.path.unlink(missing_ok=True)
 
     def _add_channel(self, message: Message) -> int:
-        kind = message.kind
-        schema = self._schemas.get(kind)
-        if schema is None:
-            schema = self._schemas[kind] = self._add_schema(kind)
-        encoding = layout.JSON if issubclass(kind, msgspec.Struct) else layout.PROTOBUF
-        channel = self._channels[message.topic] = self._writer.register_channel(message.topic, encoding, schema)
+        schema = Schema.of(message.kind)
+        number = self._schemas.get(message.kind)
+        if number is None:
+            number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._schemas[message.kind] = number
+        channel = self._writer.register_channel(message.topic, schema.message_encoding, number)
+        self._channels[message.topic] = channel
         return channel
-
-    def _add_schema(self, kind: type[Any]) -> int:
-        if issubclass(kind, msgspec.Struct):
-            name, encoding, data = layout.schema_name(kind), layout.JSON_SCHEMA, layout.schema(kind)
-        else:
-            from skyloop.recording import foxglove
-
-            name, encoding, data = kind.DESCRIPTOR.full_name, layout.PROTOBUF, foxglove.schema(kind)
-        return int(self._writer.register_schema(name, encoding, data))

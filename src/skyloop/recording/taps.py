@@ -69,7 +69,9 @@ class Gaps:
 class Tap:
     """Subscribes to one drone and puts its samples into the backlog."""
 
-    def __init__(self, number: int, drone: Drone, options: Options, backlog: Backlog) -> None:
+    def __init__(
+        self, number: int, drone: Drone, options: Options, backlog: Backlog, *, encoded_far: bool = False
+    ) -> None:
         """Initialise without subscribing.
 
         Args:
@@ -77,6 +79,8 @@ class Tap:
             drone: A connected drone.
             options: What to record and how.
             backlog: Where samples are put.
+            encoded_far: Over a network, let the proxy encode as H.264 what the vehicle does not, at the rate that the
+                path carries.
         """
         self.drone = drone
         self._number = number
@@ -85,7 +89,7 @@ class Tap:
         self._listeners: list[Listener[Any]] = []
         self._gaps = {Channel.FEEDBACK.value: Gaps(), Channel.EVENTS.value: Gaps()}
         self._videos = [
-            Video(self._put, drone, camera.name, options)
+            Video(self._put, drone, camera.name, options, encoded_far=encoded_far)
             for camera in drone.capabilities.cameras
             if options.wants_camera(camera.name)
         ]
@@ -185,15 +189,15 @@ class Tap:
 
 
 class Stream:
-    """One camera's frames as the vehicle encoded them, from the first key frame on."""
+    """One camera's frames as they were encoded by the vehicle, or for a subscriber, from the first key frame on."""
 
-    def __init__(self, put: Callable[..., None], drone: Drone, camera: str) -> None:
+    def __init__(self, put: Callable[..., None], drone: Drone, camera: str, subscriber: str = "") -> None:
         self.gaps = Gaps()
         self.dropped = 0  #: frames that can't be decoded because one before them is missing
         self.newest_ns = 0  #: arrival of the newest decodable frame, or the start
         self._put = put
         self._channel = f"{VIDEO}.{camera}"
-        self._topic = drone._core.stream(camera)
+        self._topic = drone._core.stream(camera, subscriber=subscriber)
         self._chain = Chain()
         self._begun = False
         self._sink = self._arrived
@@ -210,7 +214,9 @@ class Stream:
     def _arrived(self, picture: EncodedFrame) -> None:
         now_ns = time.monotonic_ns()
         self.gaps.follow(picture.seq)
-        if picture.codec != H264 or not self._chain.follows(picture.seq, key=picture.key):
+        follows = picture.codec == H264 and self._chain.follows(picture.seq, key=picture.key)
+        self._topic.report(picture.seq, wants_key=not follows)
+        if not follows:
             self.dropped += self._begun
             return
         self._begun = True
@@ -227,14 +233,20 @@ class Video:
     Where the vehicle's own encoding is to be kept, frames are subscribed to only while that does not arrive.
     """
 
-    def __init__(self, put: Callable[..., None], drone: Drone, camera: str, options: Options) -> None:
+    def __init__(
+        self, put: Callable[..., None], drone: Drone, camera: str, options: Options, *, encoded_far: bool = False
+    ) -> None:
         self.channel = f"{VIDEO}.{camera}"
         self.gaps = Gaps()
         self._put = put
         self._topic = drone._core.channel(camera)
         self._encode = encoder(options)
         self._format = "png" if options.encoding == "png" else "jpeg"
-        self._stream = Stream(put, drone, camera) if options.keeps_stream(drone._core.channel(camera).camera) else None
+        self._stream: Stream | None = None
+        if options.keeps_stream(drone._core.channel(camera).camera):
+            self._stream = Stream(put, drone, camera)
+        elif encoded_far and drone._core.connection.variants:
+            self._stream = Stream(put, drone, camera, f"{drone._core.subscriber}-view")
         self._lock = threading.Lock()  # guards the subscription to frames
         self._listening = self._ended = False
         self._failed = 0

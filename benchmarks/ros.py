@@ -1,0 +1,171 @@
+"""``python -m benchmarks.ros``: what the bridge to ROS 2 adds to the delays, in one run with Skyloop's own.
+
+Four processes: a simulated drone's proxy, the bridge, a program of rclpy that flies by ``cmd_vel`` and receives images,
+and this one, which receives the same images and the echoes of the commands as Skyloop's client does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from skyloop.bench.machine import Machine
+from skyloop.bench.statistics import Summary, summarize
+from skyloop.bench.tables import Table, median_and_p99
+from skyloop.client import Drone, connect
+from skyloop.errors import NoAnswerError, UnsupportedError
+from skyloop.messages import Applied, Velocity
+from skyloop.ros_node import LOOPBACK_PROFILE, PROFILES_VARIABLE
+
+ADDRESS: Final = "sim://?world=room&seed=0"
+PERIOD_S: Final = 1 / 32  #: of velocities, as in ``ros_probe.py``
+STEP: Final = 1e-4  #: of their yaw rates, likewise [rad/s]
+IMAGE_PERIOD_S: Final = 1 / 30
+PROBE: Final = Path(__file__).parent / "ros_probe.py"
+STARTS_WITHIN_S: Final = 30.0
+
+
+class RosDelays(msgspec.Struct, frozen=True):
+    """A whole run, as in ``ros.json``.
+
+    ``command``: Twist published to applied; ``command_own``: of that, sent by the bridge to applied, which is what a
+    Skyloop application has. ``image``: captured to the callback of rclpy; ``image_own``: to that of Skyloop.
+    """
+
+    machine: Machine
+    seconds: float
+    command: Summary
+    command_own: Summary
+    image: Summary
+    image_own: Summary
+
+
+def measure(
+    seconds: float,
+    ros_python: str | None = None,
+    progress: Callable[[float, str], None] = lambda _share, _what: None,
+) -> RosDelays:
+    """Fly for so long.
+
+    Args:
+        seconds: [s]
+        ros_python: An interpreter with rclpy and Skyloop; None: that of ``SKYLOOP_ROS_PYTHON``, or this one.
+        progress: Called with the share that is done, 0 to 1, and what comes next.
+
+    Raises:
+        NoAnswerError: A process did not start, or failed.
+        UnsupportedError: There is no rclpy.
+    """
+    python = ros_python or os.environ.get("SKYLOOP_ROS_PYTHON", sys.executable)
+    if subprocess.run([python, "-c", "import rclpy, skyloop"], capture_output=True, check=False).returncode:
+        raise UnsupportedError(f"{python} has no rclpy with Skyloop: pip install 'skyloop[ros]', or --ros-python")
+    machine = Machine.here()
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+        environment = _environment(Path(folder))
+        os.environ["SKYLOOP_RUNTIME_DIR"] = environment["SKYLOOP_RUNTIME_DIR"]
+        own = [sys.executable, "-m", "skyloop", "proxy", ADDRESS, "--name", "bench"]
+        bridge = [python, "-m", "skyloop", "ros", "bench", "--priority", "16"]
+        with _running(own, environment, "ready"), _running(bridge, environment, "ready"):
+            progress(0.0, "a flight by cmd_vel")
+            with connect("bench", access="observe", name="bench eye") as drone:
+                echoes, ages_ns = _watch(drone)
+                probe = [python, str(PROBE), "/bench", str(seconds)]
+                done = subprocess.run(probe, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise NoAnswerError(f"the program of rclpy failed: {done.stderr[-500:]}")
+    told = json.loads(done.stdout.splitlines()[-1])
+    return _judged(machine, seconds, told["published_ns"], told["image_ages_ns"], echoes, ages_ns)
+
+
+def table(results: RosDelays) -> Table:
+    """Return the delays of both channels, Skyloop's own, and what the bridge adds to the median."""
+    rows = []
+    for name, whole, own in (
+        ("command: Twist published → applied", results.command, results.command_own),
+        ("image: captured → callback", results.image, results.image_own),
+    ):
+        added_us = whole.median_us - own.median_us
+        rows.append([name, str(whole.samples), median_and_p99(whole), median_and_p99(own), f"{added_us:.0f}"])
+    columns = ["", "samples", "by ROS 2", "Skyloop's own", "added to the median"]
+    return Table("Delays in µs by the bridge to ROS 2: median (99th percentile)", columns, rows)
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    """Return an environment in which neither ROS 2 nor Skyloop meets anything else on this machine."""
+    profile = folder / "loopback.xml"
+    profile.write_text(LOOPBACK_PROFILE)
+    places = {PROFILES_VARIABLE: str(profile), "SKYLOOP_RUNTIME_DIR": str(folder / "run")}
+    return {**os.environ, **places, "ROS_DOMAIN_ID": str(1 + os.getpid() % 100)}
+
+
+def _watch(drone: Drone) -> tuple[dict[int, Applied], list[int]]:
+    """Return what fills with the echoes, by the number of their velocity, and the ages of frames [ns]."""
+    echoes: dict[int, Applied] = {}
+    ages_ns: list[int] = []
+
+    def on_command(echo: Applied) -> None:
+        if isinstance(echo.asked, Velocity):
+            echoes.setdefault(round(echo.asked.yaw_rate / STEP), echo)  # the first: others are repeats
+
+    drone.on_command(on_command)
+    drone.on_frame(lambda frame: ages_ns.append(drone.now_ns - frame.captured_ns))
+    return echoes, ages_ns
+
+
+def _judged(
+    machine: Machine,
+    seconds: float,
+    published_ns: list[int],
+    image_ages_ns: list[int],
+    echoes: dict[int, Applied],
+    ages_ns: list[int],
+) -> RosDelays:
+    found = {number: echoes[number] for number in range(1, len(published_ns)) if number in echoes}
+    sent = len(published_ns)
+    images = round(seconds / IMAGE_PERIOD_S)
+    by_ros = [echo.applied_ns - published_ns[number] for number, echo in found.items()]
+    return RosDelays(
+        machine,
+        seconds,
+        command=summarize(by_ros, sent=sent, period_s=PERIOD_S),
+        command_own=summarize([e.applied_ns - e.sent_ns for e in found.values()], sent=sent, period_s=PERIOD_S),
+        image=summarize(image_ages_ns, sent=images, period_s=IMAGE_PERIOD_S),
+        image_own=summarize(ages_ns, sent=images, period_s=IMAGE_PERIOD_S),
+    )
+
+
+@contextmanager
+def _running(command: list[str], environment: dict[str, str], ready: str) -> Iterator[None]:
+    """Run a process from its line that begins with ``ready`` on."""
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        try:
+            end = time.monotonic() + STARTS_WITHIN_S
+            while not child.stdout.readline().startswith(ready):
+                if child.poll() is not None or time.monotonic() > end:
+                    raise NoAnswerError(f"{' '.join(command)} did not start within {STARTS_WITHIN_S:g} s")
+            yield
+        finally:
+            if child.poll() is None:
+                child.send_signal(signal.SIGINT)
+                try:
+                    child.wait(30)
+                except subprocess.TimeoutExpired:
+                    child.kill()
+
+
+if __name__ == "__main__":
+    from benchmarks.command import main
+
+    main("ros")

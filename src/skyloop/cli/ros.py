@@ -1,0 +1,74 @@
+"""``skyloop ros``: drones as nodes of ROS 2."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+from typing import Annotated
+
+import typer
+
+from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
+from skyloop.cli.process import interrupt
+
+
+def ros(
+    names: NamesArgument = None,
+    drone: DronesOption = None,
+    priority: Annotated[
+        int | None,
+        typer.Option(
+            metavar="P",
+            min=0,
+            max=31,
+            help="Ask for the authority at once, 0 is the highest; without: the service authority/request asks",
+        ),
+    ] = None,
+    cmd_vel_timeout: Annotated[
+        float, typer.Option(metavar="S", min=0.05, max=5.0, help="Silence of cmd_vel after which the drone hovers")
+    ] = 0.5,
+    map_frame: Annotated[
+        str, typer.Option("--map", metavar="FRAME", help="Join the drones' odom frames, where they share their axes")
+    ] = "",
+    use_sim_time: Annotated[bool, typer.Option("--use-sim-time", help="Stamps on the clock of /clock")] = False,
+    domain: Annotated[
+        str | None, typer.Option(metavar="ID", help="Of DDS, 0 to 101 [ROS_DOMAIN_ID]", show_default=False)
+    ] = None,
+    subnet: Annotated[
+        bool,
+        typer.Option("--subnet", help="Let other machines find it: ROS 2 has no keys, whoever reaches it may fly"),
+    ] = False,
+    ros_args: Annotated[
+        str, typer.Option(metavar="ARGS", help='For ROS 2, in quotes: --ros-args "-r cmd_vel:=teleop"')
+    ] = "",
+    network: NetworkOption = None,
+    keys: KeysOption = None,
+) -> None:
+    """Show drones to ROS 2: images, state and transforms as topics, flying by cmd_vel and services. Until Ctrl-C.
+
+    Each drone is a namespace, /alpha. It is found on this machine only, unless --subnet or the variables of ROS 2 say
+    otherwise. Leaving lands what it flies.
+    """
+    from skyloop.ros import Bridge, Settings
+    from skyloop.ros_node import domain_of
+
+    join_network(network, keys)
+    settings = Settings(
+        drones=tuple(drones(names, drone)),
+        priority=priority,
+        timeout_s=cmd_vel_timeout,
+        map_frame=map_frame,
+        use_sim_time=use_sim_time,
+        domain=domain_of(domain),
+        subnet=subnet,
+        arguments=tuple(shlex.split(ros_args)),
+    )
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupt)
+    try:
+        with Bridge(settings) as bridge:
+            for name, namespace in bridge.namespaces.items():
+                typer.echo(f"ready /{namespace}: {name}, {bridge.drones[name].uri}")
+            bridge.run()
+    except KeyboardInterrupt:
+        pass  # how it is meant to end

@@ -1,0 +1,158 @@
+"""Options of ``ros2://`` addresses, parsed and checked. Pure."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.drivers.base import reject_unknown_options
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages import CameraInfo, Capabilities, Encoding
+from skyloop.ros_node import MOST_DOMAIN
+
+#: Topics and services, by the option that names them; without a slash in front they are below the namespace.
+TOPICS: Final = {"image": "image_raw", "cmd_vel": "cmd_vel", "odom": "odom", "battery": "battery_state"}
+SERVICES: Final = ("takeoff", "land")
+_OTHERS: Final = (
+    "info",
+    "camera",
+    "mount",
+    "width",
+    "height",
+    "fps",
+    "compressed",
+    "stamped",
+    "ground",
+    "timeout",
+    "domain",
+)
+KNOWN: Final = {*TOPICS, *SERVICES, *_OTHERS}
+_NAME: Final = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z", re.ASCII)
+Rotation = tuple[float, float, float, float, float, float, float, float, float]
+#: How a camera may be mounted: its optical axes (x right, y down, z forward) in those of the body, row by row.
+MOUNTS: Final[dict[str, Rotation | None]] = {
+    "ahead": (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
+    "down": (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
+    "unknown": None,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Where a robot's topics and services are, as whole names; empty: it has none.
+
+    Attributes:
+        namespace: With a slash in front.
+        image: ``sensor_msgs/Image``, or ``CompressedImage`` if ``compressed``.
+        info: ``sensor_msgs/CameraInfo``.
+        cmd_vel: ``geometry_msgs/Twist``, or ``TwistStamped`` if ``stamped``.
+        odom: ``nav_msgs/Odometry``.
+        battery: ``sensor_msgs/BatteryState``.
+        takeoff: ``std_srvs/Trigger``.
+        land: ``std_srvs/Trigger``.
+        camera: Name of the camera.
+        mount: How it is mounted, of :data:`MOUNTS`.
+        width: Of its images [px].
+        height: [px]
+        fps: Of its images [1/s].
+        compressed: Whether its images are JPEG.
+        stamped: Whether velocities carry a stamp.
+        ground: Whether it stays on the ground: then take-off and landing begin and end the drive.
+        timeout_s: Silence after which the link is lost [s].
+        domain: Of DDS; None: from ``ROS_DOMAIN_ID``.
+    """
+
+    namespace: str
+    image: str
+    info: str
+    cmd_vel: str
+    odom: str
+    battery: str
+    takeoff: str
+    land: str
+    camera: str
+    mount: str
+    width: int
+    height: int
+    fps: float
+    compressed: bool
+    stamped: bool
+    ground: bool
+    timeout_s: float
+    domain: int | None
+
+    def capabilities(self) -> Capabilities:
+        """Return what the robot can do, by the topics and services that it is said to have."""
+        actions: set[str] = set()
+        if self.cmd_vel:
+            actions = {"idle", "velocity"}
+            if self.ground:
+                actions |= {"takeoff", "hover", "land"}
+            actions |= {name for name in SERVICES if getattr(self, name)}
+        camera = CameraInfo(
+            self.camera,
+            self.width,
+            self.height,
+            self.fps,
+            Encoding.JPEG if self.compressed else Encoding.BGR8,
+            rotation=MOUNTS[self.mount],
+        )
+        return Capabilities(
+            vehicle="ros2",
+            actions=frozenset(actions),
+            cameras=(camera,) if self.image else (),
+            why_not="" if actions else "the address gives it no cmd_vel",
+            description=f"a robot of ROS 2 below {self.namespace}" + (", on the ground" if self.ground else ""),
+        )
+
+
+def options_of(uri: VehicleUri) -> Options:
+    """Return the options of an address.
+
+    Raises:
+        UsageError: One is unknown or makes no sense, or they name neither images nor odometry.
+    """
+    reject_unknown_options(uri, KNOWN)
+    namespace = f"/{uri.place.strip('/')}" if uri.place.strip("/") else ""
+    if namespace and not _NAME.match(namespace):
+        raise UsageError(f"{uri}: {uri.place!r} is no namespace of ROS 2: letters, digits and _, no digit first")
+
+    def name(option: str, default: str = "") -> str:
+        given = uri.options.get(option, default)
+        if given and not _NAME.match(given):
+            raise UsageError(f"{uri}: option {option} is {given!r} and must be a name of ROS 2, or empty for none")
+        return given if given.startswith("/") or not given else f"{namespace}/{given}"
+
+    topics = {option: name(option, default) for option, default in TOPICS.items()}
+    if not topics["image"] and not topics["odom"]:
+        raise UsageError(f"{uri}: without image and odom nothing would come from the robot: give one of them")
+    ground = uri.flag("ground")
+    services = {option: name(option) for option in SERVICES}
+    for option, service in services.items():
+        if service and (ground or not topics["cmd_vel"]):
+            reason = "a robot with ground=1 does not leave the ground" if ground else "it needs cmd_vel as well"
+            raise UsageError(f"{uri}: option {option} makes no sense: {reason}")
+    camera = uri.options.get("camera", "front")
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}", camera):
+        raise UsageError(f"{uri}: option camera is {camera!r} and must be a name of 1 to 32 letters, digits, _ or -")
+    mount = uri.options.get("mount", "ahead")
+    if mount not in MOUNTS:
+        raise UnknownNameError(f"mount of a camera of {uri.scheme}://", mount, MOUNTS)
+    return Options(
+        namespace=namespace or "/",
+        **topics,
+        **services,
+        info=name("info", f"{topics['image'].rpartition('/')[0]}/camera_info" if topics["image"] else ""),
+        camera=camera,
+        mount=mount,
+        width=uri.whole("width", 640, minimum=1, maximum=8192),
+        height=uri.whole("height", 480, minimum=1, maximum=8192),
+        fps=uri.number("fps", 30.0, minimum=0.1, maximum=1000.0),
+        compressed=uri.flag("compressed"),
+        stamped=uri.flag("stamped"),
+        ground=ground,
+        timeout_s=uri.number("timeout", 1.0, minimum=0.1, maximum=60.0),
+        domain=uri.whole("domain", 0, maximum=MOST_DOMAIN) if "domain" in uri.options else None,
+    )

@@ -1,0 +1,295 @@
+"""A robot as a vehicle: from its messages to the proxy's sink, and from actions to velocities and services.
+
+Nothing here needs rclpy: messages are any objects with their fields, and the robot's services are a function.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+from skyloop.clock import Clock, nanoseconds, seconds
+from skyloop.drivers.base import Sink
+from skyloop.drivers.ros2.options import Options
+from skyloop.drivers.ros2.telemetry import CaptureClock, battery_of, state_of
+from skyloop.errors import DecodeError
+from skyloop.messages import (
+    AnyAction,
+    Encoding,
+    EventKind,
+    Feedback,
+    FlightState,
+    Hover,
+    Idle,
+    Intrinsics,
+    Land,
+    LinkState,
+    Severity,
+    Takeoff,
+    Velocity,
+)
+from skyloop.wire.ros2.conversions import intrinsics_of, nanoseconds_of, pixels_of
+
+PERIOD_S: Final = 0.05  #: a velocity is repeated so often, as robots stop when none comes
+AIRBORNE_M: Final = 0.1  #: a robot that flies is off the ground above this height of its odometry
+SERVICES_S: Final = 5.0  #: as long as the robot's services may take to be found
+ANSWER_S: Final = 30.0  #: as long as a service may take
+_FEEDBACK_NS: Final = nanoseconds(PERIOD_S)
+
+
+class Robot(Protocol):
+    """What the session commands."""
+
+    def send(self, velocity: Velocity) -> None:
+        """Publish a velocity."""
+
+    def missing(self) -> str:
+        """Return a service that the address names and nobody offers; empty: there is none."""
+
+    def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
+        """Call a ``std_srvs/Trigger``; ``answered`` gets success and message, on any thread.
+
+        Raises:
+            DriverError: Nobody offers it.
+        """
+
+
+@dataclass
+class _Pending:
+    """A take-off or landing that the robot was asked for."""
+
+    state: FlightState
+    since_ns: int
+
+
+class RobotSession:
+    """One opened driver's session: actions from any thread, all else from the node's own.
+
+    The sink is called with the lock free, as the proxy may hold its own while it commands.
+
+    Args:
+        options: Of the address.
+        sink: The proxy's.
+        robot: Commands go there.
+        clock: This host's monotonic clock [ns].
+        system_clock: The system's clock, which stamps are of [ns].
+    """
+
+    def __init__(self, options: Options, sink: Sink, robot: Robot, clock: Clock, system_clock: Clock) -> None:
+        self._options = options
+        self._sink = sink
+        self._robot = robot
+        self._clock = clock
+        self._system_clock = system_clock
+        self._lock = threading.RLock()
+        self._clocks = {topic: CaptureClock() for topic in ("odom", "image")}
+        self._fields: dict[str, Any] = {}  # of the newest odometry
+        self._battery: dict[str, Any] = {}
+        self._intrinsics: Intrinsics | None = None
+        self._captured_ns = 0  # of the newest feedback
+        self._received_ns: int | None = None
+        self._fed_ns = 0
+        self._opened_ns = clock()
+        self._link: LinkState | None = None
+        self._velocity: Velocity | None = None  # in force
+        self._pending: _Pending | None = None
+        self._up: bool | None = False if options.ground else None  # by the robot's services, or the drive's begin
+        self._complained: set[str] = set()
+
+    # From the robot --------------------------------------------------------------------------------------------------
+
+    def on_odometry(self, message: Any) -> None:
+        """Publish a feedback."""
+        now_ns = self._received()
+        with self._lock:
+            self._fields = state_of(message, ground=self._options.ground)
+        stamp_ns = nanoseconds_of(message.header.stamp)
+        self._publish(self._clocks["odom"].captured_ns(stamp_ns, now_ns, self._system_clock()), now_ns)
+
+    def on_battery(self, message: Any) -> None:
+        """Keep the battery's state for the next feedback."""
+        self._battery = battery_of(message)
+
+    def on_info(self, message: Any) -> None:
+        """Keep the camera's intrinsics for the next frame."""
+        self._intrinsics = intrinsics_of(message)
+
+    def on_image(self, message: Any) -> None:
+        """Publish a frame, decoded as far as it needs to be."""
+        now_ns = self._received()
+        stamp_ns = nanoseconds_of(message.header.stamp)
+        captured_ns = self._clocks["image"].captured_ns(stamp_ns, now_ns, self._system_clock())
+        camera, (width, height) = self._options.camera, (self._options.width, self._options.height)
+        if not self._sink.wants(camera):
+            return
+        try:
+            if self._options.compressed:
+                pixels, size = jpeg_of(message)
+                encoding = Encoding.JPEG
+            else:
+                pixels, encoding = pixels_of(message)
+                size = (int(message.width), int(message.height))
+        except DecodeError as error:
+            self._complain(f"an image can't be read: {error}")
+            return
+        if size != (width, height):
+            self._complain(f"images are {size[0]}×{size[1]}: write width={size[0]}&height={size[1]} into the address")
+            return
+        self._sink.frame(
+            camera, pixels, captured_ns, width=width, height=height, encoding=encoding, intrinsics=self._intrinsics
+        )
+
+    # To the robot ----------------------------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction, *, new: bool = True) -> AnyAction:
+        """Accept an action that the capabilities name.
+
+        Args:
+            action: The action.
+            new: Whether somebody newly asked for it; a repeated take-off or landing calls no service once more.
+
+        Raises:
+            DriverError: The robot does not offer the service.
+        """
+        with self._lock:
+            if isinstance(action, Velocity):
+                self._velocity = action
+            elif isinstance(action, Takeoff):
+                self._begin(FlightState.TAKING_OFF, self._options.takeoff, new=new)
+            elif isinstance(action, Land):
+                self._begin(FlightState.LANDING, self._options.land, new=new)
+            elif isinstance(action, Hover):
+                self._velocity = Velocity()
+            elif isinstance(action, Idle):
+                self._velocity = None
+            if self._velocity is not None:
+                self._robot.send(self._velocity)
+        return action
+
+    def tick(self) -> None:
+        """Repeat the velocity in force, and watch the link: to be called every :data:`PERIOD_S`."""
+        now_ns = self._clock()
+        with self._lock:
+            if self._velocity is not None:
+                self._robot.send(self._velocity)
+            if self._pending is not None and now_ns - self._pending.since_ns > nanoseconds(ANSWER_S):
+                self._pending = None
+        since_ns = self._opened_ns if self._received_ns is None else self._received_ns
+        silent_s = seconds(now_ns - since_ns)
+        if silent_s > self._options.timeout_s:
+            self._lose(silent_s)
+        elif not self._fields and self._received_ns is not None and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
+            self._publish(self._received_ns, now_ns)  # no odometry tells how the robot is: its images show that it is
+
+    def close(self) -> None:
+        """Stop what moves: a robot must not go on with an old velocity."""
+        with self._lock:
+            if self._velocity is not None:
+                self._velocity = None
+                self._robot.send(Velocity())
+
+    # Inside ----------------------------------------------------------------------------------------------------------
+
+    @property
+    def _state(self) -> FlightState:
+        if self._pending is not None:
+            return self._pending.state
+        altitude_m = self._fields.get("altitude_m")
+        up = self._up if self._options.ground or altitude_m is None else altitude_m > AIRBORNE_M
+        if up is None:
+            return FlightState.UNKNOWN
+        if not up:
+            return FlightState.LANDED
+        return FlightState.HOVERING if self._velocity in (None, Velocity()) else FlightState.FLYING
+
+    def _begin(self, state: FlightState, service: str, *, new: bool) -> None:
+        up = state is FlightState.TAKING_OFF
+        self._velocity = None
+        if self._options.ground:
+            self._up = up
+            self._robot.send(Velocity())
+            return
+        under_way = self._pending is not None and self._pending.state is state
+        there = (self._state is FlightState.LANDED) is not up and self._state is not FlightState.UNKNOWN
+        if (under_way or there) and not new:
+            return
+        if not up and self._state is FlightState.LANDED:
+            return  # it stands on the ground
+        pending = _Pending(state, self._clock())
+
+        def answered(success: bool, text: str) -> None:
+            with self._lock:
+                if success:
+                    self._up = up
+                if self._pending is pending:
+                    self._pending = None
+            if not success:
+                text = f"the robot refused {service}: {text or 'without a reason'}"
+                self._sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, reason="service_failed")
+
+        self._robot.call(service, answered)
+        self._pending = pending
+
+    def _received(self) -> int:
+        """Note that something came, and return the time."""
+        self._received_ns = now_ns = self._clock()
+        if self._link is not LinkState.UP:
+            self._find(now_ns)
+        return now_ns
+
+    def _find(self, now_ns: int) -> None:
+        """Report that the robot is there, once its services are found too, or that they are not."""
+        missing = self._robot.missing()
+        if not missing:
+            self._link = LinkState.UP
+            self._sink.link(LinkState.UP)
+        elif self._link is not LinkState.DEGRADED and seconds(now_ns - self._opened_ns) > SERVICES_S:
+            self._link = LinkState.DEGRADED
+            remedy = "start the node that does, or correct its name in the address"
+            self._sink.link(LinkState.DEGRADED, f"nobody offers the service {missing}", remedy)
+
+    def _lose(self, silent_s: float) -> None:
+        if self._link is LinkState.LOST:
+            return
+        self._link = LinkState.LOST
+        options = self._options
+        topics = " and ".join(topic for topic in (options.odom, options.image) if topic)
+        domain = "ROS_DOMAIN_ID" if options.domain is None else f"domain={options.domain}"
+        self._sink.link(
+            LinkState.LOST,
+            f"nothing came on {topics} for {silent_s:.1f} s",
+            f"start the robot's nodes, and compare the topics' names and {domain} with theirs",
+        )
+
+    def _publish(self, captured_ns: int, now_ns: int) -> None:
+        self._captured_ns, self._fed_ns = max(self._captured_ns, captured_ns), now_ns
+        with self._lock:
+            feedback = Feedback(captured_ns=self._captured_ns, state=self._state, **self._fields, **self._battery)
+        self._sink.feedback(feedback)
+
+    def _complain(self, text: str) -> None:
+        """Emit what is wrong, once."""
+        if text not in self._complained and len(self._complained) < 8:
+            self._complained.add(text)
+            self._sink.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="image")
+
+
+def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
+    """Return the bytes of a ``sensor_msgs/CompressedImage`` as uint8, shape (bytes,), and its width and height.
+
+    Raises:
+        DecodeError: It is no JPEG.
+    """
+    import numpy as np
+
+    from skyloop.messages.image_header import image_size
+
+    data = np.frombuffer(message.data, np.uint8)
+    if bytes(data[:2]) != b"\xff\xd8":
+        raise DecodeError(f"compressed images of format {message.format!r} are not read, only JPEG")
+    size = image_size(data.tobytes())
+    if size is None:
+        raise DecodeError("this JPEG does not say how large it is")
+    return data, size

@@ -1,0 +1,272 @@
+"""A WebSocket server for Foxglove: the topics and schemas of recordings, live, and the drones' parameters.
+
+The protocol is that of https://github.com/foxglove/ws-protocol, spoken by the ``foxglove-sdk``, which sends on threads
+of its own and drops the oldest messages of a viewer that does not read them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import logging
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from time import monotonic_ns
+from typing import Any, Final
+
+from skyloop.client import Drone
+from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UsageError
+from skyloop.logfile.layout import ClockPair
+from skyloop.messages import Value
+from skyloop.messages.encoded import H264, Chain
+from skyloop.recording.backlog import Item
+from skyloop.recording.foxglove import CompressedVideo
+from skyloop.recording.live.parameters import ParameterDesk, Written
+from skyloop.recording.live.topics import ViewTopic, topics
+from skyloop.recording.live.view import Source, check_names
+from skyloop.recording.output import Message, Schema
+from skyloop.recording.translation import Picture, Translator
+
+PORT: Final = 8765  #: that Foxglove asks for by itself
+WAITING: Final = 512  #: messages that may wait for a viewer; then its oldest are dropped
+_log = logging.getLogger(__name__)
+
+
+class FoxgloveServer:
+    """A :class:`skyloop.recording.live.view.Screen` of any number of viewers."""
+
+    def __init__(
+        self, drones: Sequence[Drone], *, host: str = "127.0.0.1", port: int = PORT, priority: int | None = None
+    ) -> None:
+        """Start to listen.
+
+        Args:
+            drones: Connected ones, with different names.
+            host: Address to listen on.
+            port: To listen on; 0 takes a free one.
+            priority: Of a viewer that writes parameters, 0 (the highest) to 31; None: none does.
+
+        Raises:
+            UsageError: Two drones have the same name, or other machines could write parameters.
+            LinkError: The address can't be listened on.
+            MissingExtraError: The extra ``[foxglove]`` is not installed.
+        """
+        check_names(drones)
+        if priority is not None and not is_loopback(host):
+            raise UsageError(
+                f"parameters can't be written from beyond this machine, and {host} is open to others: Foxglove's "
+                "protocol knows no passwords. Leave out --write, or --host and reach it through ssh -L"
+            )
+        self._sdk = _sdk()
+        clock = ClockPair.now()
+        self._translators = [
+            Translator(drone.name, drone.capabilities, clock, lambda drone=drone: drone.clock_offset_ns)  # type: ignore[misc]
+            for drone in drones
+        ]
+        self._lock = threading.Lock()  # guards what viewers' threads change: the next three
+        self._viewers: Counter[str] = Counter()  # by topic
+        self._began: set[str] = set()  # topics that somebody has just subscribed to
+        self._starts: set[str] = set()  # topics that nobody was subscribed to before
+        self._known: dict[str, tuple[ViewTopic, tuple[Source, ...]]] = {}
+        for number, drone in enumerate(drones):
+            for topic in topics(drone.name, drone.capabilities, far=drone._core.connection.variants):
+                before = self._known[topic.name][1] if topic.name in self._known else ()
+                self._known[topic.name] = topic, (*before, *((number, channel) for channel in topic.channels))
+        self._chains: dict[str, Chain] = {}  # H.264 that viewers were given, by topic
+        self._ready = threading.Event()  # viewers may be there before the server is known here
+        self._context = self._sdk.Context()
+        self._channels = {name: self._channel(topic) for name, (topic, _) in self._known.items() if topic.at_once}
+        self._desk = ParameterDesk(drones, priority, self._parameter_changed)
+        try:
+            self._server = self._sdk.start_server(
+                name=f"skyloop: {', '.join(drone.name for drone in drones)}",
+                host=host,
+                port=port,
+                capabilities=[self._sdk.Capability.Parameters],
+                server_listener=_Listener(self),
+                context=self._context,
+                message_backlog_size=WAITING,
+            )
+        except RuntimeError as error:
+            raise LinkError(f"can't listen on {host}:{port}: {error}; choose another --port, or 0 for any") from None
+        self.host = host
+        self.port: int = self._server.port
+        self._ready.set()
+
+    @property
+    def url(self) -> str:
+        """What Foxglove connects to."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"ws://{host}:{self.port}"
+
+    @property
+    def viewers(self) -> dict[str, int]:
+        """How many viewers have subscribed, by topic. May be read from any thread."""
+        with self._lock:
+            return {topic: count for topic, count in self._viewers.items() if count > 0}
+
+    # On the view's thread --------------------------------------------------------------------------------------
+
+    def wanted(self) -> frozenset[Source]:
+        """Return what the topics that viewers have subscribed to are made of."""
+        with self._lock:
+            found = {source for topic, count in self._viewers.items() if count > 0 for source in self._known[topic][1]}
+            began, self._began = self._began, set()
+            starts, self._starts = self._starts, set()
+        for topic in starts:
+            self._chains.pop(topic, None)
+        if began:
+            self._show_known(began)
+        return frozenset(found)
+
+    def show(self, item: Item) -> None:
+        """Send a sample's messages to those who have subscribed."""
+        for message in self._translators[item.drone].messages(item):
+            if isinstance(item.sample, Picture) and not self._decodable(message, item.sample):
+                continue
+            self._send(message)
+
+    def close(self) -> None:
+        """Stop listening, and disconnect the viewers."""
+        self._server.stop()
+        self._desk.close()
+        for channel in self._channels.values():
+            channel.close()
+
+    def _show_known(self, began: set[str]) -> None:
+        """Send what is known already to who has just subscribed: parameters, mountings, calibrations."""
+        for translator in self._translators:
+            for message in translator.prelude(monotonic_ns()):
+                if message.topic in began:
+                    self._send(message)
+
+    def _decodable(self, message: Message, picture: Picture) -> bool:
+        """Whether viewers can decode a message after those that they were given, beginning with a key picture."""
+        record = picture.record
+        if record.format != H264 or message.kind is not CompressedVideo:
+            return True
+        if message.topic not in self.viewers:
+            return False
+        chain = self._chains.setdefault(message.topic, Chain())
+        return chain.follows(record.header.seq, key=record.key)
+
+    def _send(self, message: Message) -> None:
+        channel = self._channels.get(message.topic)
+        if channel is None:  # pictures in another form than was expected
+            known = self._known.get(message.topic)
+            if known is None:
+                return
+            channel = self._channels[message.topic] = self._channel(known[0])
+        if channel.has_sinks():
+            channel.log(message.data, log_time=message.log_ns)
+
+    def _channel(self, topic: ViewTopic) -> Any:
+        schema = Schema.of(topic.kind)
+        described = self._sdk.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
+        return self._sdk.Channel(
+            topic.name, schema=described, message_encoding=schema.message_encoding, context=self._context
+        )
+
+    # On the viewers' threads -----------------------------------------------------------------------------------
+
+    def subscribed(self, topic: str) -> None:
+        """Note that a viewer has subscribed."""
+        with self._lock:
+            self._viewers[topic] += 1
+            self._began.add(topic)
+            if self._viewers[topic] == 1:
+                self._starts.add(topic)
+
+    def unsubscribed(self, topic: str) -> None:
+        """Note that a viewer has unsubscribed, or is gone."""
+        with self._lock:
+            self._viewers[topic] -= 1
+
+    def read_parameters(self, names: Sequence[str]) -> list[Any]:
+        """Return the parameters of these names, or all."""
+        self._ready.wait()
+        self._desk.follow()
+        try:
+            found = self._desk.read(names)
+        except SkyloopError as error:
+            self._report(f"the parameters can't be read: {error.reason}", "parameters")
+            return []
+        return [self._parameter(name, value) for name, value in found.items()]
+
+    def write_parameters(self, wanted: Sequence[Any]) -> list[Any]:
+        """Write parameters, and return what is in force then."""
+        self._ready.wait()
+        found = []
+        for each in wanted:
+            written = self._desk.write(each.name, each.get_value())
+            self._report_written(written)
+            if written.value is not None:
+                found.append(self._parameter(written.name, written.value))
+        return found
+
+    def follow_parameters(self) -> None:
+        """Report changes from now on."""
+        self._ready.wait()
+        self._desk.follow()
+
+    def _report_written(self, written: Written) -> None:
+        if written.refused:
+            self._report(written.refused, written.name)
+        else:
+            self._server.remove_status([written.name])
+
+    def _report(self, text: str, about: str) -> None:
+        self._server.publish_status(text, self._sdk.StatusLevel.Warning, about)
+
+    def _parameter_changed(self, name: str, value: Value) -> None:
+        self._server.publish_parameter_values([self._parameter(name, value)])
+
+    def _parameter(self, name: str, value: Value) -> Any:
+        return self._sdk.Parameter(name, value=list(value) if isinstance(value, tuple) else value)
+
+
+class _Listener:
+    """What the SDK calls, on its threads. An error in it would only be a line of its log."""
+
+    def __init__(self, server: FoxgloveServer) -> None:
+        self._server = server
+
+    def on_subscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
+        self._server.subscribed(channel.topic)
+
+    def on_unsubscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
+        self._server.unsubscribed(channel.topic)
+
+    def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:  # noqa: ARG002
+        return self._server.read_parameters(param_names)
+
+    def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:  # noqa: ARG002
+        return self._server.write_parameters(parameters)
+
+    def on_parameters_subscribe(self, param_names: list[str]) -> None:  # noqa: ARG002
+        self._server.follow_parameters()
+
+    def on_parameters_unsubscribe(self, param_names: list[str]) -> None: ...
+    def on_client_advertise(self, client: Any, channel: Any) -> None: ...
+    def on_client_unadvertise(self, client: Any, client_channel_id: int) -> None: ...
+    def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None: ...
+    def on_connection_graph_subscribe(self) -> None: ...
+    def on_connection_graph_unsubscribe(self) -> None: ...
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches an address."""
+    if host == "localhost":
+        return True
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return False
+
+
+def _sdk() -> Any:
+    try:
+        import foxglove
+    except ImportError as error:
+        raise MissingExtraError("viewing in Foxglove", "foxglove", cause=str(error)) from None
+    return foxglove

@@ -1,0 +1,174 @@
+"""Rerun as a screen: its viewer, which is started or runs already, or a file."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from skyloop.client import Drone
+from skyloop.clock import nanoseconds
+from skyloop.errors import LinkError, NoAnswerError, SkyloopError
+from skyloop.logfile.layout import ClockPair, FrameRecord
+from skyloop.messages.encoded import H264, Chain
+from skyloop.recording.backlog import Item
+from skyloop.recording.live.view import Source, check_names
+from skyloop.recording.options import MB, VIDEO
+from skyloop.recording.rerun_log import RerunLog, Shown, rerun_sdk
+from skyloop.recording.translation import Picture
+
+PORT: Final = 9876  #: of Rerun's viewer
+_START_S: Final = 20.0
+_AHEAD: Final = 8 * MB  #: that the viewer may be behind
+_PATIENCE_S: Final = 0.5
+_ASK_NS: Final = nanoseconds(1.0)
+_LAST_S: Final = 5.0
+_LOOK_S: Final = 0.1
+_SETTLED_S: Final = 1.0
+_SHOWN: Final = ("feedback", "commands", "events", "annotations", "logs")
+_log = logging.getLogger(__name__)
+
+
+class RerunViewer:
+    """A :class:`skyloop.recording.live.view.Screen` of everything: Rerun does not say what is looked at."""
+
+    def __init__(
+        self,
+        drones: Sequence[Drone],
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        connect: str | None = None,
+        save: Path | None = None,
+    ) -> None:
+        """Start the viewer, connect to it, or open the file.
+
+        Args:
+            drones: Connected ones, with different names.
+            host: Address on which a viewer that is started listens.
+            port: Of the viewer; a viewer that listens there already is taken. None: 9876; 0: any free one.
+            connect: Address of a viewer that runs, instead.
+            save: File to write, instead.
+
+        Raises:
+            UsageError: Two drones have the same name, the file can't be written, or the address makes no sense.
+            LinkError: The viewer can't be started.
+            NoAnswerError: It does not listen in time.
+            MissingExtraError: The extra ``[rerun]`` is not installed.
+        """
+        check_names(drones)
+        rerun_sdk()
+        self.left_out = 0  #: samples for which the viewer was too slow
+        self._ahead = 0  # bytes that the viewer may not have taken yet
+        self._stalled = False
+        self._due_ns = 0
+        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 that was shown
+        clock = ClockPair.now()
+        self._channels = frozenset(
+            (number, channel)
+            for number, drone in enumerate(drones)
+            for channel in (*_SHOWN, *(f"{VIDEO}.{camera.name}" for camera in drone.capabilities.cameras))
+        )
+        self._shown = RerunLog([Shown(drone.name, drone.capabilities, _unix(clock, drone)) for drone in drones])
+        if save is not None:
+            self.target = str(save)
+            self._shown.save(save)
+            return
+        if connect is None:
+            chosen = _free_port(host) if port == 0 else PORT if port is None else port
+            _start(host, chosen)
+            connect = f"rerun+http://{host}:{chosen}/proxy"
+        self.target = connect
+        self._shown.connect(connect)
+
+    def wanted(self) -> frozenset[Source]:
+        """Return everything that is drawn."""
+        return self._channels
+
+    def show(self, item: Item) -> None:
+        """Draw a sample, unless the viewer stands still: Rerun would keep everything for it."""
+        if not self._keeps_up(item):
+            self.left_out += 1
+            return
+        sample = item.sample
+        if not isinstance(sample, Picture):
+            self._shown.add(item.drone, sample)
+        elif self._decodable(item, sample.record):
+            self._shown.add_picture(item.drone, sample.record, sample.data)
+
+    def close(self) -> None:
+        """Finish the file; the viewer stays open."""
+        try:
+            self._shown.close(_PATIENCE_S if self._stalled else _LAST_S)
+        except SkyloopError as error:
+            _log.warning("%s", error)
+
+    def _keeps_up(self, item: Item) -> bool:
+        now_ns = time.monotonic_ns()
+        self._ahead += item.size
+        if now_ns < self._due_ns and (self._stalled or self._ahead < _AHEAD):
+            return not self._stalled
+        taken = self._shown.taken(_PATIENCE_S)
+        if taken == self._stalled:
+            self._stalled = not taken
+            _log.warning("Rerun's viewer %s", "goes on" if taken else "takes nothing: it stands still, or is closed")
+        self._ahead = 0
+        self._due_ns = now_ns + _ASK_NS
+        return taken
+
+    def _decodable(self, item: Item, record: FrameRecord) -> bool:
+        if record.format != H264:
+            return True
+        chain = self._chains.setdefault((item.drone, item.channel), Chain())
+        return chain.follows(record.header.seq, key=record.key)
+
+
+def _unix(clock: ClockPair, drone: Drone) -> Callable[[int], int]:
+    return lambda proxy_ns: clock.unix(proxy_ns, drone.clock_offset_ns)
+
+
+def _start(host: str, port: int) -> None:
+    """Start a viewer that outlives this program, unless one listens already."""
+    if _listens(host, port):
+        return
+    # Rerun's own spawn() would let it listen on all addresses.
+    command = [sys.executable, "-m", "rerun_cli", "--bind", host, "--port", str(port), "--expect-data-soon"]
+    try:
+        viewer = subprocess.Popen(command, start_new_session=True, stdin=subprocess.DEVNULL)
+    except OSError as error:
+        raise LinkError(f"Rerun's viewer can't be started: {error}") from None
+    end = time.monotonic() + _START_S
+    listening_s = 0.0  # a viewer that finds no display listens for a moment before it ends
+    while listening_s < _SETTLED_S:
+        if viewer.poll() is not None:
+            raise LinkError(
+                "Rerun's viewer ended at once: it needs a display. Without one, --save FILE writes a file for a viewer "
+                "elsewhere, --connect URL shows the drones in one elsewhere"
+            )
+        if time.monotonic() > end:
+            os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of what was started
+            raise NoAnswerError(f"Rerun's viewer does not listen on {host}:{port} after {_START_S:g} s")
+        time.sleep(_LOOK_S)
+        listening_s = listening_s + _LOOK_S if _listens(host, port) else 0.0
+
+
+def _listens(host: str, port: int) -> bool:
+    with suppress(OSError), socket.create_connection((host, port), timeout=1.0):
+        return True
+    return False
+
+
+def _free_port(host: str) -> int:
+    try:
+        with socket.create_server((host, 0)) as free:
+            return int(free.getsockname()[1])
+    except OSError as error:
+        raise LinkError(f"can't listen on {host}: {error}") from None

@@ -1,0 +1,162 @@
+"""A live view of drones: subscribes to what a screen wants, and hands it the samples on a thread of its own."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Final, Protocol, Self
+
+from skyloop.client import Drone
+from skyloop.clock import nanoseconds
+from skyloop.errors import UsageError
+from skyloop.recording.backlog import Backlog, Item
+from skyloop.recording.options import MB, Options
+from skyloop.recording.taps import Tap
+
+BEAT_S: Final = 0.02  #: period of polling the backlog, so that receiving threads need not wake the view
+_BATCH: Final = MB  # bytes that are shown before what is wanted is asked again
+_LIMIT: Final = 16 * MB  # what may wait for a slow screen; older pictures are of no use to somebody who watches
+_RESERVE: Final = 16 * MB
+_QUALITY: Final = 80  # of JPEG: these pictures are looked at, and not kept
+_LOOK_NS: Final = nanoseconds(1.0)
+NICENESS: Final = 5
+
+#: A drone's index, and a channel of it as :data:`skyloop.recording.options.CHOICES` names them, or ``video.CAMERA``.
+Source = tuple[int, str]
+_log = logging.getLogger(__name__)
+
+
+class Screen(Protocol):
+    """Shows samples to people. All methods are called on the view's thread, except :meth:`close`."""
+
+    def wanted(self) -> frozenset[Source]:
+        """Return what somebody looks at now: nothing else is subscribed to."""
+
+    def show(self, item: Item) -> None:
+        """Show a sample."""
+
+    def close(self) -> None:
+        """End. The view's thread has ended before."""
+
+
+class View:
+    """Shows drones on a screen from :meth:`start` to :meth:`close`. Use it as a context manager.
+
+    Attributes:
+        failed: Samples that could not be shown.
+        failed_why: Channel and error of the last one.
+    """
+
+    def __init__(self, drones: Sequence[Drone], screen: Screen) -> None:
+        """Initialise without subscribing.
+
+        Args:
+            drones: Connected ones, with different names.
+            screen: Where they are shown; closed with the view.
+
+        Raises:
+            UsageError: Two drones have the same name.
+        """
+        check_names(drones)
+        self.failed = 0
+        self.failed_why = ""
+        self._drones = drones
+        self._screen = screen
+        self._backlog = Backlog(_LIMIT, _RESERVE)
+        self._taps: dict[Source, Tap] = {}
+        self._look_due_ns = 0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="skyloop-view", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Unsubscribe, and close the screen. Idempotent."""
+        self._closing.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._screen.close()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def subscribed(self) -> dict[str, list[str]]:
+        """What is subscribed to, by drone. May be read from any thread."""
+        found: dict[str, list[str]] = {}
+        for number, channel in sorted(self._taps):
+            found.setdefault(self._drones[number].name, []).append(channel)
+        return found
+
+    @property
+    def dropped(self) -> int:
+        """Samples that the screen or the encoder was too slow for. May be read from any thread."""
+        return sum(tuple(self._backlog.dropped.values()))
+
+    # The thread ------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        due_s = time.monotonic()
+        while True:
+            due_s = max(due_s + BEAT_S, time.monotonic())
+            ending = self._closing.wait(max(0.0, due_s - time.monotonic()))
+            try:
+                self.step(time.monotonic_ns(), ending=ending)
+            except Exception:  # noqa: BLE001  (a view that ended would show a standing picture of a flying drone)
+                _log.exception("the view goes on")
+            if ending:
+                return
+
+    def step(self, now_ns: int, *, ending: bool = False) -> None:
+        """Subscribe to what is wanted, and show what came. Called by the thread, or by a test."""
+        self._subscribe(frozenset() if ending else self._screen.wanted())
+        for item in self._backlog.take(_BATCH):
+            try:
+                self._screen.show(item)
+            except Exception as error:  # noqa: BLE001  (samples hold what any application may send)
+                self.failed += 1
+                self.failed_why = f"{item.channel}: {error!r:.200}"
+                _log.warning("a sample of %s can't be shown: %r", item.channel, error)
+        if now_ns >= self._look_due_ns:
+            self._look_due_ns = now_ns + _LOOK_NS
+            for tap in self._taps.values():
+                tap.look()
+
+    def _subscribe(self, wanted: frozenset[Source]) -> None:
+        for source in self._taps.keys() - wanted:
+            self._taps.pop(source).stop()
+        for source in sorted(wanted - self._taps.keys()):
+            number, channel = source
+            options = Options(channels=(channel,), quality=_QUALITY)
+            tap = Tap(number, self._drones[number], options, self._backlog, encoded_far=True)
+            self._taps[source] = tap
+            tap.start()
+
+
+def give_way() -> None:
+    """Lower this process's priority, and that of the threads that it starts from now on: who flies goes first."""
+    if hasattr(os, "nice"):
+        os.nice(NICENESS)
+
+
+def check_names(drones: Sequence[Drone]) -> None:
+    """Check that drones can be told apart.
+
+    Raises:
+        UsageError: Two drones have the same name.
+    """
+    names = [drone.name for drone in drones]
+    if len(set(names)) < len(names):
+        raise UsageError(f"the drones of one view need different names, not {', '.join(names)}")

@@ -1,0 +1,13 @@
+"""Drones as nodes of ROS 2: topics, services and parameters (extra ``[ros]``). ``docs/ros.md`` says which.
+
+::
+
+    from skyloop.ros import Bridge, Settings
+
+    with Bridge(Settings(drones=("alpha",))) as bridge:
+        bridge.run()
+"""
+
+from skyloop.ros.bridge import Bridge, Settings
+
+__all__ = ["Bridge", "Settings"]

@@ -1,0 +1,159 @@
+"""Drones as nodes of ROS 2: connects to each, and wires its topics, services and parameters."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+from skyloop.client import Drone
+from skyloop.client.connect import NAME_TIMEOUT_S, dial_by_name
+from skyloop.client.core import DroneCore
+from skyloop.client.warm_up import keeper
+from skyloop.errors import UsageError
+from skyloop.messages import Event, Severity
+from skyloop.ros.names import Frames, namespaces_of
+from skyloop.ros.parameters import Parameters
+from skyloop.ros.pilot import Pilot
+from skyloop.ros.telemetry import Telemetry
+from skyloop.ros.time import RosTime
+from skyloop.ros.video import CameraPublisher
+from skyloop.ros_node import RosContext, require_rclpy, stay_on_this_machine
+from skyloop.warmth import PERIOD_S
+
+PURPOSE: Final = "the bridge to ROS 2"
+MESSAGES: Final = ("sensor_msgs.msg", "geometry_msgs.msg", "nav_msgs.srv", "std_srvs.srv", "std_msgs.msg")
+UPDATE_S: Final = 0.2  #: how often it is looked who subscribes to images
+_WAITING: Final = 4  #: services of a drone that may wait at a time
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What a bridge does.
+
+    Attributes:
+        drones: Names of running proxies, each a namespace.
+        priority: Ask for the authority at once with this priority, 0 (highest) to 31, and again with it in the service;
+            None: only the service asks, with the default.
+        timeout_s: Silence of ``cmd_vel`` after which the drone hovers, above 0 up to 5 s.
+        map_frame: A frame that all drones' ``odom`` coincide with, as where one simulator or motion capture knows them
+            all; empty: there is none.
+        use_sim_time: Stamps on the clock of ``/clock``.
+        domain: Of DDS; None: from ``ROS_DOMAIN_ID``.
+        subnet: Let other machines find it, where the environment does not say; else this machine only.
+        arguments: For ROS 2, without ``--ros-args``: ``("-r", "cmd_vel:=teleop")``.
+
+    Raises:
+        UsageError: A value is out of range, or two drones have one name in ROS 2.
+    """
+
+    drones: tuple[str, ...]
+    priority: int | None = None
+    timeout_s: float = 0.5
+    map_frame: str = ""
+    use_sim_time: bool = False
+    domain: int | None = None
+    subnet: bool = False
+    arguments: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.drones:
+            raise UsageError("a bridge to ROS 2 needs at least one drone")
+        if not 0.0 < self.timeout_s <= 5.0:
+            raise UsageError(f"the time-out of cmd_vel is {self.timeout_s!r} and must be above 0 and up to 5 s")
+        if self.priority is not None and not 0 <= self.priority <= 31:
+            raise UsageError(f"priority is {self.priority!r} and must be from 0, the highest, to 31")
+        namespaces_of(self.drones)
+
+
+class Bridge:
+    """Connects drones to ROS 2, from entering to leaving. Leaving lands what it flies.
+
+    Raises on entering:
+        MissingExtraError: rclpy or a package of messages is not installed.
+        UsageError: ROS 2 refuses its arguments.
+        SkyloopError: A drone can't be connected to, or with ``priority``, the authority can't be had.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._stack = ExitStack()
+        self._cameras: list[CameraPublisher] = []
+        self.drones: dict[str, Drone] = {}  #: by name
+        self.namespaces = namespaces_of(settings.drones)  #: by name, without a slash
+
+    def __enter__(self) -> Self:
+        settings = self._settings
+        require_rclpy(PURPOSE, *MESSAGES)
+        if not settings.subnet:
+            stay_on_this_machine()
+        with self._stack:
+            context = RosContext(PURPOSE, settings.domain, settings.arguments)
+            self._stack.callback(context.close)
+            waiting, quick = [], []
+            for name, namespace in self.namespaces.items():
+                drone = self._stack.enter_context(_connect(name, settings.timeout_s))
+                self.drones[name] = drone
+                nodes = self._add(context, drone, namespace)
+                waiting.append(nodes[0])
+                quick.append(nodes[1])
+            context.spin(waiting, "ros-services", threads=_WAITING * len(waiting))
+            context.spin(quick, "ros-commands")
+            self._stack = self._stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def run(self, stopping: threading.Event | None = None, shown: Callable[[], object] | None = None) -> None:
+        """Serve until the event is set.
+
+        Args:
+            stopping: Ends it; None: nothing does, but an exception such as KeyboardInterrupt.
+            shown: Called a few times a second, on this thread.
+        """
+        stopping = stopping or threading.Event()
+        while True:
+            for camera in self._cameras:
+                camera.update()
+            if shown is not None:
+                shown()
+            if stopping.wait(UPDATE_S):
+                return
+
+    def _add(self, context: RosContext, drone: Drone, namespace: str) -> tuple[Any, Any]:
+        """Wire a drone, and return the node whose callbacks may wait, and that whose callbacks never do."""
+        settings = self._settings
+        # No node shows the borrowed type of transforms as something that it is not (skyloop.ros.tf_type).
+        own = {"use_sim_time": settings.use_sim_time, "start_type_description_service": False}
+        node = context.node("skyloop", namespace, own)
+        topics = context.node("skyloop_commands", namespace, own)
+        drone.on_event(lambda event: _log(node, event))
+        frames, time = Frames(namespace, settings.map_frame), RosTime(node, drone)
+        Parameters(node, drone)
+        Telemetry(node, drone, time, frames)
+        self._cameras += [CameraPublisher(node, drone, each, time, frames) for each in drone.capabilities.cameras]
+        pilot = Pilot(topics, node, drone, time, frames, priority=settings.priority, timeout_s=settings.timeout_s)
+        self._stack.callback(pilot.close)  # before the drone is left, which lands it
+        if settings.priority is not None:
+            pilot.request_authority()
+        return node, topics
+
+
+def _connect(name: str, timeout_s: float) -> Drone:
+    """Connect as a pilot that does not ask for the authority yet."""
+    core = DroneCore(dial_by_name(name), app="skyloop ros", stall_s=timeout_s, keep_warm=keeper(PERIOD_S))
+    core.open(timeout_s=NAME_TIMEOUT_S, acquire=False)
+    return Drone(core)
+
+
+def _log(node: Any, event: Event) -> None:
+    logger = node.get_logger()
+    if event.severity is Severity.ERROR:
+        logger.error(event.text)
+    elif event.severity is Severity.WARNING:
+        logger.warning(event.text)
+    else:
+        logger.info(event.text)

@@ -1,0 +1,215 @@
+"""Flies a drone by topics and services: ``cmd_vel``, ``goal_pose``, take-off, landing, and the authority to do so."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+from skyloop.client import Drone
+from skyloop.errors import SkyloopError, UsageError
+from skyloop.ros.names import Frames
+from skyloop.ros.time import RosTime
+from skyloop.wire.ros2.conversions import euler_of, nanoseconds_of
+
+NEAR_M: Final = 0.2  #: of a goal without a tolerance
+WARN_AGAIN_S: Final = 5.0  #: between two warnings of one kind
+
+
+class Pilot:
+    """Turns what arrives on topics and services into commands. Nothing is commanded without the authority.
+
+    Args:
+        topics: Node of rclpy whose callbacks never wait, in the drone's namespace.
+        services: Node whose callbacks may wait, several at a time.
+        drone: Connected as a pilot, with the time after which a velocity decays to hover.
+        time: Stamps.
+        frames: Names of the drone's frames.
+        priority: Of requests for the authority, 0 (highest) to 31; None: the default.
+        timeout_s: How old a stamped velocity may be [s].
+    """
+
+    def __init__(
+        self,
+        topics: Any,
+        services: Any,
+        drone: Drone,
+        time: RosTime,
+        frames: Frames,
+        *,
+        priority: int | None,
+        timeout_s: float,
+    ) -> None:
+        from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+        from nav_msgs.srv import GetPlan
+        from rclpy.callback_groups import ReentrantCallbackGroup
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+        from std_srvs.srv import Trigger
+
+        self._drone = drone
+        self._time = time
+        self._frames = frames
+        self._priority = priority
+        self._timeout_s = timeout_s
+        self._log = topics.get_logger()
+        self._lock = threading.Lock()
+        self._under_way: list[str] = []  # services that wait until the drone has done it
+        # The newest wins, whether its publisher is reliable or not.
+        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        topics.create_subscription(Twist, "cmd_vel", self.on_velocity, newest)
+        topics.create_subscription(TwistStamped, "cmd_vel_stamped", self.on_stamped_velocity, newest)
+        topics.create_subscription(PoseStamped, "goal_pose", self.on_goal, newest)
+        group = ReentrantCallbackGroup()
+        actions: dict[str, Callable[[], object]] = {
+            "takeoff": drone.takeoff,
+            "land": drone.land,
+            "hover": drone.hover,
+            "return_to_start": drone.return_to_start,
+            "emergency_stop": drone.emergency_stop,
+            "authority/request": self.request_authority,
+            "authority/release": drone.release_authority,
+        }
+        for name, act in actions.items():
+            services.create_service(Trigger, name, self._trigger(name, act), callback_group=group)
+        services.create_service(GetPlan, "go_to", self._go_to, callback_group=group)
+
+    def request_authority(self) -> None:
+        """Ask for the authority with the priority that was given.
+
+        Raises:
+            AuthorityError: Another application has it; names which.
+        """
+        self._drone.request_authority(self._priority)
+
+    def close(self) -> None:
+        """Ignore what still comes on topics, so that the landing at the end is not ended by it."""
+        with self._lock:
+            self._under_way.append("the end of the bridge")
+
+    # Topics: never wait ----------------------------------------------------------------------------------------------
+
+    def on_velocity(self, twist: Any) -> None:
+        """Fly with the velocity of a ``geometry_msgs/Twist`` (levelled axes); rates of roll and pitch are ignored."""
+        linear, angular = twist.linear, twist.angular
+        if self._is_occupied("cmd_vel"):
+            return
+        try:
+            self._drone.velocity(forward=linear.x, left=linear.y, up=linear.z, yaw_rate=angular.z)
+        except SkyloopError as error:
+            self._ignored("cmd_vel", error)
+
+    def on_stamped_velocity(self, message: Any) -> None:
+        """Fly with the velocity of a ``TwistStamped``, unless it is too old or in the axes of something else."""
+        frame = message.header.frame_id
+        stamp_ns = nanoseconds_of(message.header.stamp)
+        age_s = self._time.age_s(stamp_ns) if stamp_ns else 0.0
+        if frame not in ("", "base_link", self._frames.base):
+            self._ignored("cmd_vel_stamped", UsageError(f"its frame is {frame!r} and must be {self._frames.base}"))
+        elif not abs(age_s) <= self._timeout_s:
+            limit_s = self._timeout_s
+            self._ignored("cmd_vel_stamped", UsageError(f"its stamp is {age_s:.3g} s old, {limit_s:g} s are allowed"))
+        else:
+            self.on_velocity(message.twist)
+
+    def on_goal(self, pose: Any) -> None:
+        """Fly to a pose, without waiting."""
+        if self._is_occupied("goal_pose"):
+            return
+        try:
+            place = self._place(pose)
+            self._drone.go_to(x=place["x"], y=place["y"], z=place["z"], yaw=place.get("yaw"), wait=False)
+        except SkyloopError as error:
+            self._ignored("goal_pose", error)
+
+    def _is_occupied(self, topic: str) -> bool:
+        """Return whether a service is under way: programs go on to publish velocities while they wait for it."""
+        with self._lock:
+            service = self._under_way[-1] if self._under_way else ""
+        if service:
+            self._log.info(f"{topic} is ignored during {service}", throttle_duration_sec=WARN_AGAIN_S)
+        return bool(service)
+
+    @contextmanager
+    def _occupied(self, service: str) -> Iterator[None]:
+        """Ignore velocities and goals within the block."""
+        with self._lock:
+            self._under_way.append(service)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._under_way.remove(service)
+
+    def _ignored(self, topic: str, error: SkyloopError) -> None:
+        self._log.warning(f"{topic} is ignored: {_in_words_of_ros(error)}", throttle_duration_sec=WARN_AGAIN_S)
+
+    def _place(self, pose: Any) -> dict[str, float]:
+        """Return the arguments of ``go_to`` for a ``PoseStamped``.
+
+        A pose that was drawn in a plane has no height: z = 0 keeps the present one. An orientation that was left out
+        keeps the present heading.
+
+        Raises:
+            UsageError: It is in the axes of something else, its numbers are not finite, or its height is not known.
+        """
+        frame, place, turn = pose.header.frame_id, pose.pose.position, pose.pose.orientation
+        allowed = [each for each in ("odom", self._frames.odom, self._frames.map) if each]
+        if frame and frame not in allowed:
+            raise UsageError(f"the goal's frame is {frame!r} and must be {' or '.join(allowed)}")
+        if not all(map(math.isfinite, (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))):
+            raise UsageError("the goal's numbers must be finite")
+        found = {"x": place.x, "y": place.y, "z": place.z}
+        if place.z == 0.0:
+            position = self._drone.feedback().position_m
+            if position is None:
+                raise UsageError("the goal's height is 0 and the drone's own is not known: give z")
+            found["z"] = position[2]
+        angles = euler_of((turn.x, turn.y, turn.z, turn.w))
+        as_made = (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0) and not frame  # nothing was filled in
+        if angles is not None and not as_made:
+            found["yaw"] = angles[2]
+        return found
+
+    # Services: may wait ----------------------------------------------------------------------------------------------
+
+    def _trigger(self, name: str, act: Callable[[], object]) -> Callable[[Any, Any], Any]:
+        def call(_request: Any, response: Any) -> Any:
+            try:
+                with self._occupied(name):
+                    done = act()
+            except SkyloopError as error:
+                response.success, response.message = False, _in_words_of_ros(error)
+                self._log.warning(f"{name} failed: {response.message}")
+                return response
+            response.success = done is not False
+            response.message = "" if response.success else "it was not sent: the proxy is not reached just now"
+            return response
+
+        return call
+
+    def _go_to(self, request: Any, response: Any) -> Any:
+        """Fly to ``goal`` and wait; the plan is the straight way that was flown, and empty if it was not."""
+        from geometry_msgs.msg import PoseStamped
+
+        try:
+            place = self._place(request.goal)
+            start = self._drone.feedback().position_m
+            near_m = request.tolerance if request.tolerance > 0.0 else NEAR_M
+            with self._occupied("go_to"):
+                self._drone.go_to(x=place["x"], y=place["y"], z=place["z"], yaw=place.get("yaw"), tolerance_m=near_m)
+        except SkyloopError as error:
+            self._log.error(f"go_to failed: {_in_words_of_ros(error)}")
+            return response
+        response.plan.header.frame_id = self._frames.odom
+        for x, y, z in (start or (math.nan,) * 3, (place["x"], place["y"], place["z"])):
+            pose = PoseStamped(header=response.plan.header)
+            pose.pose.position.x, pose.pose.position.y, pose.pose.position.z = x, y, z
+            response.plan.poses.append(pose)
+        return response
+
+
+def _in_words_of_ros(error: SkyloopError) -> str:
+    """Return what is wrong, and instead of Python's calls the services that do the same."""
+    return error.reason.replace("request_authority()", "the service authority/request")

@@ -1,0 +1,231 @@
+"""Publishes a drone's state: odometry, IMU, battery, place on the earth, transforms, and what it is doing."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from skyloop.client import Drone
+from skyloop.errors import UnsupportedError
+from skyloop.messages import CameraInfo, Feedback, LinkState
+from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.ros.names import Frames
+from skyloop.ros.time import RosTime
+from skyloop.wire.ros2.conversions import VARIANCE, Quaternion, body_velocity, covariance, quaternion_of, stamp_of
+from skyloop.wire.ros2.tf_message import Transform, encode_transforms
+
+SLOW_NS: Final = 1_000_000_000  #: battery and place on the earth, once in so long
+_NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+
+
+class Telemetry:
+    """Publishes each feedback, to those topics that somebody subscribes to.
+
+    Args:
+        node: Of rclpy, in the drone's namespace.
+        drone: Connected.
+        time: Stamps of captures.
+        frames: Names of the drone's frames.
+    """
+
+    def __init__(self, node: Any, drone: Drone, time: RosTime, frames: Frames) -> None:
+        from geometry_msgs.msg import TwistStamped
+        from nav_msgs.msg import Odometry
+        from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+        from sensor_msgs.msg import BatteryState, Imu, NavSatFix
+        from std_msgs.msg import String
+
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._node = node
+        self._time = time
+        self._frames = frames
+        self._odometry = node.create_publisher(Odometry, "odom", qos_profile_sensor_data)
+        self._velocity = node.create_publisher(TwistStamped, "velocity", qos_profile_sensor_data)
+        self._imu = node.create_publisher(Imu, "imu/data", qos_profile_sensor_data)
+        self._battery = node.create_publisher(BatteryState, "battery_state", 1)
+        self._fix = node.create_publisher(NavSatFix, "fix", 1)
+        self._state = node.create_publisher(String, "state", latched)
+        self._pilot = node.create_publisher(String, "pilot", latched)
+        self._transforms: Any = None
+        self._static: Any = None
+        try:
+            self._open_transforms(drone.capabilities.cameras)
+        except UnsupportedError as error:
+            node.get_logger().warning(f"no /tf and no /tf_static: {error}")
+        self._told: dict[Any, str] = {}
+        self._slow_ns = 0
+        drone.on_feedback(self.publish)
+
+    def publish(self, feedback: Feedback) -> None:
+        """Publish one sample. On a thread of the drone's own."""
+        self._tell(self._state, feedback.state.value)
+        self._tell(self._pilot, feedback.owner or "")
+        stamp_ns = self._time.stamp_ns(feedback.captured_ns)
+        if stamp_ns is None or feedback.vehicle_link not in (LinkState.UP, LinkState.DEGRADED):
+            return
+        rotation = _quaternion(feedback)
+        for publisher, make in (
+            (self._odometry, self._odometry_of),
+            (self._velocity, self._velocity_of),
+            (self._imu, self._imu_of),
+        ):
+            if publisher.get_subscription_count():
+                message = make(feedback, rotation, stamp_ns)
+                if message is not None:
+                    publisher.publish(message)
+        if rotation is not None and feedback.position_m is not None and self._transforms is not None:
+            frames = self._frames
+            moved = Transform(stamp_ns, frames.odom, frames.base, feedback.position_m, rotation)
+            self._transforms.publish(encode_transforms([moved]))
+        if feedback.captured_ns - self._slow_ns >= SLOW_NS:
+            self._slow_ns = feedback.captured_ns
+            self._publish_slow(feedback, stamp_ns)
+
+    def _publish_slow(self, feedback: Feedback, stamp_ns: int) -> None:
+        for publisher, make in ((self._battery, self._battery_of), (self._fix, self._fix_of)):
+            if publisher.get_subscription_count():
+                message = make(feedback, stamp_ns)
+                if message is not None:
+                    publisher.publish(message)
+
+    def _open_transforms(self, cameras: tuple[CameraInfo, ...]) -> None:
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        from skyloop.ros.tf_type import forget_error, tf_message_type
+
+        kind = tf_message_type()
+        frames = self._frames
+        self._transforms = self._node.create_publisher(kind, "/tf", 100)
+        lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._static = self._node.create_publisher(kind, "/tf_static", lasting)
+        forget_error()
+        known = [
+            Transform(
+                0,
+                frames.base,
+                frames.optical(each.name),
+                each.position_m or (0.0, 0.0, 0.0),
+                quaternion_of(each.rotation),
+            )
+            for each in cameras
+            if each.rotation is not None
+        ]
+        if frames.map:
+            known.append(Transform(0, frames.map, frames.odom, (0.0, 0.0, 0.0), _NO_ROTATION))
+        if known:
+            self._static.publish(encode_transforms(known))
+
+    def _tell(self, publisher: Any, text: str) -> None:
+        """Publish a text if it is another than the last one."""
+        if self._told.get(publisher) != text:
+            from std_msgs.msg import String
+
+            self._told[publisher] = text
+            publisher.publish(String(data=text))
+
+    # Messages ------------------------------------------------------------------------------------------------------
+
+    def _odometry_of(self, feedback: Feedback, rotation: Quaternion | None, stamp_ns: int) -> Any:
+        from nav_msgs.msg import Odometry
+
+        twist = self._twist(feedback)
+        if rotation is None or feedback.position_m is None or twist is None:
+            return None
+        message = Odometry(child_frame_id=self._frames.base)
+        self._head(message, stamp_ns, self._frames.odom)
+        place = message.pose.pose.position
+        place.x, place.y, place.z = feedback.position_m
+        _turn(message.pose.pose.orientation, rotation)
+        message.pose.covariance = covariance(6)
+        message.twist.twist = twist
+        message.twist.covariance = covariance(6)
+        return message
+
+    def _velocity_of(self, feedback: Feedback, _rotation: Quaternion | None, stamp_ns: int) -> Any:
+        from geometry_msgs.msg import TwistStamped
+
+        twist = self._twist(feedback)
+        if twist is None:
+            return None
+        message = TwistStamped(twist=twist)
+        self._head(message, stamp_ns, self._frames.base)
+        return message
+
+    def _twist(self, feedback: Feedback) -> Any:
+        """Return velocity and rates in body axes; None if the velocity or the tilt is not known."""
+        from geometry_msgs.msg import Twist
+
+        if feedback.velocity_m_s is None or feedback.roll_rad is None or feedback.pitch_rad is None:
+            return None
+        twist = Twist()
+        moved = body_velocity(feedback.velocity_m_s, feedback.roll_rad, feedback.pitch_rad)
+        twist.linear.x, twist.linear.y, twist.linear.z = moved
+        twist.angular.x, twist.angular.y, twist.angular.z = feedback.angular_velocity_rad_s or (math.nan,) * 3
+        return twist
+
+    def _imu_of(self, feedback: Feedback, rotation: Quaternion | None, stamp_ns: int) -> Any:
+        from sensor_msgs.msg import Imu
+
+        rates, force = feedback.angular_velocity_rad_s, feedback.acceleration_m_s2
+        if rotation is None and rates is None and force is None:
+            return None
+        message = Imu()
+        self._head(message, stamp_ns, self._frames.base)
+        _turn(message.orientation, rotation or _NO_ROTATION)
+        message.orientation_covariance = covariance(3, known=rotation is not None)
+        turned, pushed = message.angular_velocity, message.linear_acceleration
+        turned.x, turned.y, turned.z = rates or (0.0, 0.0, 0.0)
+        message.angular_velocity_covariance = covariance(3, known=rates is not None)
+        pushed.x, pushed.y, pushed.z = force or (0.0, 0.0, 0.0)
+        message.linear_acceleration_covariance = covariance(3, known=force is not None)
+        return message
+
+    def _battery_of(self, feedback: Feedback, stamp_ns: int) -> Any:
+        from sensor_msgs.msg import BatteryState
+
+        if feedback.battery is None and feedback.battery_v is None:
+            return None
+        message = BatteryState(
+            voltage=_or_nan(feedback.battery_v),
+            percentage=_or_nan(feedback.battery),  # 0 to 1, as everywhere in Skyloop
+            present=True,
+            power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
+            **dict.fromkeys(("temperature", "current", "charge", "capacity", "design_capacity"), math.nan),
+        )
+        self._head(message, stamp_ns, self._frames.base)
+        return message
+
+    def _fix_of(self, feedback: Feedback, stamp_ns: int) -> Any:
+        from sensor_msgs.msg import NavSatFix, NavSatStatus
+
+        origin = feedback.origin
+        if origin is None or feedback.position_m is None:
+            return None
+        latitude_deg, longitude_deg, _ = origin.place_of(feedback.position_m)
+        # The altitude of a NavSatFix is above the ellipsoid; the vehicle's is above the sea, and what lies between them
+        # (up to 100 m) is not known here.
+        message = NavSatFix(latitude=latitude_deg, longitude=longitude_deg, altitude=math.nan)
+        message.status.status = NavSatStatus.STATUS_FIX
+        message.status.service = NavSatStatus.SERVICE_GPS
+        message.position_covariance = covariance(3, variance=100 * VARIANCE)
+        message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_APPROXIMATED
+        self._head(message, stamp_ns, self._frames.base)
+        return message
+
+    def _head(self, message: Any, stamp_ns: int, frame: str) -> None:
+        message.header.frame_id = frame
+        message.header.stamp.sec, message.header.stamp.nanosec = stamp_of(stamp_ns)
+
+
+def _quaternion(feedback: Feedback) -> Quaternion | None:
+    if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
+        return None
+    return quaternion_from_euler(feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad)
+
+
+def _turn(orientation: Any, rotation: Quaternion) -> None:
+    orientation.x, orientation.y, orientation.z, orientation.w = rotation
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -1,0 +1,225 @@
+"""Nodes of ROS 2, made in one place: rclpy is optional, and imported when the first one is made.
+
+Unless the environment says who may find them, they are found on this machine only: ROS 2 asks nobody for a key.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import re
+import tempfile
+import threading
+from collections.abc import Iterable, Mapping, MutableMapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final
+
+from skyloop.errors import MissingExtraError, UsageError
+
+#: What decides who finds a node; where one of them is set, it is left to them.
+DISCOVERY_VARIABLES: Final = (
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_LOCALHOST_ONLY",
+    "ROS_DISCOVERY_SERVER",
+)
+#: Where Fast DDS 3 looks for a profile, and Fast DDS 2, of Jazzy and before.
+PROFILES_VARIABLE, OLD_PROFILES_VARIABLE = DISCOVERY_VARIABLES[:2]
+_OLD_DISTRIBUTIONS: Final = ("humble", "iron", "jazzy")
+_FIRST_WITH_FAST_DDS_3: Final = 8  #: major version of rclpy
+MOST_DOMAIN: Final = 101  #: above it, the ports of DDS may be taken by outgoing connections on Linux
+SHARED_BYTES: Final = 16 * 2**20  #: shared memory of a participant: several pictures, where 512 KiB hold not even one
+
+#: A profile for Fast DDS: sockets on loopback only, and shared memory that has room for pictures.
+LOOPBACK_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8"?>
+<dds xmlns="http://www.eprosima.com">
+  <profiles>
+    <transport_descriptors>
+      <transport_descriptor>
+        <transport_id>skyloop_loopback</transport_id>
+        <type>UDPv4</type>
+        <interfaceWhiteList><address>127.0.0.1</address></interfaceWhiteList>
+      </transport_descriptor>
+      <transport_descriptor>
+        <transport_id>skyloop_shared_memory</transport_id>
+        <type>SHM</type>
+        <segment_size>{SHARED_BYTES}</segment_size>
+      </transport_descriptor>
+    </transport_descriptors>
+    <participant profile_name="skyloop" is_default_profile="true">
+      <rtps>
+        <userTransports>
+          <transport_id>skyloop_shared_memory</transport_id>
+          <transport_id>skyloop_loopback</transport_id>
+        </userTransports>
+        <useBuiltinTransports>false</useBuiltinTransports>
+      </rtps>
+    </participant>
+  </profiles>
+</dds>
+"""
+
+
+def require_rclpy(purpose: str, *packages: str) -> Any:
+    """Import rclpy, and return it.
+
+    Args:
+        purpose: What it is needed for, as the error says it.
+        *packages: Packages of messages that are needed besides, such as ``nav_msgs.msg``.
+
+    Raises:
+        MissingExtraError: It, or one of the packages, is not installed.
+    """
+    from importlib import import_module
+
+    try:
+        for package in packages:
+            import_module(package)
+        return import_module("rclpy")
+    except ImportError as error:
+        raise MissingExtraError(purpose, "ros", cause=str(error)) from error
+
+
+def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> bool:
+    """Let nodes of this process be found on this machine only, unless the environment says who may find them.
+
+    To be called before the first node is made. The profile is a file in a directory of its own, removed at the end.
+
+    Args:
+        environment: Where the variables of ROS 2 are looked up and set.
+
+    Returns:
+        Whether it was left to this.
+    """
+    if any(environment.get(variable) for variable in DISCOVERY_VARIABLES):
+        return bool(_profile) and _profile["path"] in map(environment.get, DISCOVERY_VARIABLES[:2])
+    if environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") != "rmw_fastrtps_cpp":
+        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # which another DDS keeps by itself
+        return True
+    folder = tempfile.TemporaryDirectory(prefix="skyloop-ros-")
+    atexit.register(folder.cleanup)
+    path = Path(folder.name) / "loopback.xml"
+    path.write_text(LOOPBACK_PROFILE)
+    variable = OLD_PROFILES_VARIABLE if _has_fast_dds_2(environment) else PROFILES_VARIABLE
+    environment[variable] = _profile["path"] = str(path)
+    return True
+
+
+_profile: dict[str, str] = {}  # the path of the profile that was written
+
+
+def _has_fast_dds_2(environment: Mapping[str, str]) -> bool:
+    try:
+        return int(version("ros-rclpy").partition(".")[0]) < _FIRST_WITH_FAST_DDS_3
+    except (PackageNotFoundError, ValueError):  # a distribution's own
+        return environment.get("ROS_DISTRO", "") in _OLD_DISTRIBUTIONS
+
+
+def domain_of(text: str | None) -> int | None:
+    """Return the domain that a text names; None without one: ROS 2 then reads ``ROS_DOMAIN_ID``.
+
+    Raises:
+        UsageError: It is no number from 0 to :data:`MOST_DOMAIN`.
+    """
+    if text is None:
+        return None
+    if not (text.isascii() and text.isdigit() and int(text) <= MOST_DOMAIN):
+        raise UsageError(f"the domain of ROS 2 is {text!r} and must be a number from 0 to {MOST_DOMAIN}")
+    return int(text)
+
+
+def ros_name(name: str) -> str:
+    """Return a name that ROS 2 allows for a namespace or frame: letters, digits and ``_``, no digit first."""
+    word = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    return f"drone_{word}" if not word or word[0].isdigit() else word
+
+
+class RosContext:
+    """A context of rclpy with its nodes, and the threads that run their callbacks.
+
+    Args:
+        purpose: What it is for, as an error says it.
+        domain: Of DDS; None: from ``ROS_DOMAIN_ID``.
+        arguments: For ROS 2, such as ``-r cmd_vel:=/cmd_vel``, without ``--ros-args``.
+
+    Raises:
+        MissingExtraError: rclpy is not installed.
+        UsageError: rclpy does not understand the arguments.
+    """
+
+    def __init__(self, purpose: str, domain: int | None = None, arguments: Iterable[str] = ()) -> None:
+        self._rclpy = require_rclpy(purpose)
+        self._context = self._rclpy.Context()
+        # What is logged goes to standard error and to /rosout; a file in the user's home for each run is nobody's wish.
+        words = ["--ros-args", "--disable-external-lib-logs", *arguments]
+        try:
+            self._rclpy.init(args=words, context=self._context, domain_id=domain, signal_handler_options=_no_signals())
+        except Exception as error:
+            raise UsageError(f"ROS 2 can't begin with {' '.join(words)}: {error}") from error
+        self._nodes: list[Any] = []
+        self._executors: list[tuple[Any, threading.Thread]] = []
+
+    def node(self, name: str, namespace: str = "", parameters: Mapping[str, bool | int | float | str] = {}) -> Any:
+        """Return a new node.
+
+        Args:
+            name: Of the node.
+            namespace: Its namespace.
+            parameters: Values of its parameters from the beginning.
+        """
+        overrides = [self._rclpy.Parameter(key, value=value) for key, value in parameters.items()]
+        node = self._rclpy.create_node(
+            name, namespace=namespace, context=self._context, parameter_overrides=overrides, enable_logger_service=False
+        )
+        self._nodes.append(node)
+        return node
+
+    def spin(self, nodes: Iterable[Any], name: str, threads: int = 1) -> None:
+        """Run the callbacks of nodes on threads of their own, until :meth:`close`.
+
+        Args:
+            nodes: Of this context.
+            name: Of the thread.
+            threads: How many callbacks may run at a time.
+        """
+        from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+
+        executor: Any = (
+            SingleThreadedExecutor(context=self._context)
+            if threads == 1
+            else MultiThreadedExecutor(threads, context=self._context)
+        )
+        for node in nodes:
+            executor.add_node(node)
+
+        def run() -> None:
+            try:
+                executor.spin()
+            except ExternalShutdownException:
+                return  # how it is meant to end
+
+        thread = threading.Thread(target=run, name=name, daemon=True)
+        self._executors.append((executor, thread))
+        thread.start()
+
+    def close(self) -> None:
+        """End the threads and the nodes. Idempotent."""
+        executors, self._executors = self._executors, []
+        for executor, thread in executors:
+            executor.shutdown(timeout_sec=5.0)
+            thread.join(5.0)
+        nodes, self._nodes = self._nodes, []
+        for node in nodes:
+            node.destroy_node()
+        if self._context.ok():
+            self._rclpy.shutdown(context=self._context)
+        self._context.destroy()
+
+
+def _no_signals() -> Any:
+    from rclpy.signals import SignalHandlerOptions
+
+    return SignalHandlerOptions.NO

@@ -1,0 +1,227 @@
+"""Numbers of ROS 2's messages from those of Skyloop, and back. Pure.
+
+Axes are the same on both sides (REP 103): body x forward, y left, z up; world x east, y north, z up; a camera's optical
+axes x right, y down, z forward. What differs: Skyloop's velocity is in the body's *levelled* axes, that of a twist in
+those of the body; angles are quaternions; and what is not known is a covariance of -1, or NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import NS_PER_S
+from skyloop.errors import DecodeError
+from skyloop.messages import Encoding, Intrinsics, Vector
+from skyloop.messages.geometry import euler_from_rotation, rotation_from_euler
+
+Quaternion = tuple[float, float, float, float]  #: x, y, z, w
+
+NOT_KNOWN: Final = -1.0  #: in the first place of a covariance: that measurement is not there (sensor_msgs/Imu)
+#: The variance that is told where nobody has measured one: of "about right", not of "exact" [m², (m/s)², rad² …].
+VARIANCE: Final = 0.01
+
+#: Names of pixels, as in ``sensor_msgs/image_encodings.hpp``: bytes of a pixel, and of which order they are.
+_PIXELS: Final[dict[str, tuple[int, tuple[int, ...] | None, Encoding]]] = {
+    "bgr8": (3, None, Encoding.BGR8),
+    "8UC3": (3, None, Encoding.BGR8),
+    "rgb8": (3, None, Encoding.RGB8),
+    "mono8": (1, None, Encoding.MONO8),
+    "8UC1": (1, None, Encoding.MONO8),
+    "bgra8": (4, (0, 1, 2), Encoding.BGR8),
+    "8UC4": (4, (0, 1, 2), Encoding.BGR8),
+    "rgba8": (4, (2, 1, 0), Encoding.BGR8),
+}
+
+
+# Time -----------------------------------------------------------------------------------------------------------
+
+
+def stamp_of(ns: int) -> tuple[int, int]:
+    """Return seconds and nanoseconds of a ``builtin_interfaces/Time``."""
+    return divmod(ns, NS_PER_S)
+
+
+def nanoseconds_of(stamp: Any) -> int:
+    """Return a ``builtin_interfaces/Time`` in nanoseconds."""
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+class ClockMap:
+    """Maps times of a proxy's monotonic clock to ROS time.
+
+    The difference of the clocks is kept until it is off by more than ``tolerance_s``, so that the intervals of stamps
+    are those of the captures; then one of them was set, or ROS time is that of a simulation.
+
+    Args:
+        tolerance_s: [s]
+    """
+
+    def __init__(self, tolerance_s: float = 1e-3) -> None:
+        self._tolerance_ns = round(tolerance_s * NS_PER_S)
+        self._offset_ns: int | None = None
+
+    def to_ros(self, captured_ns: int, now_ns: int, ros_now_ns: int) -> int | None:
+        """Return the time of a capture as ROS time [ns].
+
+        Args:
+            captured_ns: On the proxy's clock.
+            now_ns: The present time on it.
+            ros_now_ns: The present ROS time; 0 while a simulation's clock is not known.
+
+        Returns:
+            None while ROS time is not known, or the capture was before its beginning.
+        """
+        if ros_now_ns <= 0:
+            return None
+        offset_ns = ros_now_ns - now_ns
+        if self._offset_ns is None or abs(offset_ns - self._offset_ns) > self._tolerance_ns:
+            self._offset_ns = offset_ns
+        stamp_ns = captured_ns + self._offset_ns
+        return stamp_ns if stamp_ns >= 0 else None
+
+
+# Attitude and velocity -------------------------------------------------------------------------------------------
+
+
+def rotation_of(quaternion: Quaternion) -> NDArray[np.float64] | None:
+    """Return the matrix of a quaternion, shape (3, 3); None for one that is none: not finite, or all but zero."""
+    length = math.sqrt(sum(each * each for each in quaternion))
+    if not (math.isfinite(length) and length > 1e-6):
+        return None
+    x, y, z, w = (each / length for each in quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def euler_of(quaternion: Quaternion) -> tuple[float, float, float] | None:
+    """Return roll, pitch and yaw of a quaternion [rad]; None for one that is none."""
+    rotation = rotation_of(quaternion)
+    return None if rotation is None else euler_from_rotation(rotation)
+
+
+def quaternion_of(rotation: tuple[float, ...]) -> Quaternion:
+    """Return the unit quaternion of a rotation matrix, given row by row (9 numbers).
+
+    Source: S. W. Shepperd, "Quaternion from Rotation Matrix", Journal of Guidance and Control 1(3), 1978.
+    """
+    r = np.asarray(rotation, dtype=np.float64).reshape(3, 3)
+    trace = float(np.trace(r))
+    squares = [float(r[i, i]) for i in range(3)] + [trace]
+    largest = max(range(4), key=squares.__getitem__)
+    if largest == 3:
+        found = [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1.0 + trace]
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        found = [0.0] * 4
+        found[i] = 1.0 + r[i, i] - r[j, j] - r[k, k]
+        found[j] = r[j, i] + r[i, j]
+        found[k] = r[k, i] + r[i, k]
+        found[3] = r[k, j] - r[j, k]
+    length = math.sqrt(sum(float(each) ** 2 for each in found))
+    x, y, z, w = (float(each) / length for each in found)
+    return x, y, z, w
+
+
+def body_velocity(levelled: Vector, roll: float, pitch: float) -> Vector:
+    """Return a velocity in body axes, from one in the body's levelled axes [m/s]."""
+    x, y, z = rotation_from_euler(roll, pitch, 0.0).T @ np.array(levelled)
+    return float(x), float(y), float(z)
+
+
+def levelled_velocity(body: Vector, roll: float, pitch: float) -> Vector:
+    """Return a velocity in the body's levelled axes, from one in body axes [m/s]."""
+    x, y, z = rotation_from_euler(roll, pitch, 0.0) @ np.array(body)
+    return float(x), float(y), float(z)
+
+
+def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> list[float]:
+    """Return a covariance matrix, row by row: ``variance`` on its diagonal, or :data:`NOT_KNOWN` in its first place.
+
+    Args:
+        size: Of its side.
+        known: Whether what it belongs to was measured.
+        variance: [square of the unit]
+    """
+    found = [0.0] * (size * size)
+    if not known:
+        found[0] = NOT_KNOWN
+    else:
+        found[:: size + 1] = [variance] * size
+    return found
+
+
+# Cameras ---------------------------------------------------------------------------------------------------------
+
+
+class CameraModel(NamedTuple):
+    """What a ``sensor_msgs/CameraInfo`` holds, row by row; without intrinsics all is zero, as ROS has it."""
+
+    model: str
+    d: list[float]
+    k: list[float]
+    r: list[float]
+    p: list[float]
+
+
+def camera_model(intrinsics: Intrinsics | None) -> CameraModel:
+    """Return what a ``sensor_msgs/CameraInfo`` says of a camera's intrinsics."""
+    if intrinsics is None:
+        return CameraModel("", [], [0.0] * 9, [0.0] * 9, [0.0] * 12)
+    fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+    given = list(intrinsics.distortion)
+    if intrinsics.model == "fisheye":
+        model, many = "equidistant", 4
+    elif len(given) <= 5:
+        model, many = "plumb_bob", 5
+    else:
+        model, many = "rational_polynomial", max(8, len(given))
+    return CameraModel(
+        model,
+        given + [0.0] * (many - len(given)),
+        [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    )
+
+
+def intrinsics_of(info: Any) -> Intrinsics | None:
+    """Return the intrinsics of a ``sensor_msgs/CameraInfo``; None if it has none that make sense."""
+    k = [float(each) for each in info.k]
+    d = tuple(float(each) for each in info.d)
+    if not (all(map(math.isfinite, (*k, *d))) and k[0] > 0.0 and k[4] > 0.0 and len(d) <= 14):
+        return None
+    fisheye = info.distortion_model in ("equidistant", "fisheye")
+    return Intrinsics(k[0], k[4], k[2], k[5], d if any(d) else (), "fisheye" if fisheye else "pinhole")
+
+
+def pixels_of(image: Any) -> tuple[NDArray[np.uint8], Encoding]:
+    """Return the pixels of a ``sensor_msgs/Image``: C-contiguous uint8, without padding, and how they are to be read.
+
+    Raises:
+        DecodeError: Its encoding is none that is known here, or its size does not fit its data.
+    """
+    known = _PIXELS.get(image.encoding)
+    if known is None:
+        raise DecodeError(f"images of encoding {image.encoding!r} are not read, only {', '.join(_PIXELS)}")
+    channels, order, encoding = known
+    height, width, step = int(image.height), int(image.width), int(image.step)
+    data = np.frombuffer(image.data, np.uint8)
+    row = width * channels
+    if not (height > 0 and width > 0 and step >= row and data.size == height * step):
+        raise DecodeError(
+            f"an image of {width}×{height} {image.encoding} with step {step} can't have {data.size} bytes"
+        )
+    rows = data.reshape(height, step)[:, :row]
+    if order is None:
+        shape = (height, width, channels) if channels > 1 else (height, width)
+        return np.ascontiguousarray(rows).reshape(shape), encoding
+    return np.ascontiguousarray(rows.reshape(height, width, channels)[:, :, order]), encoding

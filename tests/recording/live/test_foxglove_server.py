@@ -1,0 +1,353 @@
+"""Foxglove's server, by a viewer of our own that reads its protocol: topics, what is subscribed to, parameters."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from skyloop.client import Drone
+from skyloop.drivers.base import Sink
+from skyloop.errors import LinkError, MissingExtraError, UsageError
+from skyloop.logfile import layout
+from skyloop.logfile.layout import FrameRecord
+from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Polyline
+from skyloop.recording import foxglove as schemas
+from skyloop.recording import taps
+from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.live import parameters as module
+from skyloop.recording.live.parameters import ParameterDesk
+from skyloop.recording.translation import Picture
+from tests.integration.fake_vehicle import PERIOD_S, FakeVehicle
+from tests.integration.test_fabric import Node, far
+from tests.recording.live.conftest import WAIT_S, Fly
+from tests.recording.live.viewer import Viewer
+from tests.recording.streams import film
+
+pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: pip install 'skyloop[foxglove]'")
+
+import itertools
+
+from skyloop.recording.live.foxglove_server import WAITING, FoxgloveServer
+from skyloop.recording.live.view import View
+
+__all__ = ["far"]
+Show = Callable[..., tuple[View, FoxgloveServer]]
+VIDEO, IMAGE, FRAMES = (f"/alpha/{name}" for name in ("camera/front/video", "camera/front/image", "frames/front"))
+
+
+@pytest.fixture
+def show() -> Iterator[Show]:
+    """Serves drones on a free port."""
+    with ExitStack() as stack:
+
+        def one(*drones: Drone, **options: Any) -> tuple[View, FoxgloveServer]:
+            server = FoxgloveServer(drones, port=0, **options)
+            return stack.enter_context(View(drones, server)), server
+
+        yield one
+
+
+def until(done: Callable[[], object], what: str) -> None:
+    end = time.monotonic() + WAIT_S
+    while not done():
+        assert time.monotonic() < end, f"not so after {WAIT_S} s: {what}"
+        time.sleep(0.01)
+
+
+class Encoded(FakeVehicle):
+    """Sends H.264, of which every fifth picture is a key, and nothing else."""
+
+    def capabilities(self) -> Capabilities:
+        able = super().capabilities()
+        return Capabilities(able.vehicle, able.actions, (CameraInfo("front", 64, 48, 25.0, stream="h264"),))
+
+    def _run(self, sink: Sink) -> None:
+        number = 0
+        while not self._ended.wait(PERIOD_S):
+            now_ns = time.monotonic_ns()
+            sink.feedback(Feedback(captured_ns=now_ns, state=self.state))
+            unit = film()[number % len(film())]
+            number += 1
+            sink.stream("front", unit.data, now_ns, width=64, height=48, key=unit.key)
+
+
+# Topics --------------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_looked_at_is_subscribed_to_and_nothing_else(fly: Fly, show: Show) -> None:
+    view, server = show(fly())
+    with Viewer(server.url) as viewer:
+        viewer.until(lambda one: IMAGE in one.topics)
+        assert VIDEO not in viewer.topics  # this vehicle encodes nothing
+        assert {topic.partition("/camera")[0] for topic in viewer.topics} >= {"/tf", "/log", "/alpha", "/alpha/pose"}
+        assert view.subscribed == {}
+        viewer.subscribe("/alpha/pose")
+        viewer.until(lambda one: one.of("/alpha/pose"))
+        assert view.subscribed == {"alpha": ["feedback"]}
+        viewer.subscribe(IMAGE)
+        viewer.until(lambda one: one.of(IMAGE))
+        assert view.subscribed == {"alpha": ["feedback", "video.front"]}
+        viewer.unsubscribe("/alpha/pose")
+        until(lambda: view.subscribed == {"alpha": ["video.front"]}, "the feedback is let go")
+    until(lambda: view.subscribed == {}, "all is let go with the viewer")
+
+
+def test_messages_are_those_of_a_recording(fly: Fly, show: Show) -> None:
+    drone = fly()
+    _, server = show(drone)
+    own, calibration = "/alpha/feedback", "/alpha/camera/front/calibration"
+    with Viewer(server.url) as viewer:
+        viewer.subscribe(own, IMAGE, calibration, "/tf", "/log", "/alpha/logs", "/alpha/camera/front/annotations")
+        viewer.until(lambda one: all(one.of(topic) for topic in (own, IMAGE, calibration, "/tf")))
+        drone.log.text("found it")
+        drone.annotate(drone.next_frame(timeout_s=WAIT_S), [Polyline(((1.0, 1.0), (5.0, 5.0)))])
+        viewer.until(lambda one: one.of("/log") and one.of("/alpha/logs") and one.of("/alpha/camera/front/annotations"))
+        assert (viewer.topics[own]["encoding"], viewer.topics[own]["schemaName"]) == ("json", "skyloop.Feedback")
+        assert viewer.topics[IMAGE]["schemaName"] == "foxglove.CompressedImage"
+        sample = layout.decode(viewer.of(own)[0], Feedback)
+        assert sample.position_m is not None
+        data, form = schemas.read_image(viewer.of(IMAGE)[0])
+        assert (form, data[:2]) == ("jpeg", b"\xff\xd8")
+        assert schemas.CameraCalibration.FromString(viewer.of(calibration)[0]).K[0] == 30.0
+        assert schemas.Log.FromString(viewer.of("/log")[0]).message == "found it"
+        times = [log_ns for topic, log_ns, _ in viewer.messages if topic == own]
+        assert times == sorted(times)
+        assert abs(times[-1] - time.time_ns()) < 60e9
+
+
+def test_who_subscribes_later_is_sent_what_was_known_before(fly: Fly, show: Show) -> None:
+    _, server = show(fly())
+    known = "/alpha/parameters"
+    with Viewer(server.url) as first, Viewer(server.url) as second:
+        first.subscribe(known)
+        first.until(lambda one: len(one.of(known)) > 10)
+        second.subscribe(known)
+        second.until(lambda one: len(one.of(known)) > 10, "the parameters, once more")
+
+
+def test_two_drones_on_one_server(fly: Fly, show: Show) -> None:
+    view, server = show(fly("alpha"), fly("beta"))
+    with Viewer(server.url) as viewer:
+        viewer.subscribe("/tf")
+        viewer.until(lambda one: len(one.of("/tf")) > 10)
+        found = {schemas.FrameTransform.FromString(data).child_frame_id for data in viewer.of("/tf")}
+        assert found == {"alpha", "beta"}
+        assert view.subscribed == {"alpha": ["feedback"], "beta": ["feedback"]}
+
+
+def test_two_drones_of_the_same_name_are_refused(fly: Fly, show: Show) -> None:
+    drone = fly()
+    with pytest.raises(UsageError, match="different names, not alpha, alpha"):
+        show(drone, drone)
+
+
+def test_h264_begins_with_a_key_picture_each_time(fly: Fly, show: Show) -> None:
+    _, server = show(fly(vehicle=Encoded()))
+    keys = {unit.data for unit in film() if unit.key}
+    with Viewer(server.url) as viewer:
+        for _ in range(2):
+            viewer.messages.clear()
+            viewer.subscribe(VIDEO, FRAMES)
+            viewer.until(lambda one: len(one.of(VIDEO)) > 6)
+            pictures = [schemas.CompressedVideo.FromString(data) for data in viewer.of(VIDEO)]
+            assert pictures[0].data in keys
+            assert {(one.format, one.frame_id) for one in pictures} == {("h264", "alpha/front")}
+            units = [unit.data for unit in film()]
+            order = [units.index(one.data) for one in pictures]
+            assert all(after == (before + 1) % len(units) for before, after in itertools.pairwise(order))
+            viewer.unsubscribe(VIDEO)
+            viewer.unsubscribe(FRAMES)
+
+
+def test_frames_in_another_form_than_expected_get_a_topic(fly: Fly, show: Show) -> None:
+    _, server = show(fly(vehicle=Encoded()))
+    with Viewer(server.url) as viewer:
+        viewer.until(lambda one: VIDEO in one.topics)
+        assert IMAGE not in viewer.topics
+        server.show(frame_item(1, b"\xff\xd8"))
+        viewer.until(lambda one: IMAGE in one.topics)
+
+
+def test_from_a_network_frames_come_as_h264_and_in_their_own_form_where_that_can_not_be_had(
+    far: Node, show: Show, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("av", reason="H.264 needs the extra 'video'")
+    with far.connected(access="observe") as drone:
+        video, image = (f"/{drone.name}/camera/front/{kind}" for kind in ("video", "image"))
+        _, server = show(drone)
+        with Viewer(server.url) as viewer:
+            viewer.subscribe(video)
+            viewer.until(lambda one: len(one.of(video)) > 5)
+            assert image not in viewer.topics
+            first = schemas.CompressedVideo.FromString(viewer.of(video)[0]).data
+            assert first.split(b"\x00\x00\x01")[1][0] & 31 == 7  # a key picture, with its parameters
+            viewer.unsubscribe(video)
+            # A proxy that can't encode sends nothing: JPEG is shown instead.
+            monkeypatch.setattr(taps, "_STREAM_GONE_NS", 1)
+            monkeypatch.setattr(drone._core.stream("front", subscriber="x").__class__, "receive", lambda *_: None)
+            viewer.subscribe(video)
+            viewer.until(lambda one: image in one.topics)
+
+
+# Slow viewers --------------------------------------------------------------------------------------------------------
+
+
+def frame_item(seq: int, data: bytes) -> Item:
+    header = FrameHeader("front", seq, 1, 2, 32, 24, Encoding.BGR8, 32 * 24 * 3)
+    record = FrameRecord(header, 3, "jpeg")
+    return Item(0, "video.front", Rank.FRAME, time.monotonic_ns(), Picture(record, data), len(data))
+
+
+def test_a_viewer_that_stands_still_loses_messages_and_nobody_else_does(fly: Fly, show: Show) -> None:
+    drone = fly()
+    _, server = show(drone)
+    count, size = 2 * WAITING, 50_000  # more than the server keeps and the sockets hold
+    with Viewer(server.url) as stalled, Viewer(server.url) as healthy:
+        for viewer in (stalled, healthy):
+            viewer.subscribe(FRAMES, IMAGE)
+        until(lambda: server.viewers == {FRAMES: 2, IMAGE: 2}, "both have subscribed")
+        stalled.until(lambda one: one.of(FRAMES))
+        sent = range(10_000, 10_000 + count)
+        for seq in sent:  # what the view's thread does; it must not wait for the viewer
+            server.show(frame_item(seq, bytes(size)))
+            if seq % 50 == 0 or seq == sent[-1]:
+                healthy.until(lambda one, seq=seq: newest(one) >= seq)  # type: ignore[misc]
+        assert set(sent) <= sequences(healthy)
+        drone.takeoff()  # the pilot is unharmed
+        stalled.until(lambda one: newest(one) >= sent[-1], "the newest, once it reads again")
+        lost = set(sent) - sequences(stalled)
+        assert lost
+        assert max(lost) < sent[-WAITING // 8]  # the oldest ones were dropped, not the newest
+
+
+def newest(viewer: Viewer) -> int:
+    frames = next((data for topic, _, data in reversed(viewer.messages) if topic == FRAMES), None)
+    return 0 if frames is None else layout.decode(frames, FrameRecord).header.seq
+
+
+def sequences(viewer: Viewer) -> set[int]:
+    return {layout.decode(data, FrameRecord).header.seq for data in viewer.of(FRAMES)}
+
+
+# Parameters ----------------------------------------------------------------------------------------------------------
+
+
+def test_parameters_are_read_and_followed(fly: Fly, show: Show) -> None:
+    drone = fly()
+    _, server = show(drone)
+    tilt = "alpha/limits.tilt"
+    with Viewer(server.url) as viewer:
+        every = {each["name"]: each.get("value") for each in viewer.get_parameters()}
+        assert every[tilt] == drone.config["limits.tilt"]
+        assert len(every) == len(drone.config)
+        assert [each["name"] for each in viewer.get_parameters([tilt])] == [tilt]
+        viewer.follow_parameters([tilt])
+        drone.config["limits.tilt"] = 0.2
+        viewer.until(lambda one: one.parameters.get(tilt) == 0.2, "the new value")
+
+
+def test_a_view_that_only_looks_on_writes_nothing_and_says_why(fly: Fly, show: Show) -> None:
+    drone = fly()
+    _, server = show(drone)
+    before = drone.config["limits.tilt"]
+    with Viewer(server.url) as viewer:
+        (answer,) = viewer.set_parameter("alpha/limits.tilt", 0.2)
+        assert answer["value"] == before == drone.config["limits.tilt"]
+        viewer.until(lambda one: one.status)
+        assert viewer.status == [
+            "alpha/limits.tilt was not written: this view only looks on: start it with --write to write parameters"
+        ]
+
+
+@pytest.fixture
+def lent(monkeypatch: pytest.MonkeyPatch, fly: Fly) -> Drone:
+    """A drone whose desk writes through the pilot's own connection: its proxy has no name outside of this process."""
+
+    class Lent:
+        def __init__(self, drone: Drone) -> None:
+            self.config = drone.config
+
+        def __enter__(self) -> Lent:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+    drone = fly()
+    monkeypatch.setattr(module, "connect", lambda target, **options: Lent(drone))
+    return drone
+
+
+def test_parameters_are_written_where_that_was_asked_for(lent: Drone, show: Show) -> None:
+    _, server = show(lent, priority=31)
+    with Viewer(server.url) as viewer:
+        (answer,) = viewer.set_parameter("alpha/limits.tilt", 0.2)
+        assert answer["value"] == lent.config["limits.tilt"] == 0.2
+        (answer,) = viewer.set_parameter("alpha/limits.tilt", 1000)
+        assert answer["value"] == lent.config["limits.tilt"] == 0.2
+        viewer.until(lambda one: one.status)
+        assert "alpha/limits.tilt was not written: limits.tilt" in viewer.status[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "why"),
+    [
+        ("alpha/limits.tlit", 0.2, "did you mean 'limits.tilt'"),
+        ("beta/limits.tilt", 0.2, "no drone in this view named 'beta'"),
+        ("alpha/limits.tilt", "much", "limits.tilt"),
+    ],
+)
+def test_what_can_not_be_written_is_refused_with_the_reason(lent: Drone, name: str, value: object, why: str) -> None:
+    written = ParameterDesk([lent], 31).write(name, value)
+    assert why in written.refused
+    assert written.value == (lent.config["limits.tilt"] if name == "alpha/limits.tilt" else None)
+
+
+def test_whole_numbers_are_written_as_the_parameter_s_type(lent: Drone) -> None:
+    desk = ParameterDesk([lent], 31)
+    whole = [each for each in lent.config.parameters() if each.type.value == "float" and not each.read_only]
+    taken = next(each for each in whole if (each.minimum or 0) <= 1 <= (each.maximum or 1))
+    assert desk.write(f"alpha/{taken.name}", 1).value == 1.0
+    assert isinstance(lent.config[taken.name], float)
+
+
+# Refusals ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_port_that_is_taken(fly: Fly) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(LinkError, match=rf"can't listen on 127\.0\.0\.1:{port}: .*choose another --port"):
+            FoxgloveServer([fly()], port=port)
+
+
+def test_nobody_writes_from_beyond_this_machine(fly: Fly) -> None:
+    with pytest.raises(UsageError, match="no passwords"):
+        FoxgloveServer([fly()], host="0.0.0.0", port=0, priority=31)
+
+
+def test_without_the_sdk_the_error_says_what_to_install(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'skyloop\[foxglove\]'"):
+        FoxgloveServer([fly()], port=0)
+
+
+def test_a_sample_that_can_not_be_shown_is_counted_and_the_view_goes_on(fly: Fly) -> None:
+    class Broken:
+        def wanted(self) -> frozenset[tuple[int, str]]:
+            return frozenset({(0, "feedback")})
+
+        def show(self, item: Item) -> None:
+            raise ValueError(item.channel)
+
+        def close(self) -> None: ...
+
+    with View([fly()], Broken()) as view:
+        until(lambda: view.failed > 2, "it goes on")
+        assert view.failed_why == "feedback: ValueError('feedback')"
+        assert view.dropped == 0

@@ -1,0 +1,177 @@
+"""Numbers of ROS 2's messages, without rclpy: messages are any objects with their fields."""
+
+from __future__ import annotations
+
+import math
+import struct
+from array import array
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.errors import DecodeError
+from skyloop.messages import Encoding, Intrinsics
+from skyloop.messages.geometry import quaternion_from_euler, rotation_from_euler
+from skyloop.wire.ros2.conversions import (
+    NOT_KNOWN,
+    ClockMap,
+    body_velocity,
+    camera_model,
+    covariance,
+    euler_of,
+    intrinsics_of,
+    levelled_velocity,
+    nanoseconds_of,
+    pixels_of,
+    quaternion_of,
+    rotation_of,
+    stamp_of,
+)
+from skyloop.wire.ros2.tf_message import Transform, encode_transforms
+
+ANGLE = st.floats(-math.pi, math.pi)
+TILT = st.floats(-1.5, 1.5)
+SPEED = st.floats(-20, 20)
+MS = 1_000_000
+
+
+@given(st.integers(0, 2**62))
+def test_stamps_go_both_ways(ns: int) -> None:
+    sec, nanosec = stamp_of(ns)
+    assert 0 <= nanosec < 10**9
+    assert nanoseconds_of(SimpleNamespace(sec=sec, nanosec=nanosec)) == ns
+
+
+@given(TILT, TILT, ANGLE)
+def test_quaternions_are_the_rotation_of_the_angles(roll: float, pitch: float, yaw: float) -> None:
+    turn = rotation_from_euler(roll, pitch, yaw)
+    of_angles = quaternion_from_euler(roll, pitch, yaw)
+    of_matrix = quaternion_of(tuple(turn.ravel()))
+    assert math.hypot(*of_matrix) == pytest.approx(1.0)
+    for quaternion in (of_angles, of_matrix):
+        rotation = rotation_of(quaternion)
+        assert rotation is not None
+        assert rotation == pytest.approx(turn, abs=1e-9)
+    angles = euler_of(of_matrix)
+    assert angles is not None
+    assert angles == pytest.approx((roll, pitch, yaw), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "rows", [(1, 0, 0, 0, -1, 0, 0, 0, -1), (-1, 0, 0, 0, 1, 0, 0, 0, -1), (-1, 0, 0, 0, -1, 0, 0, 0, 1)]
+)
+def test_half_turns_are_rotations_too(rows: tuple[float, ...]) -> None:
+    rotation = rotation_of(quaternion_of(rows))
+    assert rotation is not None
+    assert rotation.ravel() == pytest.approx(rows)
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 1.0)])
+def test_what_is_no_quaternion_gives_no_angles(quaternion: tuple[float, float, float, float]) -> None:
+    assert euler_of(quaternion) is None
+
+
+@given(st.tuples(SPEED, SPEED, SPEED), TILT, TILT)
+def test_velocities_go_both_ways(velocity: tuple[float, float, float], roll: float, pitch: float) -> None:
+    body = body_velocity(velocity, roll, pitch)
+    assert math.hypot(*body) == pytest.approx(math.hypot(*velocity), abs=1e-9)
+    assert levelled_velocity(body, roll, pitch) == pytest.approx(velocity, abs=1e-9)
+
+
+def test_a_body_with_its_nose_down_flies_up_in_its_own_axes_when_it_flies_level() -> None:
+    forward, _, up = body_velocity((1.0, 0.0, 0.0), 0.0, math.radians(30.0))
+    assert forward == pytest.approx(math.cos(math.radians(30.0)))
+    assert up == pytest.approx(math.sin(math.radians(30.0)))
+
+
+def test_what_is_not_known_is_a_covariance_of_minus_one() -> None:
+    assert covariance(3, known=False) == [NOT_KNOWN, *[0.0] * 8]
+    assert covariance(2, variance=4.0) == [4.0, 0.0, 0.0, 4.0]
+
+
+def test_stamps_keep_their_distance_while_the_clocks_do() -> None:
+    clocks = ClockMap()
+    assert clocks.to_ros(5, 10, 0) is None  # ROS time is not known yet
+    assert clocks.to_ros(1000 * MS, 1010 * MS, 5010 * MS) == 5000 * MS
+    assert clocks.to_ros(1030 * MS, 1040 * MS, 5040 * MS + 300_000) == 5030 * MS  # 0.3 ms off: the same difference
+    assert clocks.to_ros(1060 * MS, 1070 * MS, 9070 * MS) == 9060 * MS  # the system's clock was set
+    assert clocks.to_ros(0, 9000 * MS, 1 * MS) is None  # before the beginning of a simulation
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "model", "many"),
+    [
+        (Intrinsics(300.0, 301.0, 159.5, 119.5), "plumb_bob", 5),
+        (Intrinsics(300.0, 301.0, 159.5, 119.5, (0.1, -0.2, 0.0, 0.001)), "plumb_bob", 5),
+        (Intrinsics(300.0, 301.0, 159.5, 119.5, (0.1,) * 8), "rational_polynomial", 8),
+        (Intrinsics(300.0, 301.0, 159.5, 119.5, (0.1, 0.2, 0.3, 0.4), "fisheye"), "equidistant", 4),
+    ],
+)
+def test_intrinsics_go_both_ways(intrinsics: Intrinsics, model: str, many: int) -> None:
+    told = camera_model(intrinsics)
+    assert (told.model, len(told.d)) == (model, many)
+    assert told.p[0] == told.k[0] == 300.0
+    back = intrinsics_of(SimpleNamespace(distortion_model=told.model, d=told.d, k=told.k))
+    assert back is not None
+    assert back.matrix == pytest.approx(intrinsics.matrix)
+    assert back.model == intrinsics.model
+    assert back.distortion[: len(intrinsics.distortion)] == intrinsics.distortion
+
+
+def test_a_camera_without_intrinsics_is_told_as_uncalibrated() -> None:
+    told = camera_model(None)
+    assert (told.model, told.d, told.k[0]) == ("", [], 0.0)
+    assert intrinsics_of(SimpleNamespace(distortion_model="", d=[], k=told.k)) is None
+
+
+def image(encoding: str, channels: int, padding: int = 0) -> SimpleNamespace:
+    height, width = 2, 3
+    rows = [bytes(range(10 * y, 10 * y + width * channels)) + b"\xff" * padding for y in range(height)]
+    data = array("B", b"".join(rows))
+    return SimpleNamespace(encoding=encoding, height=height, width=width, step=width * channels + padding, data=data)
+
+
+def test_pixels_lose_their_padding() -> None:
+    pixels, encoding = pixels_of(image("rgb8", 3, padding=5))
+    assert encoding is Encoding.RGB8
+    assert pixels.shape == (2, 3, 3)
+    assert pixels.flags.c_contiguous
+    assert pixels[1, 0].tolist() == [10, 11, 12]
+    grey, encoding = pixels_of(image("mono8", 1))
+    assert (grey.shape, encoding) == ((2, 3), Encoding.MONO8)
+
+
+def test_pixels_with_transparency_become_blue_green_red() -> None:
+    pixels, encoding = pixels_of(image("rgba8", 4))
+    assert encoding is Encoding.BGR8
+    assert pixels[0, 1].tolist() == [6, 5, 4]
+    assert pixels_of(image("bgra8", 4))[0][0, 1].tolist() == [4, 5, 6]
+
+
+def test_other_pixels_are_refused() -> None:
+    with pytest.raises(DecodeError, match="encoding 'mono16' are not read, only bgr8"):
+        pixels_of(image("mono16", 2))
+    short = image("bgr8", 3)
+    short.height = 3
+    with pytest.raises(DecodeError, match="can't have 18 bytes"):
+        pixels_of(short)
+
+
+def test_transforms_as_the_bytes_of_their_type() -> None:
+    """As rclpy 9.1.2 wrote and read them; what rosbags reads is tested in tests/third_party/test_ros2.py."""
+    packed = encode_transforms([Transform(5 * 10**9 + 6, "odom", "base_link", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))])
+    head = b"\x00\x01\x00\x00" + struct.pack("<IiI", 1, 5, 6)
+    texts = struct.pack("<I", 5) + b"odom\0\0\0\0" + struct.pack("<I", 10) + b"base_link\0" + b"\0\0" * 1
+    assert packed[: len(head)] == head
+    assert packed[len(head) : len(head) + len(texts)] == texts
+    assert packed[-56:] == struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)
+    assert (len(packed) - 4 - 56) % 8 == 0  # numbers of eight bytes are aligned
+
+
+@given(st.lists(st.text(min_size=0, max_size=9), min_size=1, max_size=4))
+def test_each_transform_begins_aligned(names: list[str]) -> None:
+    packed = encode_transforms([Transform(0, name, name, (0.0,) * 3, (0.0, 0.0, 0.0, 1.0)) for name in names])
+    assert struct.unpack_from("<I", packed, 4) == (len(names),)
+    assert len(packed) % 4 == 0
