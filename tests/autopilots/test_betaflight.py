@@ -72,6 +72,7 @@ def test_silence_is_an_event(rig: Rig) -> None:
 
 def test_its_death_stops_the_rotors_and_it_is_started_again_as_it_is(rig: Rig) -> None:
     rig.answered()
+    rig.event(FirmwareEventKind.STARTED)
     os.kill(rig.firmware.program.pid, signal.SIGKILL)
     rig.until(lambda commands: commands == STOPPED, "the rotors' stop")
     assert "was killed by SIGKILL" in rig.event(FirmwareEventKind.DIED)

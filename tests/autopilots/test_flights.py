@@ -1,44 +1,35 @@
-"""Real ArduCopter, PX4 and Betaflight fly in the simulator, where their programs are.
+"""Real ArduCopter and PX4 fly in the simulator, where their programs are; Betaflight has tests of its own.
 
-``SKYLOOP_ARDUCOPTER``, ``SKYLOOP_PX4`` and ``SKYLOOP_BETAFLIGHT`` are the paths of the programs; ``docs/autopilots.md``
-says where they come from. A flight takes two minutes, at the pace of the clock.
+``SKYLOOP_ARDUCOPTER`` and ``SKYLOOP_PX4`` are the paths of the programs; ``docs/autopilots.md`` says where they come
+from. A flight takes two minutes, at the pace of the clock.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 import skyloop
 from benchmarks.autopilots import address, compared, fly_square, follow, take_off, wait_ready
-from skyloop.autopilots import ardupilot, betaflight, px4
-from skyloop.errors import UsageError
+from skyloop.autopilots import ardupilot, px4
 from skyloop.messages import FlightState
 
 pytestmark = [pytest.mark.process, pytest.mark.slow, pytest.mark.timeout(400)]
 
-VARIABLES = {"ardupilot": ardupilot.VARIABLE, "betaflight": betaflight.VARIABLE, "px4": px4.VARIABLE}
+VARIABLES = {"ardupilot": ardupilot.VARIABLE, "px4": px4.VARIABLE}
 MOST_RMS_DEG = 2.0
 MOST_RMS_M = 0.5
 IN_VIEW = 0.9
-
-
-def has_program(kind: str) -> bool:
-    if kind == "betaflight":  # the package brings its own
-        with suppress(UsageError):
-            return bool(betaflight.program_path())
-    return bool(os.environ.get(VARIABLES[kind]))
 
 
 @pytest.fixture(params=sorted(VARIABLES))
 def drone(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[skyloop.Drone]:
     """One in the demo's room, in the air."""
     kind = request.param
-    if not has_program(kind):
+    if not os.environ.get(VARIABLES[kind]):
         pytest.skip(f"{kind}'s program is not here: {VARIABLES[kind]} must be its path (docs/autopilots.md)")
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path))
     tmp_path.chmod(0o700)

@@ -52,6 +52,20 @@ def gone(pid: int) -> bool:
     return False
 
 
+def test_one_that_was_started_in_vain_is_started_again() -> None:
+    starts = [0]
+
+    def verify() -> None:
+        starts[0] += 1
+        if starts[0] == 1:
+            raise ConnectionError("it does not listen")
+
+    with Watched(SLEEPS, verify=verify) as watched:
+        assert "it does not listen" in watched.next(FirmwareEventKind.FAILED)
+        watched.next(FirmwareEventKind.STARTED)
+    assert starts == [2]
+
+
 def test_it_runs_until_it_is_closed_and_leaves_nothing_behind() -> None:
     with Watched(SLEEPS) as watched:
         text = watched.next(FirmwareEventKind.STARTED)

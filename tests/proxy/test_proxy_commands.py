@@ -353,7 +353,8 @@ def test_a_vehicle_refuses_what_the_software_autopilot_would_begin() -> None:
         bench.driver.answers = False  # it goes on to stand
         bench.driver.refuses = "it can't be armed: THROTTLE"
         pilot.command(Takeoff())
-        assert "takeoff: it can't be armed: THROTTLE" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
+        assert pilot.refusals() == [Refusal.WRONG_STATE]  # waiting would not help
+        assert "it can't be armed: THROTTLE" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
         bench.driver.refuses = ""
         pilot.command(Takeoff())
         bench.run(0.1)

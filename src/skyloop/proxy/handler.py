@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from skyloop.clock import Clock, nanoseconds, seconds
+from skyloop.errors import RefusedError
 from skyloop.messages import (
     AnswerTakeover,
     AnyAction,
@@ -292,6 +293,8 @@ class CommandHandler:
                 self._report_limits(session, decision, now_ns)
             try:
                 applied = self._executor.execute(decision.action, now_ns, new=decision.new)
+            except RefusedError as error:
+                return self._refuse(session, command, Refusal.WRONG_STATE, str(error)), now_ns
             except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
                 if kind is Takeoff and ownership.ours:
                     ownership.claim(now_ns)  # it may be trying

@@ -239,7 +239,8 @@ class _RealTimeStepper:
     def __init__(self, host: SimHost) -> None:
         self._host = host
         self._simulation = host.simulation
-        self._pacer = Pacer(self._simulation.step, speed=host.options.speed)
+        options = host.options
+        self._pacer = Pacer(self._simulation.step, speed=options.speed, most_lag_s=options.most_lag_s)
         self._begun_s = self._simulation.time_s
         self._publisher = ReportPublisher(host, self._start_pipeline)
         self._stop = threading.Event()

@@ -7,6 +7,7 @@ from typing import Final
 
 from skyloop.messages import ACTION_NAMES
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
+from skyloop.sim.pacing import MOST_LAG_S
 from skyloop.sim.parameters import VehicleParameters, with_scaled_flaws
 from skyloop.sim.world import Wind, World
 from skyloop.sim.world_file import load_world
@@ -35,6 +36,7 @@ class SimOptions:
         velocity: Whether the drone reports its velocity; it flies by it all the same.
         truth: Whether the drone reports its true state too.
         rate_hz: Of the reports.
+        most_lag_s: How far the world may be behind the clock before it gives the rest up [s].
         parameters: Of the vehicles.
         autopilot: The real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``.
         autopilot_folder: Where the firmware keeps its settings; None: they last as long as the drone.
@@ -54,6 +56,7 @@ class SimOptions:
     velocity: bool = True
     truth: bool = True
     rate_hz: float = 40.0
+    most_lag_s: float = MOST_LAG_S
     parameters: VehicleParameters = STANDARD_VEHICLE
     autopilot: str | None = None
     autopilot_folder: str | None = None

@@ -16,14 +16,21 @@ _LONGEST_RUN_STEPS = 25
 class Pacer:
     """Runs the steps that are due, by absolute deadlines: step k is due at start + k · STEP_S / speed.
 
-    Small delays are caught up. Beyond :data:`MOST_LAG_S` of the clock, the rest is given up, counted in ``lost_s``, and
-    the deadlines move. Not thread-safe: one thread owns it::
+    Small delays are caught up. Beyond ``most_lag_s`` of the clock, the rest is given up, counted in ``lost_s``, and the
+    deadlines move. Not thread-safe: one thread owns it::
 
         while not stop.wait(pacer.run_due()):
             publish()
     """
 
-    def __init__(self, step: Callable[[int], None], *, speed: float = 1.0, clock: Clock = monotonic_ns) -> None:
+    def __init__(
+        self,
+        step: Callable[[int], None],
+        *,
+        speed: float = 1.0,
+        most_lag_s: float = MOST_LAG_S,
+        clock: Clock = monotonic_ns,
+    ) -> None:
         """``step(n)`` does n steps. ``speed`` is how many seconds of simulation a second of the clock is worth."""
         if not (math.isfinite(speed) and 0 < speed <= 1000):
             raise UsageError(f"speed must be greater than 0 and at most 1000, not {speed!r}")
@@ -31,6 +38,7 @@ class Pacer:
         self._clock = clock
         self._ns_per_step = STEP_S / speed * NS_PER_S
         self._speed = speed
+        self._most_lag_ns = most_lag_s * NS_PER_S
         self._start_ns = clock()
         self._done = 0
         self.lost_s = 0.0  # of the clock, given up so far
@@ -44,7 +52,7 @@ class Pacer:
         behind = self._clock() - self._due_ns(self._done + 1)
         if behind < 0:
             return -behind / NS_PER_S
-        excess = behind - MOST_LAG_S * NS_PER_S
+        excess = behind - self._most_lag_ns
         if excess > 0:
             self._start_ns += round(excess)
             self.lost_s += excess / NS_PER_S

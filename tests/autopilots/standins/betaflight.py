@@ -11,6 +11,10 @@ import time
 from pathlib import Path
 
 from skyloop.wire.betaflight_sitl import decode_state, encode_motors
+from skyloop.wire.msp.frames import Direction, Frame, encode
+from skyloop.wire.msp.messages import Function
+
+API_VERSION = encode(Frame(Function.API_VERSION))
 
 assert sys.argv[1] == "127.0.0.1"
 motors_port, state_port, msp_port = map(int, os.environ["STANDIN_PORTS"].split(","))
@@ -25,6 +29,8 @@ def command_line() -> None:
             text += data
             if data == b"#":
                 link.sendall(b"Entering CLI Mode\r\n\r\n# ")
+            elif data == API_VERSION:
+                link.sendall(encode(Frame(Function.API_VERSION, b"\0\1\57", Direction.REPLY)))
             elif data == b"save\r\n":
                 Path("eeprom.bin").write_bytes(text)
                 os._exit(0)

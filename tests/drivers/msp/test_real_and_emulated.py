@@ -22,8 +22,9 @@ from skyloop.messages import Attitude, FlightState, LinkState
 from skyloop.wire.msp.frames import Frame, Parser, encode
 from skyloop.wire.msp.messages import Function, Status, channels, pack_channels
 from skyloop.wire.msp.names import flag_names
+from tests.autopilots.real_betaflight import real_betaflight
 from tests.drivers.msp.rig import world
-from tests.drivers.msp.sitl import MSP_PORT, Sitl, why_not
+from tests.drivers.msp.sitl import MSP_PORT, Sitl
 
 PATIENCE_S: Final = 20.0
 
@@ -52,10 +53,7 @@ def vehicle(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Vehicle]
 
             yield Vehicle("127.0.0.1", firmware.port, set_flag)
         return
-    reason = why_not()
-    if reason:
-        pytest.skip(reason)
-    with Sitl(tmp_path) as sitl:
+    with real_betaflight(), Sitl(tmp_path) as sitl:
 
         def roll(on: bool) -> None:
             sitl.roll_rad = math.radians(60.0) if on else 0.0

@@ -135,7 +135,7 @@ def test_what_appears_while_it_arms_is_told_by_name() -> None:
     bench = Bench(BoardSettings(boot_s=30.0))
     bench.run(2.0)
     bench.fly(climb=0.5)  # waits for what passes by itself
-    bench.until(lambda: bool(bench.texts("arming_refused")), 5.0)
+    bench.until(lambda: bool(bench.texts("arming_refused")), 10.0)
     assert "BOOTGRACE" in bench.texts("arming_refused")[0]
     assert not bench.board.armed
     with pytest.raises(DriverError, match="BOOTGRACE"):

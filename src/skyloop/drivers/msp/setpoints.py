@@ -27,13 +27,23 @@ OFF_US: Final = 1000
 SPOOL_PER_S: Final = 0.15  #: how fast a take-off raises the throttle
 SPOOL_FROM: Final = 0.6  #: of the throttle that carries it, where it is known
 IDLE: Final = 0.05  #: where it is not
-ARM_NS: Final = nanoseconds(3.0)  #: an arming that has not shown by then failed
+ARM_NS: Final = nanoseconds(6.0)  #: an arming that has not shown by then failed; Betaflight's BOOTGRACE is 5 s
 NAMED_NS: Final = nanoseconds(0.4)  #: so long must a hindrance last while it arms
 REFUSED_NS: Final = nanoseconds(1.0)  #: after a refusal the arm switch stays off for so long
 ABORT_NS: Final = nanoseconds(1.0)  #: so long a take-off may be interrupted before it ends
-#: What passes by itself, soon after the connection: an arming waits for it with the arm switch off.
+#: What passes by itself, soon after the connection or a landing: an arming waits for it with the arm switch off.
 PASSING: Final = frozenset(
-    {"RXLOSS", "FAILSAFE", "NOT_DISARMED", "CALIB", "BOOTGRACE", "RC_LINK", "SENSORS_CALIBRATING", ARM_SWITCH}
+    {
+        "RXLOSS",
+        "FAILSAFE",
+        "NOT_DISARMED",
+        "CALIB",
+        "BOOTGRACE",
+        "THROTTLE",
+        "RC_LINK",
+        "SENSORS_CALIBRATING",
+        ARM_SWITCH,
+    }
 )
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] that shows it, precise or not
 LATE_S: Final = 0.15  #: so long after the throttle carried it a lift-off shows

@@ -28,6 +28,7 @@ from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FPV_CAMERA, FRONT_CAMERA, CameraModel
 from skyloop.sim.options import EVERY_ACTION, SimOptions
+from skyloop.sim.pacing import MOST_LAG_S
 from skyloop.sim.vehicles import VEHICLES
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA, FPV_CAMERA)}
@@ -44,6 +45,8 @@ AUTOPILOT_VEHICLES: Final = {
     AutopilotKind.BETAFLIGHT: "racer",
     AutopilotKind.PX4: "iris",
 }
+#: What keeps the computer's time never catches up: the world's time would stay behind, and what is seen would look old.
+REAL_TIME_LAG_S: Final = 0.02
 TRUTH_HZ: Final = 100.0  #: how often the truth is noted that is reported beside the firmware's state
 
 
@@ -90,6 +93,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
         velocity=options.get("velocity") != "none" and uri.flag("velocity", default=True),
         truth=uri.flag("truth", default=True),
         rate_hz=TRUTH_HZ if autopilot is not None else uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
+        most_lag_s=REAL_TIME_LAG_S if autopilot is AutopilotKind.BETAFLIGHT else MOST_LAG_S,
         parameters=VEHICLES[vehicle],
         autopilot=None if autopilot is None else autopilot.value,
         autopilot_folder=options.get("autopilot_folder"),
