@@ -91,8 +91,11 @@ def test_it_follows_the_marker_and_is_safe_without_link_pilot_or_firmware(
             _is_refused_by_name(drone)
             _comes_back_after_its_death(drone, tmp_path)
             with compared(observer) as agreement:
-                take_off(drone)
-                score = follow(drone, 30.0).score
+                for _ in range(3):  # once more where the pilot's process was held up until the drone landed by itself
+                    take_off(drone)
+                    score = follow(drone, 30.0).score
+                    if score.frames:
+                        break
                 assert (score.share_in_view or 0.0) >= IN_VIEW, score
                 _survives_a_cut(drone)
                 flight.close()  # another flies on
