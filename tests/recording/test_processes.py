@@ -81,8 +81,8 @@ def test_a_flight_is_recorded_and_the_file_is_complete(tmp_path: Path) -> None:
         name = drone.name
         assert pid(recorder) != os.getpid()
         drone.takeoff(wait=False)
-        drone.log.number("error", 0.5)
         drone.wait(lambda _: count(path, f"/{name}/frames/front") > 5)
+        drone.log.number("error", 0.5)
         drone.wait(lambda _: count(path, f"/{name}/logs") > 0)
         taken_off_ns = time.monotonic_ns()
     assert recorder.state.value == "closed"

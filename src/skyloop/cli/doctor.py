@@ -31,6 +31,8 @@ EXTRAS: Final = (
     ("video", "recorded video, H.264", ("av",)),
     ("control", "poses and splines", ("scipy",)),
     ("mavlink", "ArduCopter and PX4", ("pymavlink", "serial")),
+    ("msp", "Betaflight and INAV over a serial port", ("serial",)),
+    ("ros", "ROS 2", ("rclpy", "cv2")),
     ("cockpit", "page in the browser", ("starlette", "uvicorn", "websockets", "cv2")),
     ("record", "recordings", ("mcap", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
     ("foxglove", "drones live in Foxglove", ("foxglove", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
