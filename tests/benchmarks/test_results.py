@@ -83,7 +83,7 @@ def test_the_targets_of_the_load(made_up: Delays) -> None:
     assert list(rows[1]) == ["8 observers", "320×240, 15/s", "110 (164)", "70 (104)", "150 (224)", "200 (298)"]
     assert rows[0][-1] == ""
     assert list(rows[-1]) == ["zeppelin", "left out: it is foggy", "", "", "", ""]
-    assert list(load_tables.cpu_table(results).rows[0]) == [ALONE, "320×240, 15/s", "1.0", "2.0", *"––––"]
+    assert list(load_tables.cpu_table(results).rows[0]) == [ALONE, "320×240, 15/s", "1.0", "2.0", *"–––––"]
 
 
 def test_the_cases_of_the_load() -> None:
