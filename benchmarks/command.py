@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from benchmarks.one_command import one_command
 from skyloop.bench.tables import verdict_table
 from skyloop.cli.app import run
 from skyloop.cli.bench import (
@@ -295,14 +296,7 @@ BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
 
 def build(name: str) -> typer.Typer:
     """Return the command line of one benchmark."""
-    app = typer.Typer(
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )
-    app.command(name)(BENCHMARKS[name])
-    return app
+    return one_command(BENCHMARKS[name])
 
 
 def main(name: str) -> None:

@@ -17,6 +17,7 @@ from typing import Annotated, Final, NamedTuple
 
 import typer
 
+from benchmarks.one_command import one_command
 from benchmarks.pages.delays import MEASURED
 from skyloop.bench import delays, loop
 from skyloop.bench.contenders import FLOOR, OURS
@@ -167,14 +168,7 @@ def command(
 
 def build() -> typer.Typer:
     """Return the command line."""
-    app = typer.Typer(
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )
-    app.command()(command)
-    return app
+    return one_command(command)
 
 
 if __name__ == "__main__":

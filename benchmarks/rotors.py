@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 import typer
 
+from benchmarks.one_command import one_command
 from skyloop.bench.tables import UNKNOWN, Table
 from skyloop.cli.app import run
 from skyloop.cli.bench import as_rich
@@ -201,14 +202,7 @@ def command() -> None:
 
 def build() -> typer.Typer:
     """Return the command line."""
-    app = typer.Typer(
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )
-    app.command()(command)
-    return app
+    return one_command(command)
 
 
 if __name__ == "__main__":

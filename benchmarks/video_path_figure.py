@@ -40,7 +40,7 @@ def draw(results: VideoPath, folder: Path) -> list[Path]:
         )
     above.axhline(FROZEN_MS, color="black", linewidth=0.6, linestyle=":")
     above.set(yscale="log", ylabel="age of the picture shown [ms]", ylim=(15, _MOST_MS), title=trace.name)
-    above.legend(frameon=False, fontsize=8, loc="upper right", ncols=2)
+    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=len(shown))
     _carried(below, [trace.kbit(at, at + 1000.0) for at in range(0, int(results.seconds) * 1000, 1000)])
     file = folder / "video-path.png"
     with replacing(file) as part:
