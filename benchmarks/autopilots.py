@@ -155,10 +155,10 @@ def wait_ready(drone: skyloop.Drone, ready_s: float = READY_S) -> None:
         time.sleep(0.2)
 
 
-def fly_square(drone: skyloop.Drone, seconds: float) -> int:
-    """Fly the square again and again, for so long; return the corners that were reached."""
+def fly_square(drone: skyloop.Drone, seconds: float, least_corners: int = 0) -> int:
+    """Fly the square again and again, for so long and until so many corners; return the corners that were reached."""
     until_s, corners = time.monotonic() + seconds, 0
-    while time.monotonic() < until_s:
+    while time.monotonic() < until_s or corners < least_corners:
         x, y = SQUARE[corners % len(SQUARE)]
         try:
             drone.go_to(x=x, y=y, z=HEIGHT_M, speed=0.8, timeout_s=30.0, tolerance_m=0.3)
