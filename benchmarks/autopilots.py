@@ -20,7 +20,7 @@ import skyloop
 from skyloop.cli.demo import MARKER_ID
 from skyloop.control.follow import FollowMarker
 from skyloop.errors import NoAnswerError, RefusedError
-from skyloop.messages import Feedback
+from skyloop.messages import Feedback, FlightState
 from skyloop.messages.geometry import wrap_angle
 
 KINDS: Final = ("ardupilot", "betaflight", "px4")
@@ -146,11 +146,13 @@ def take_off(drone: skyloop.Drone, ready_s: float = READY_S) -> float:
 
 
 def wait_ready(drone: skyloop.Drone, ready_s: float = READY_S) -> None:
-    """Wait until a MAVLink autopilot says that it can be armed; others say nothing."""
+    """Wait until an autopilot is connected and, if it is one that says so (MAVLink), can be armed."""
     until_s = time.monotonic() + ready_s
     while time.monotonic() < until_s:
-        native = drone.feedback().native or {}
-        if native.get("mavlink.ready", not any(name.startswith("mavlink.") for name in native)):
+        feedback = drone.feedback()
+        native = feedback.native or {}
+        heard = feedback.state is not FlightState.UNKNOWN
+        if native.get("mavlink.ready", heard and not any(name.startswith("mavlink.") for name in native)):
             return
         time.sleep(0.2)
 
