@@ -47,9 +47,9 @@ PARAMETERS: Final = {
     "THR_MDL_FAC": "0.78",  # thrust is the square of a speed that begins at an eighth of the full one
     "COM_OBL_RC_ACT": "5",
 }
-#: By how much fixes are late [ms]: the name until early 2026, and since; each version ignores the other's. PX4's startup
-#: for simulators sets 10. Fixes that are later than it takes them for turn its heading, as long as it flies round in one
-#: direction: its velocity was another then.
+#: By how much fixes are late [ms]: the name until early 2026, and since; each version ignores the other's. PX4's
+#: startup for simulators sets 10. Fixes that are later than it takes them for turn its heading, as long as it flies
+#: round in one direction: its velocity was another then.
 GPS_DELAYS: Final = ("EKF2_GPS_DELAY", "SENS_GPS0_DELAY")
 _EVERYTHING: Final = 0b1_1011_1111_1111  #: all readings but the differential pressure are new
 _NO_LOGS: Final = {"SDLOG_MODE": "-1"}
