@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -102,4 +103,4 @@ def test_a_simulation_that_stays_behind_is_said_now_and_then() -> None:
             assert share == pytest.approx(0.8)
             said.append(now_ns)
     assert said[0] == 5 * SLOW_NS, "a little is no matter"
-    assert [b - a for a, b in zip(said, said[1:], strict=False)] == [SLOW_AGAIN_NS] * 2
+    assert [b - a for a, b in itertools.pairwise(said)] == [SLOW_AGAIN_NS] * 2
