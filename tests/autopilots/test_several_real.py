@@ -56,12 +56,10 @@ class Fleet:
 
     def pid(self, n: int) -> int:
         """The process of a drone's firmware; 0: there is none."""
-        folder, program = self._folder / f"drone{n + 1}", PROGRAMS[self.kinds[n]]
+        folder, name = self._folder / f"drone{n + 1}", PROGRAMS[self.kinds[n]]
         for process in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
-                if (process / "cwd").readlink() == folder and (process / "exe").readlink().name == PROGRAMS[
-                    self.kinds[n]
-                ]:
+                if (process / "cwd").readlink() == folder and (process / "exe").readlink().name == name:
                     return int(process.name)
         return 0
 
