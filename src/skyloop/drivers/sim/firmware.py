@@ -121,6 +121,8 @@ class FirmwareFlight:
         """
         self._host, self._drone, self._sink = host, drone, sink
         folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
+        if folder is not None and host.drones > 1:
+            folder /= f"drone{drone + 1}"  # each has settings of its own
         instruments = rotors_of(host.simulation.parameters[drone]).instruments
         self._firmware = firmware = make_firmware(self.kind, self._happened, instruments=instruments, folder=folder)
         self._linked = True
