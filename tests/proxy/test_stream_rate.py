@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.hosts import traces
-from skyloop.proxy.core.stream_rate import LEAST_KBIT_S, LOST_S, StreamRate, picture_form
+from skyloop.proxy.core.stream_rate import LEAST_KBIT_S, LOST_S, SELDOM_S, StreamRate, picture_form
 
 MS = 1_000_000
 PERIOD_MS = 33
@@ -139,6 +139,27 @@ def test_while_the_path_stands_still_a_small_picture_is_sent_now_and_then() -> N
     assert 6 <= len(pauses) <= 14
     assert min(pauses) >= 150
     assert rate.kbit_s == pytest.approx(before / 2), "it fell once"
+
+
+def test_the_longer_the_path_stands_still_the_less_waits_in_it_and_a_young_picture_goes_first_after_it() -> None:
+    rate = StreamRate(2000, 0)
+    for seq in range(1, 4):
+        rate.sent(seq, 1000, seq * 33 * MS)
+        rate.acknowledged(seq, (seq * 33 + 45) * MS)
+    begun, seq = [], 3
+    for ms in range(200, 8200, 33):
+        if rate.may_send(ms * MS):
+            seq += 1
+            rate.sent(seq, 1000, ms * MS)
+            begun.append(ms)
+    later = [ms for ms in begun if ms > 1000]
+    assert all(pause >= SELDOM_S * 1000 for pause in (b - a for a, b in pairwise(later)))
+    assert 10 <= len(later) <= 15, "some, as what is sent is not known to arrive"
+    rate.acknowledged(seq - 1, 8230 * MS)
+    assert rate.may_send(8231 * MS), "something passes again"
+    for again in range(1, 4):
+        rate.sent(seq + again, 1000, (8231 + again) * MS)
+    assert not rate.may_send(8240 * MS), "and then as ever"
 
 
 @pytest.mark.parametrize("loss", [0.02, 0.1])

@@ -6,7 +6,8 @@ Control", ACM Queue 14(5), 2016). A mobile network carries ten times as much in 
 so near the average pictures are often late: each time the rate falls, too, and it grows so slowly that few are.
 No picture is begun while more is under way than the path delivers in :data:`MOST_WAIT_S`, so that one that stalls holds
 a few pictures and not seconds of them, and nothing has to be thrown away after it was encoded. While it stands still a
-picture is sent now and then, so that a young one is there as soon as anything passes.
+picture is sent now and then, ever more seldom, as all that waits delays the first that is young; that one is sent as
+soon as anything is heard.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ MOST_WAIT_S: Final = 0.08  #: as much is under way, beside what the shortest rou
 SILENT_S: Final = 0.3  #: a path of which nothing was heard for so long stands still, through no fault of the rate …
 SILENT_FALL: Final = 0.5  #: … which is no longer known for what it may carry after it
 PROBE_S: Final = 0.15  #: while it stands still there is a picture as often …
-PROBES_S: Final = 0.1  #: … as long as no more is under way than the rate gives in this time
+PROBES_S: Final = 0.1  #: … as long as no more was sent than the rate gives in this time, and after that …
+SELDOM_S: Final = 0.5  #: … as often
 LOST_S: Final = 1.0  #: what is not acknowledged for so long is taken for lost
 SHORTEST_S: Final = 10.0  #: how long a shortest round trip counts
 _FEWEST: Final = 3  # pictures by which a queue is judged
@@ -62,6 +64,10 @@ class StreamRate:
         self._most_kbit_s = most_kbit_s
         self._searches = True  # nothing was late yet
         self._silent = False  # the path stands still
+        self._unheard = 0  # bytes that were sent since anything was heard
+        self._heard_ns = now_ns  # when anything was
+        self._returned_ns = now_ns - nanoseconds(SHORTEST_S)  # when it was after the path stood still
+        self._owed = False  # a picture is to be sent at once
         self._under_way: deque[_Sent] = deque()
         self._bytes = 0  # of these
         self._sent_ns = now_ns - nanoseconds(LOST_S)  # when the newest of them was
@@ -78,19 +84,23 @@ class StreamRate:
             self._bytes -= under_way.popleft().size
             self.lost += 1
             self._stands_still()
-        if not under_way:
+        if self._owed:
             return True
+        passed_ns = now_ns - self._sent_ns
+        if not under_way:
+            return not self._silent or passed_ns >= nanoseconds(SELDOM_S)
         least_ns = self._least_ns()
-        waits_s = seconds(now_ns - under_way[0].sent_ns - least_ns)
+        waits_s = seconds(now_ns - max(under_way[0].sent_ns, self._returned_ns) - least_ns)
         if waits_s >= MOST_WAIT_S:
             if waits_s >= SILENT_S:
                 self._stands_still()
-            return now_ns - self._sent_ns >= nanoseconds(PROBE_S) and self._holds(PROBES_S)
-        return len(under_way) < 2 or self._holds(seconds(least_ns) + MOST_WAIT_S)
+            few = self._gives(max(self._bytes, self._unheard), PROBES_S)
+            return passed_ns >= nanoseconds(PROBE_S if few else SELDOM_S) and (few or self._silent)
+        return len(under_way) < 2 or self._gives(self._bytes, seconds(least_ns) + MOST_WAIT_S)
 
-    def _holds(self, time_s: float) -> bool:
-        """Return whether no more is under way than the rate gives in so long [s]."""
-        return self._bytes * 8e-3 <= self.kbit_s * time_s
+    def _gives(self, size: int, time_s: float) -> bool:
+        """Return whether the rate gives so many bytes in so long [s]."""
+        return size * 8e-3 <= self.kbit_s * time_s
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:
         """Note a picture.
@@ -102,7 +112,9 @@ class StreamRate:
         """
         self._under_way.append(_Sent(seq, size, now_ns))
         self._bytes += size
+        self._unheard += size
         self._sent_ns = now_ns
+        self._owed = False
 
     def acknowledged(self, seq: int, now_ns: int) -> None:
         """Note that the subscriber has a picture.
@@ -121,6 +133,9 @@ class StreamRate:
         if newest is None or newest.seq != seq:
             return
         trip_ns = now_ns - newest.sent_ns
+        if min(trip_ns, now_ns - self._heard_ns) >= nanoseconds(SILENT_S):  # the rest of what was under way comes now
+            self._returned_ns, self._owed = now_ns, True
+        self._unheard, self._heard_ns = 0, now_ns
         self._add_trip(trip_ns, now_ns)
         wait_s = seconds(trip_ns - self._least_ns())
         step_s = min(seconds(now_ns - self._changed_ns), 0.2)
@@ -153,7 +168,8 @@ class StreamRate:
         """Forget what is under way: it will not be acknowledged."""
         self._under_way.clear()
         self._waits.clear()
-        self._bytes = 0
+        self._bytes = self._unheard = 0
+        self._silent = False
 
     def _stands_still(self) -> None:
         if not self._silent:
