@@ -324,7 +324,8 @@ class ProxySession:
         late_ns = self.monitor.late_ns  # a proxy that is silent for so long is pinged
         silent = now_ns - self.monitor.received_ns > late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
-        if not self._pinged and (silent or not self._same_clock) and now_ns - self._pinged_ns > (late_ns if silent else usual_ns):
+        due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged
+        if (silent or not self._same_clock) and due:
             self._pinged_ns = now_ns
             # One at a time, once: what waits on a path that stands still, and its answers, delay all else after it.
             self._pinged = True
