@@ -34,9 +34,10 @@ SEARCH_1_S: Final = 2.0  #: … and below the first rate, or as long as nothing 
 MOST_WAIT_S: Final = 0.08  #: as much is under way, beside what the shortest round trip holds
 SILENT_S: Final = 0.3  #: a path of which nothing was heard for so long stands still, through no fault of the rate …
 SILENT_FALL: Final = 0.5  #: … which is no longer known for what it may carry after it
-PROBE_S: Final = 0.15  #: while it stands still there is a picture as often …
-PROBES_S: Final = 0.1  #: … as long as no more was sent than the rate gives in this time, and after that …
-SELDOM_S: Final = 0.5  #: … as often
+PROBE_S: Final = 0.15  #: while pictures wait there is one as often, if no more is under way than the rate gives in …
+PROBES_S: Final = 0.1  #: … this time; while nothing is heard …
+SELDOM: Final = 1 / 8  #: … after this share of the time in which nothing was …
+SELDOM_S: Final = 0.5  #: … or this, if it is less
 LOST_S: Final = 1.0  #: what is not acknowledged for so long is taken for lost
 SHORTEST_S: Final = 10.0  #: how long a shortest round trip counts
 _FEWEST: Final = 3  # pictures by which a queue is judged
@@ -64,8 +65,7 @@ class StreamRate:
         self._most_kbit_s = most_kbit_s
         self._searches = True  # nothing was late yet
         self._silent = False  # the path stands still
-        self._unheard = 0  # bytes that were sent since anything was heard
-        self._heard_ns = now_ns  # when anything was
+        self._quiet_ns = 0  # since when something is under way and nothing was heard; 0: nothing is
         self._returned_ns = now_ns - nanoseconds(SHORTEST_S)  # when it was after the path stood still
         self._owed = False  # a picture is to be sent at once
         self._under_way: deque[_Sent] = deque()
@@ -86,16 +86,16 @@ class StreamRate:
             self._stands_still()
         if self._owed:
             return True
-        passed_ns = now_ns - self._sent_ns
+        passed_s, quiet_s = seconds(now_ns - self._sent_ns), seconds(now_ns - (self._quiet_ns or now_ns))
+        seldom = passed_s >= min(max(PROBE_S, SELDOM * quiet_s), SELDOM_S)
         if not under_way:
-            return not self._silent or passed_ns >= nanoseconds(SELDOM_S)
+            return seldom or not self._silent
         least_ns = self._least_ns()
         waits_s = seconds(now_ns - max(under_way[0].sent_ns, self._returned_ns) - least_ns)
         if waits_s >= MOST_WAIT_S:
             if waits_s >= SILENT_S:
                 self._stands_still()
-            few = self._gives(max(self._bytes, self._unheard), PROBES_S)
-            return passed_ns >= nanoseconds(PROBE_S if few else SELDOM_S) and (few or self._silent)
+            return seldom and (quiet_s >= SILENT_S or self._gives(self._bytes, PROBES_S))
         return len(under_way) < 2 or self._gives(self._bytes, seconds(least_ns) + MOST_WAIT_S)
 
     def _gives(self, size: int, time_s: float) -> bool:
@@ -112,7 +112,7 @@ class StreamRate:
         """
         self._under_way.append(_Sent(seq, size, now_ns))
         self._bytes += size
-        self._unheard += size
+        self._quiet_ns = self._quiet_ns or now_ns
         self._sent_ns = now_ns
         self._owed = False
 
@@ -133,9 +133,9 @@ class StreamRate:
         if newest is None or newest.seq != seq:
             return
         trip_ns = now_ns - newest.sent_ns
-        if min(trip_ns, now_ns - self._heard_ns) >= nanoseconds(SILENT_S):  # the rest of what was under way comes now
+        if now_ns - self._quiet_ns >= nanoseconds(SILENT_S):  # the rest of what was under way comes now
             self._returned_ns, self._owed = now_ns, True
-        self._unheard, self._heard_ns = 0, now_ns
+        self._quiet_ns = now_ns if self._under_way else 0
         self._add_trip(trip_ns, now_ns)
         wait_s = seconds(trip_ns - self._least_ns())
         step_s = min(seconds(now_ns - self._changed_ns), 0.2)
@@ -168,8 +168,8 @@ class StreamRate:
         """Forget what is under way: it will not be acknowledged."""
         self._under_way.clear()
         self._waits.clear()
-        self._bytes = self._unheard = 0
-        self._silent = False
+        self._bytes = self._quiet_ns = 0
+        self._silent = self._owed = False
 
     def _stands_still(self) -> None:
         if not self._silent:
