@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.hosts import traces
-from skyloop.proxy.core.stream_rate import LEAST_KBIT_S, LOST_S, PROBE_S, SELDOM_S, StreamRate, picture_form
+from skyloop.proxy.core.stream_rate import LEAST_KBIT_S, LOST_S, PROBE_S, SELDOM, SELDOM_S, StreamRate, picture_form
 
 MS = 1_000_000
 PERIOD_MS = 33
@@ -136,7 +136,7 @@ def test_while_the_path_stands_still_a_small_picture_is_sent_now_and_then() -> N
             rate.sent(seq, 300, ms * MS)
             begun.append(ms)
     pauses = [later - earlier for earlier, later in pairwise(begun[3:])]
-    assert 6 <= len(pauses) <= 14
+    assert 4 <= len(pauses) <= 14
     assert min(pauses) >= 150
     assert rate.kbit_s == pytest.approx(before / 2), "it fell once"
 
@@ -153,10 +153,10 @@ def test_the_longer_the_path_stands_still_the_less_waits_in_it_and_a_young_pictu
             rate.sent(seq, 1000, ms * MS)
             begun.append(ms)
     pauses = [later - earlier for earlier, later in pairwise(begun)]
-    assert all(pause <= max(1000 * PROBE_S, ms / 6) + 33 for ms, pause in zip(begun, pauses, strict=False))
-    assert len([ms for ms in begun if 1000 < ms < 4000]) <= 14
+    assert all(pause <= max(1000 * PROBE_S, SELDOM * ms * 1.5) + 33 for ms, pause in zip(begun, pauses, strict=False))
+    assert len([ms for ms in begun if 500 < ms < 4500]) <= 12
     assert all(1000 * SELDOM_S <= pause <= 1000 * SELDOM_S + 33 for pause in pauses[-4:])
-    rate.acknowledged(seq - 1, 8230 * MS)
+    rate.acknowledged(4, 8230 * MS)  # long given up
     assert rate.may_send(8231 * MS), "something passes again"
     for again in range(1, 4):
         rate.sent(seq + again, 1000, (8231 + again) * MS)

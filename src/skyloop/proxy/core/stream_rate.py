@@ -36,7 +36,7 @@ SILENT_S: Final = 0.3  #: a path of which nothing was heard for so long stands s
 SILENT_FALL: Final = 0.5  #: … which is no longer known for what it may carry after it
 PROBE_S: Final = 0.15  #: while pictures wait there is one as often, if no more is under way than the rate gives in …
 PROBES_S: Final = 0.1  #: … this time; while nothing is heard …
-SELDOM: Final = 1 / 8  #: … after this share of the time in which nothing was …
+SELDOM: Final = 1 / 3  #: … after this share of the time in which nothing was …
 SELDOM_S: Final = 0.5  #: … or this, if it is less
 LOST_S: Final = 1.0  #: what is not acknowledged for so long is taken for lost
 SHORTEST_S: Final = 10.0  #: how long a shortest round trip counts
@@ -123,6 +123,8 @@ class StreamRate:
             seq: Its number.
             now_ns: When its acknowledgement came.
         """
+        if self._quiet_ns and now_ns - self._quiet_ns >= nanoseconds(SILENT_S):  # more of what was sent comes now
+            self._returned_ns, self._owed = now_ns, True
         newest = None
         while self._under_way and self._under_way[0].seq <= seq:
             newest = self._under_way.popleft()
@@ -130,12 +132,10 @@ class StreamRate:
             self._delivered += newest.size
             if newest.seq < seq:
                 self.lost += 1
+        self._quiet_ns = now_ns if self._under_way else 0
         if newest is None or newest.seq != seq:
             return
         trip_ns = now_ns - newest.sent_ns
-        if now_ns - self._quiet_ns >= nanoseconds(SILENT_S):  # the rest of what was under way comes now
-            self._returned_ns, self._owed = now_ns, True
-        self._quiet_ns = now_ns if self._under_way else 0
         self._add_trip(trip_ns, now_ns)
         wait_s = seconds(trip_ns - self._least_ns())
         step_s = min(seconds(now_ns - self._changed_ns), 0.2)
