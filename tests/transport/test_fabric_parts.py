@@ -187,7 +187,7 @@ def test_of_what_only_the_newest_counts_taking_is_told_as_time_passes_too() -> N
 # --- configuration ---
 
 
-def test_an_application_with_addresses_waits_for_its_proxy_and_for_nothing_else() -> None:
+def test_an_application_with_one_address_waits_for_its_proxy_and_for_nothing_else() -> None:
     given = FabricSettings(connect=("10.0.0.5",), multicast=False)
 
     def delay_ms(settings: FabricSettings, part: Part) -> int:
@@ -196,6 +196,7 @@ def test_an_application_with_addresses_waits_for_its_proxy_and_for_nothing_else(
 
     assert delay_ms(given, Part.APP) == 0
     assert delay_ms(FabricSettings(connect=("10.0.0.5",)), Part.APP) == config.SETTLE_MS
+    assert delay_ms(FabricSettings(connect=("10.0.0.5", "10.0.0.6"), multicast=False), Part.APP) == config.SETTLE_MS
     assert delay_ms(FabricSettings(), Part.APP) == delay_ms(given, Part.PROXY) == config.SETTLE_MS
 
 
