@@ -23,7 +23,7 @@ from skyloop.transport.fabric.settings import LEASE_S as DEFAULT_LEASE_S
 FPS: Final = 30.0
 NO_VIDEO: Final = "no video"
 FIXED_KBIT_S: Final = 1000
-LEASE_S: Final = 5.0
+LEASE_S: Final = 10.0
 PATIENT: Final = f"H.264, adaptive, lease {LEASE_S:g} s"  #: the pilot waits longer for a drone of which nothing comes
 FORMS: Final[Mapping[str, VideoOptions | None]] = MappingProxyType(
     {

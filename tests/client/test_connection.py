@@ -150,6 +150,7 @@ def test_a_silent_proxy_is_degraded_then_lost_then_back(proxy: ScriptedProxy, dr
     at = told.until(LinkState.DEGRADED)
     at = told.until(LinkState.LOST, at)
     assert "no data" in told.reasons[at - 1]
+    assert sum(isinstance(request, Ping) for request in proxy.requests) == 1, "more would wait on the way"
     proxy.answers.clear()
     proxy.beating.set()
     told.until(LinkState.UP, at)

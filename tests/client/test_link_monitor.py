@@ -135,6 +135,10 @@ def test_stall_watch_asks_once_per_patience() -> None:
     assert not watch.stalled(True, clock())
     clock.advance(5.0)
     assert not watch.stalled(False, clock())  # nothing else flows either: that is the link's matter
+    clock.advance(0.9)
+    assert not watch.stalled(True, clock()), "the others came first after the silence"
+    clock.advance(0.2)
+    assert watch.stalled(True, clock())
 
 
 def slow_flow(monitor: LinkMonitor, clock: ManualClock, seqs: list[int], period_s: float = 1.0) -> None:

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.hosts import traces
-from skyloop.proxy.core.stream_rate import LEAST_KBIT_S, LOST_S, StreamRate, picture_form
+from skyloop.proxy.core.stream_rate import LEAST_KBIT_S, LOST_S, PROBE_S, SELDOM, SELDOM_S, StreamRate, picture_form
 
 MS = 1_000_000
 PERIOD_MS = 33
@@ -136,9 +136,31 @@ def test_while_the_path_stands_still_a_small_picture_is_sent_now_and_then() -> N
             rate.sent(seq, 300, ms * MS)
             begun.append(ms)
     pauses = [later - earlier for earlier, later in pairwise(begun[3:])]
-    assert 6 <= len(pauses) <= 14
+    assert 4 <= len(pauses) <= 14
     assert min(pauses) >= 150
     assert rate.kbit_s == pytest.approx(before / 2), "it fell once"
+
+
+def test_the_longer_the_path_stands_still_the_less_waits_in_it_and_a_young_picture_goes_first_after_it() -> None:
+    rate = StreamRate(2000, 0)
+    for seq in range(1, 4):
+        rate.sent(seq, 1000, seq * 33 * MS)
+        rate.acknowledged(seq, (seq * 33 + 45) * MS)
+    begun, seq = [], 3
+    for ms in range(200, 8200, 33):
+        if rate.may_send(ms * MS):
+            seq += 1
+            rate.sent(seq, 1000, ms * MS)
+            begun.append(ms)
+    pauses = [later - earlier for earlier, later in pairwise(begun)]
+    assert all(pause <= max(1000 * PROBE_S, SELDOM * ms * 1.5) + 33 for ms, pause in zip(begun, pauses, strict=False))
+    assert len([ms for ms in begun if 500 < ms < 4500]) <= 12
+    assert all(1000 * SELDOM_S <= pause <= 1000 * SELDOM_S + 33 for pause in pauses[-4:])
+    rate.acknowledged(4, 8230 * MS)  # long given up
+    assert rate.may_send(8231 * MS), "something passes again"
+    for again in range(1, 4):
+        rate.sent(seq + again, 1000, (8231 + again) * MS)
+    assert not rate.may_send(8240 * MS), "and then as ever"
 
 
 @pytest.mark.parametrize("loss", [0.02, 0.1])

@@ -18,6 +18,7 @@ from skyloop.transport.fabric.settings import FabricSettings
 from skyloop.transport.testing import ClientLog
 
 RUN, OTHER = "1" * 16, "2" * 16
+ABOUT = packets.ProxyInfo("alpha", RUN, 0, "host", 7, "sim://", "fabric:alpha")
 
 
 class Payload(bytes):
@@ -77,6 +78,24 @@ def test_nobody_of_that_name_is_another_thing_than_no_list(
     assert asked == [0.5]
 
 
+@pytest.mark.parametrize("runs", [{RUN}, {OTHER}, {RUN, OTHER}])
+def test_who_is_known_is_not_asked_again_unless_there_is_a_choice(
+    runs: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def oldest_first(_session: Session, name: str) -> list[packets.ProxyInfo]:
+        asked.append(name)
+        return []
+
+    monkeypatch.setattr(discovery, "oldest_first", oldest_first)
+    watch = ProxyWatch(cast("Session", SimpleNamespace(settings=FabricSettings())), "alpha", lambda _: None, ABOUT)
+    watch._runs = runs
+    found = watch.find(0.0, 0.5)
+    assert found == ([(RUN, ABOUT)] if runs == {RUN} else [(min(runs), None)])
+    assert bool(asked) == (runs != {RUN})
+
+
 def test_who_tells_nothing_is_given_another_session_soon_and_more_time_each_turn(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -84,11 +103,14 @@ def test_who_tells_nothing_is_given_another_session_soon_and_more_time_each_turn
     retired: list[object] = []
     reached = True
 
-    def connection(session: Session, _name: str, _handler: object, _find_s: float, list_s: float) -> Any:
+    def connection(
+        session: Session, _name: str, _handler: object, _find_s: float, list_s: float, known: packets.ProxyInfo | None
+    ) -> Any:
         given.append(list_s)
+        assert known == (ABOUT if len(given) > 1 else None), "it is not asked again who it is"
         if not reached:
             raise NoAnswerError("nobody said")
-        return SimpleNamespace(parted=True, session=session)
+        return SimpleNamespace(parted=True, session=session, about=ABOUT if len(given) == 1 else None)
 
     monkeypatch.setattr(client, "FabricClient", connection)
     monkeypatch.setattr(client, "acquire", lambda *_: object())

@@ -42,7 +42,7 @@ from skyloop.transport.fabric import (
     packets,
 )
 from skyloop.transport.fabric.config import Part
-from skyloop.transport.fabric.delivery import ACKNOWLEDGE_AFTER, AckPolicy, RecentPackets
+from skyloop.transport.fabric.delivery import ACKNOWLEDGE_AFTER, ACKNOWLEDGE_EVERY_S, AckPolicy, RecentPackets
 from skyloop.transport.fabric.discovery import FORGET_S, UnreachablePeers
 from skyloop.transport.testing import header
 
@@ -178,7 +178,26 @@ def test_taking_is_told_now_and_then() -> None:
     assert told == [ACKNOWLEDGE_AFTER * n for n in range(1, 100 // ACKNOWLEDGE_AFTER + 1)]
 
 
+def test_of_what_only_the_newest_counts_taking_is_told_as_time_passes_too() -> None:
+    policy = AckPolicy(ACKNOWLEDGE_EVERY_S)
+    assert [ms for ms in range(0, 600, 31) if policy.count(ms // 31 + 1, 0, ms / 1000)] == [0, 155, 310, 465]
+    assert [number for number in range(21, 101) if policy.count(number, 0, 0.5)] == [48, 80], "many at once"
+
+
 # --- configuration ---
+
+
+def test_an_application_with_one_address_waits_for_its_proxy_and_for_nothing_else() -> None:
+    given = FabricSettings(connect=("10.0.0.5",), multicast=False)
+
+    def delay_ms(settings: FabricSettings, part: Part) -> int:
+        delay: int = config.make(settings, part)["scouting"]["delay"]
+        return delay
+
+    assert delay_ms(given, Part.APP) == 0
+    assert delay_ms(FabricSettings(connect=("10.0.0.5",)), Part.APP) == config.SETTLE_MS
+    assert delay_ms(FabricSettings(connect=("10.0.0.5", "10.0.0.6"), multicast=False), Part.APP) == config.SETTLE_MS
+    assert delay_ms(FabricSettings(), Part.APP) == delay_ms(given, Part.PROXY) == config.SETTLE_MS
 
 
 def test_an_address_stands_for_two_links_without_keys_and_one_with() -> None:

@@ -147,7 +147,10 @@ class LinkMonitor:
 
 
 class StallWatch:
-    """Tells when one channel has stalled although the others flow, so that it is subscribed to again."""
+    """Tells when one channel has stalled although the others flow, so that it is subscribed to again.
+
+    After a silence of all of them it has as much time as before, as it may come last.
+    """
 
     def __init__(self, patience_s: float, now_ns: int) -> None:
         """Start watching.
@@ -159,10 +162,13 @@ class StallWatch:
         self._patience_ns = nanoseconds(patience_s)
         self.received_ns = now_ns  #: when something came on this channel last
         self._asked_ns = now_ns
+        self._flow_ns = now_ns  # since when the others do
 
     def stalled(self, others_flow: bool, now_ns: int) -> bool:
         """Return whether to subscribe again now; True at most once in ``patience_s``."""
-        if not others_flow or now_ns - max(self.received_ns, self._asked_ns) <= self._patience_ns:
+        if not others_flow:
+            self._flow_ns = now_ns
+        if now_ns - max(self.received_ns, self._asked_ns, self._flow_ns) <= self._patience_ns:
             return False
         self._asked_ns = now_ns
         return True

@@ -65,7 +65,7 @@ class Requests:
         self._last_id = 0
         self._failed: LinkError | None = None
 
-    def ask(self, body: AnyRequest, done: Done, timeout_s: float, now_ns: int) -> None:
+    def ask(self, body: AnyRequest, done: Done, timeout_s: float, now_ns: int, *, again_s: float = RETRY_S) -> None:
         """Send a request.
 
         Args:
@@ -74,6 +74,7 @@ class Requests:
                 one if the connection has failed already.
             timeout_s: After which ``done`` gets a :class:`NoAnswerError` [s].
             now_ns: On this process's clock.
+            again_s: How long until it is repeated [s].
         """
         with self._lock:
             failed = self._failed
@@ -86,7 +87,7 @@ class Requests:
                     type(body).__name__,
                     done,
                     now_ns + nanoseconds(timeout_s),
-                    now_ns + nanoseconds(RETRY_S),
+                    now_ns + nanoseconds(again_s),
                     timeout_s,
                 )
         if failed is not None:
@@ -127,6 +128,7 @@ class Requests:
             one.done(error)
 
 
+PING_S: Final = 1.0  #: how long a ping may take
 FEEDBACK_STALL_S: Final = 1.0  #: without feedback from a proxy that answers: it is subscribed to again
 _VIDEOS: Final = (video(""), stream(""))
 _PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often a proxy on another clock is asked for its time
@@ -196,6 +198,7 @@ class ProxySession:
         self._quiet = False  # closed by this end: ignore what still arrives
         self._up = False
         self._pinged_ns = 0
+        self._pinged = False  # and not answered yet
         self._trips = OffsetEstimator()
         self._video_users: dict[str, set[str]] = {}  # topic of the transport: the topics that it serves
         self._handlers: dict[type, Callable[..., None]] = {
@@ -321,9 +324,12 @@ class ProxySession:
         late_ns = self.monitor.late_ns  # a proxy that is silent for so long is pinged
         silent = now_ns - self.monitor.received_ns > late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
-        if (silent or not self._same_clock) and now_ns - self._pinged_ns > (late_ns if silent else usual_ns):
+        due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged
+        if (silent or not self._same_clock) and due:
             self._pinged_ns = now_ns
-            self.requests.ask(Ping(now_ns), self._ponged, 1.0, now_ns)
+            # One at a time, once: what waits on a path that stands still, and its answers, delay all else after it.
+            self._pinged = True
+            self.requests.ask(Ping(now_ns), self._ponged, PING_S, now_ns, again_s=PING_S)
 
     def renew_feedback(self, now_ns: int) -> None:
         """Subscribe to feedback again if it has stalled although the proxy answers.
@@ -350,6 +356,7 @@ class ProxySession:
         self._feedback_watch = StallWatch(FEEDBACK_STALL_S + request.period_s, now_ns)
 
     def _ponged(self, answer: AnyReply | LinkError) -> None:
+        self._pinged = False
         if isinstance(answer, Pong) and not self._same_clock:
             self._take_offset(self._trips.add(answer.sent_ns, answer.now_ns, self._clock()))
 

@@ -6,7 +6,8 @@ Control", ACM Queue 14(5), 2016). A mobile network carries ten times as much in 
 so near the average pictures are often late: each time the rate falls, too, and it grows so slowly that few are.
 No picture is begun while more is under way than the path delivers in :data:`MOST_WAIT_S`, so that one that stalls holds
 a few pictures and not seconds of them, and nothing has to be thrown away after it was encoded. While it stands still a
-picture is sent now and then, so that a young one is there as soon as anything passes.
+picture is sent now and then, ever more seldom, as all that waits delays the first that is young; that one is sent as
+soon as anything is heard.
 """
 
 from __future__ import annotations
@@ -33,8 +34,10 @@ SEARCH_1_S: Final = 2.0  #: … and below the first rate, or as long as nothing 
 MOST_WAIT_S: Final = 0.08  #: as much is under way, beside what the shortest round trip holds
 SILENT_S: Final = 0.3  #: a path of which nothing was heard for so long stands still, through no fault of the rate …
 SILENT_FALL: Final = 0.5  #: … which is no longer known for what it may carry after it
-PROBE_S: Final = 0.15  #: while it stands still there is a picture as often …
-PROBES_S: Final = 0.1  #: … as long as no more is under way than the rate gives in this time
+PROBE_S: Final = 0.15  #: while pictures wait there is one as often, if no more is under way than the rate gives in …
+PROBES_S: Final = 0.1  #: … this time; while nothing is heard …
+SELDOM: Final = 1 / 3  #: … after this share of the time in which nothing was …
+SELDOM_S: Final = 0.5  #: … or this, if it is less
 LOST_S: Final = 1.0  #: what is not acknowledged for so long is taken for lost
 SHORTEST_S: Final = 10.0  #: how long a shortest round trip counts
 _FEWEST: Final = 3  # pictures by which a queue is judged
@@ -62,6 +65,9 @@ class StreamRate:
         self._most_kbit_s = most_kbit_s
         self._searches = True  # nothing was late yet
         self._silent = False  # the path stands still
+        self._quiet_ns = 0  # since when something is under way and nothing was heard; 0: nothing is
+        self._returned_ns = now_ns - nanoseconds(SHORTEST_S)  # when it was after the path stood still
+        self._owed = False  # a picture is to be sent at once
         self._under_way: deque[_Sent] = deque()
         self._bytes = 0  # of these
         self._sent_ns = now_ns - nanoseconds(LOST_S)  # when the newest of them was
@@ -78,19 +84,23 @@ class StreamRate:
             self._bytes -= under_way.popleft().size
             self.lost += 1
             self._stands_still()
-        if not under_way:
+        if self._owed:
             return True
+        passed_s, quiet_s = seconds(now_ns - self._sent_ns), seconds(now_ns - (self._quiet_ns or now_ns))
+        seldom = passed_s >= min(max(PROBE_S, SELDOM * quiet_s), SELDOM_S)
+        if not under_way:
+            return seldom or not self._silent
         least_ns = self._least_ns()
-        waits_s = seconds(now_ns - under_way[0].sent_ns - least_ns)
+        waits_s = seconds(now_ns - max(under_way[0].sent_ns, self._returned_ns) - least_ns)
         if waits_s >= MOST_WAIT_S:
             if waits_s >= SILENT_S:
                 self._stands_still()
-            return now_ns - self._sent_ns >= nanoseconds(PROBE_S) and self._holds(PROBES_S)
-        return len(under_way) < 2 or self._holds(seconds(least_ns) + MOST_WAIT_S)
+            return seldom and (quiet_s >= SILENT_S or self._gives(self._bytes, PROBES_S))
+        return len(under_way) < 2 or self._gives(self._bytes, seconds(least_ns) + MOST_WAIT_S)
 
-    def _holds(self, time_s: float) -> bool:
-        """Return whether no more is under way than the rate gives in so long [s]."""
-        return self._bytes * 8e-3 <= self.kbit_s * time_s
+    def _gives(self, size: int, time_s: float) -> bool:
+        """Return whether the rate gives so many bytes in so long [s]."""
+        return size * 8e-3 <= self.kbit_s * time_s
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:
         """Note a picture.
@@ -102,7 +112,9 @@ class StreamRate:
         """
         self._under_way.append(_Sent(seq, size, now_ns))
         self._bytes += size
+        self._quiet_ns = self._quiet_ns or now_ns
         self._sent_ns = now_ns
+        self._owed = False
 
     def acknowledged(self, seq: int, now_ns: int) -> None:
         """Note that the subscriber has a picture.
@@ -111,6 +123,8 @@ class StreamRate:
             seq: Its number.
             now_ns: When its acknowledgement came.
         """
+        if self._quiet_ns and now_ns - self._quiet_ns >= nanoseconds(SILENT_S):  # more of what was sent comes now
+            self._returned_ns, self._owed = now_ns, True
         newest = None
         while self._under_way and self._under_way[0].seq <= seq:
             newest = self._under_way.popleft()
@@ -118,6 +132,7 @@ class StreamRate:
             self._delivered += newest.size
             if newest.seq < seq:
                 self.lost += 1
+        self._quiet_ns = now_ns if self._under_way else 0
         if newest is None or newest.seq != seq:
             return
         trip_ns = now_ns - newest.sent_ns
@@ -153,7 +168,8 @@ class StreamRate:
         """Forget what is under way: it will not be acknowledged."""
         self._under_way.clear()
         self._waits.clear()
-        self._bytes = 0
+        self._bytes = self._quiet_ns = 0
+        self._silent = self._owed = False
 
     def _stands_still(self) -> None:
         if not self._silent:

@@ -67,10 +67,11 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         chosen.identity.require_application()
 
     before: FabricClient | None = None  # the connection that was made last
+    about: packets.ProxyInfo | None = None  # the proxy
     list_s = SYNC_S
 
     def attempt(handler: ClientHandler, within_s: float) -> FabricClient:
-        nonlocal before, chosen, list_s
+        nonlocal about, before, chosen, list_s
         chosen = chosen.current()
         if before is not None and not before.parted:
             # One end may have forgotten the other while the other has not: such a session finds nobody, or gets no
@@ -79,7 +80,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
             before = None
         session = acquire(chosen, Part.APP)
         try:
-            found = FabricClient(session, name, handler, within_s, list_s)
+            found = FabricClient(session, name, handler, within_s, list_s, about)
         except UnknownNameError:
             renew(session)
             release(session)
@@ -93,7 +94,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
             release(session)
             raise
         proxy_reached()
-        before, list_s = found, LIST_S
+        about, before, list_s = found.about or about, found, LIST_S
         return found
 
     def dialer(handler: ClientHandler) -> FabricClient:
@@ -122,13 +123,22 @@ class FabricClient(TransportClient):
         handler: Called on the receiving thread.
         find_s: How long to search for the proxy [s].
         list_s: How long the linked nodes may take after that to list the proxies that they know [s].
+        known: What the proxy reported of itself before.
 
     Raises:
         UnknownNameError: No such proxy can be reached.
         LinkError: The proxy does not let this application in, or does not answer (:class:`NoAnswerError`).
     """
 
-    def __init__(self, session: Session, name: str, handler: ClientHandler, find_s: float, list_s: float) -> None:
+    def __init__(
+        self,
+        session: Session,
+        name: str,
+        handler: ClientHandler,
+        find_s: float,
+        list_s: float,
+        known: packets.ProxyInfo | None = None,
+    ) -> None:
         self._session = session
         self.parted = False  #: the proxy has announced that it ends this connection, or let it end
         self._name = name
@@ -158,7 +168,7 @@ class FabricClient(TransportClient):
         self._reason = ""
         self._held: list[Any] = []
         try:
-            about = self._enter(find_s, list_s)
+            about = self.about = self._enter(find_s, list_s, known)  #: what the proxy reports of itself, if it did
         except BaseException:
             self._undeclare()
             raise
@@ -166,7 +176,7 @@ class FabricClient(TransportClient):
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-{name}-fabric-client", daemon=True)
         self._thread.start()
 
-    def _enter(self, find_s: float, list_s: float) -> packets.ProxyInfo | None:
+    def _enter(self, find_s: float, list_s: float, known: packets.ProxyInfo | None) -> packets.ProxyInfo | None:
         """Find the proxy and be let in.
 
         Raises:
@@ -174,7 +184,7 @@ class FabricClient(TransportClient):
             UnknownNameError: There is none.
         """
         session, name = self._session, self._name
-        watch = ProxyWatch(session, name, self._on_proxy_gone)
+        watch = ProxyWatch(session, name, self._on_proxy_gone, known)
         self._held.append(watch.declare())
         candidates = watch.find(find_s, list_s)
         mine = layout.to(name, self._id)
@@ -468,12 +478,13 @@ class FabricClient(TransportClient):
             return
         answer = subscription.deliver(self._handler, packet, number)
         if answer:
-            self._acknowledge(answer)
+            self._acknowledge(answer, once=subscription.newest_wins)
 
-    def _acknowledge(self, packet: bytes) -> None:
+    def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
+        """Acknowledge something, ``once`` by a datagram, which may be lost."""
         with self._lock:
             if not self._ended:
-                self._put(layout.ASK, packet, 0)
+                _ = self._send_report(packet) if once else self._put(layout.ASK, packet, 0)
 
 
 _UNNUMBERED: Final = packets.number(0)

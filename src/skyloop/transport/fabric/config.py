@@ -18,6 +18,9 @@ OPEN_MS: Final = 800
 #: outage each answer waits there behind old video. Who gives up just before the last one comes has left a link at the
 #: other end, and Zenoh takes the next for one more beside it, by which nothing is told again.
 OPEN_GIVEN_MS: Final = 1500
+#: How long opening a session waits for others to be found (Zenoh's default). An application that was given one address
+#: waits for its proxy itself, and goes on as soon as that shows; with several it has to know all that have the name.
+SETTLE_MS: Final = 500
 MAX_MESSAGE: Final = 1 << 27  #: bytes of one frame that are taken from others
 #: Bytes of one message that a proxy takes, as frames go the other way; more is dropped before it is put together.
 MAX_MESSAGE_UP: Final = 1 << 18
@@ -70,11 +73,13 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
     # threads waits for it meanwhile. All else is dropped when a link is congested.
     blocked_us = lease_ms * 1000
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
+    waits = settings.multicast or len(settings.connect) != 1 or part is not Part.APP
     found: dict[str, Any] = {
         "mode": "router" if part is Part.ROUTER else "peer",
         "listen": {"endpoints": endpoints},
         "connect": {"endpoints": connect, "timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY},
         "scouting": {
+            "delay": SETTLE_MS if waits else 0,
             "multicast": {"enabled": settings.multicast, "autoconnect": found_by_search},
             "gossip": {"enabled": True, "autoconnect": found_by_search},
         },

@@ -17,7 +17,7 @@ from skyloop.transport.backlog import Backlog
 from skyloop.transport.base import Peer
 from skyloop.transport.fabric import packets
 from skyloop.transport.fabric.admission import Admission
-from skyloop.transport.fabric.delivery import DEPTH, MAX_BYTES, Outgoing, Receiver
+from skyloop.transport.fabric.delivery import DEPTH, MAX_BYTES, Outgoing, Pace, Receiver
 
 #: Packets of one application that wait for the handler, and as many commands. Further packets are not acknowledged, so
 #: that they are sent again; further commands are dropped, as newer ones follow. Set-points count once.
@@ -51,6 +51,7 @@ class ServerConnection:
         "left",
         "lock",
         "outgoing",
+        "paces",
         "peer",
         "reason",
         "receiver",
@@ -75,6 +76,7 @@ class ServerConnection:
         self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's, to it
         self._taken = 0  # the number to acknowledge its packets up to; 0: nothing to acknowledge
         self.topics: dict[str, int] = {}  #: with the number up to which it has acknowledged each
+        self.paces: dict[str, Pace] = {}  #: of those of which only the newest counts
         self.left = False  #: it is not subscribed to anything any more, and can't be again
 
     def may_command(self, drone: str) -> bool:
@@ -108,6 +110,8 @@ class ServerConnection:
                 return True
             if topic in self.topics:
                 self.topics[topic] = max(number, self.topics[topic])
+            if topic in self.paces:
+                self.paces[topic].taken(number, now_s)
             return False
 
     def queue(self, packet: bytes) -> str:

@@ -9,6 +9,7 @@ other end acknowledges it, and few are under way at once, so that they do not co
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -24,6 +25,9 @@ ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: packets of a topic after which they ar
 #: Packets on the way at once: as many as Zenoh queues for a link before it drops one (config._QUEUES).
 ON_THE_WAY: Final = 16
 ON_THE_WAY_BYTES: Final = 1 << 18
+ACKNOWLEDGE_EVERY_S: Final = 0.15  #: of a topic of which only the newest counts, beside that: see :class:`Pace`
+STANDS_S: Final = 0.5  #: what was not acknowledged for so long stands in the path …
+SLOW_S: Final = 0.25  #: … and until something is heard, a packet follows as often
 AGAIN_S: Final = 0.2  #: after so long without an answer what is on the way is sent again; then after twice as long, …
 AGAIN_AT_MOST_S: Final = 0.5  #: … and never later than after so long
 
@@ -166,25 +170,82 @@ class Incoming:
 
 
 class AckPolicy:
-    """Decides when a subscriber acknowledges the packets of a topic. Not thread-safe."""
+    """Decides when a subscriber acknowledges the packets of a topic. Not thread-safe.
 
-    def __init__(self) -> None:
+    Args:
+        every_s: At least so much time is between two, after which the next packet is acknowledged, too [s].
+    """
+
+    def __init__(self, every_s: float = math.inf) -> None:
         self._acknowledged = 0
         self._bytes = 0
+        self._every_s = every_s
+        self._next_s = -math.inf if every_s < math.inf else math.inf
 
-    def count(self, number: int, size: int) -> bool:
+    def count(self, number: int, size: int, now_s: float = 0.0) -> bool:
         """Count a packet; return whether to acknowledge now.
 
         Args:
             number: The packet's.
             size: Its size [bytes].
+            now_s: The monotonic clock [s].
         """
         self._bytes += size
-        if number - self._acknowledged < ACKNOWLEDGE_AFTER and self._bytes < MAX_BYTES // 8:
+        few = number - self._acknowledged < ACKNOWLEDGE_AFTER and self._bytes < MAX_BYTES // 8
+        if few and now_s < self._next_s:
             return False
         self._acknowledged = number
         self._bytes = 0
+        self._next_s = now_s + self._every_s
         return True
+
+
+class Pace:
+    """Whether the path to one subscriber carries what is published on one topic. One thread sends, another takes.
+
+    Datagrams are taken by a path that stands still, as by a mobile network that is silent for seconds, and wait in it
+    ahead of all that is sent later. So a subscriber of which nothing is heard is sent few.
+    """
+
+    __slots__ = ("_acknowledged", "_newest", "_prompt", "_sent_s", "_since_s")
+
+    def __init__(self) -> None:
+        self._newest = self._acknowledged = 0  # numbers
+        self._prompt = False  # it acknowledges more often than it must, so that a silence says something
+        self._sent_s = -math.inf  # when the newest was
+        self._since_s = math.inf  # when the oldest was sent that is not acknowledged, or later
+
+    def may_send(self, now_s: float) -> bool:
+        """Return whether another packet may be sent now.
+
+        Args:
+            now_s: The monotonic clock [s].
+        """
+        stands = self._prompt and now_s - self._since_s > STANDS_S
+        return not stands or now_s - self._sent_s >= SLOW_S
+
+    def sent(self, number: int, now_s: float) -> None:
+        """Note a packet.
+
+        Args:
+            number: Its number, higher than those before.
+            now_s: The monotonic clock [s].
+        """
+        self._newest, self._sent_s = number, now_s
+        self._since_s = min(self._since_s, now_s)
+
+    def taken(self, number: int, now_s: float) -> None:
+        """Note that the subscriber acknowledged the packets up to this number.
+
+        Args:
+            number: The packet's; those that were not sent yet are ignored, as in :meth:`Outgoing.taken`.
+            now_s: The monotonic clock [s].
+        """
+        if not self._acknowledged < number <= self._newest:
+            return
+        self._prompt = self._prompt or (self._acknowledged > 0 and number - self._acknowledged < ACKNOWLEDGE_AFTER)
+        self._acknowledged = number
+        self._since_s = math.inf if number == self._newest else now_s
 
 
 class RecentPackets:

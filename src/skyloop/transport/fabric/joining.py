@@ -31,12 +31,20 @@ class ProxyWatch:
         session: The Zenoh session.
         name: The proxy's name.
         on_gone: Called with the run of a transport server that goes away, on one of Zenoh's threads.
+        known: What a proxy with this name reported of itself before: it is not asked again.
     """
 
-    def __init__(self, session: Session, name: str, on_gone: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        session: Session,
+        name: str,
+        on_gone: Callable[[str], None],
+        known: packets.ProxyInfo | None = None,
+    ) -> None:
         self._session = session
         self._name = name
         self._on_gone = on_gone
+        self._known = known
         self._runs: set[str] = set()
         self._changed = threading.Condition()
 
@@ -81,6 +89,9 @@ class ProxyWatch:
         return self._candidates()
 
     def _candidates(self) -> list[tuple[str, packets.ProxyInfo | None]]:
+        known = self._known
+        if known is not None and self._runs == {known.run}:
+            return [(known.run, known)]
         running = [about for about in discovery.oldest_first(self._session, self._name) if about.run in self._runs]
         with self._changed:
             found: list[tuple[str, packets.ProxyInfo | None]] = [(about.run, about) for about in running]

@@ -33,7 +33,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.codec import KINDS
-from skyloop.transport.base import NAME
+from skyloop.transport.base import FEEDBACK, NAME
 
 if TYPE_CHECKING:
     from skyloop.keys import Identity
@@ -111,6 +111,11 @@ def to(name: str, connection: str) -> str:
 def topic(name: str, topic_name: str) -> str:
     """Return the key at which packets of a topic are published."""
     return f"{ROOT}/{name}/topic/{_chunk(topic_name)}"
+
+
+def newest_wins(topic_name: str) -> bool:
+    """Return whether only the newest packet of a topic counts: it may be lost, and waits for none before it."""
+    return topic_name.partition("?")[0] == FEEDBACK  # in whichever form
 
 
 def video(name: str, camera: str, variant: str = "") -> str:

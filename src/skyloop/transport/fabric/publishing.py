@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Final
 
@@ -10,6 +11,7 @@ from skyloop.messages import FrameHeader, encode
 from skyloop.transport.base import FEEDBACK, MAX_SUBSCRIPTIONS, Pixels, results, stream, too_many_topics, video
 from skyloop.transport.fabric import layout, packets
 from skyloop.transport.fabric.connection import ServerConnection
+from skyloop.transport.fabric.delivery import Pace
 from skyloop.transport.fabric.frames import FramePublisher, Variant
 from skyloop.transport.fabric.sealing import Sealer
 from skyloop.transport.fabric.session import Session, load
@@ -31,12 +33,15 @@ class Publisher:
         name: The proxy's name.
         run: This run of the proxy.
         sealer: Seals what is published.
+        clock: The monotonic clock [s].
     """
 
-    def __init__(self, name: str, run: str, sealer: Sealer) -> None:
+    def __init__(self, name: str, run: str, sealer: Sealer, clock: Callable[[], float] = time.monotonic) -> None:
         self._name = name
         self._run = bytes.fromhex(run)
         self._sealer = sealer
+        self._clock = clock
+        self.held_back = 0  #: packets that were not sent, as nothing was heard from any subscriber
         self._lock = threading.RLock()  # guards what follows
         self._session: Session | None = None  # while it may publish
         self._subscribed: dict[str, tuple[ServerConnection, ...]] = {}
@@ -66,13 +71,23 @@ class Publisher:
             self._publishers.clear()
 
     def publish(self, topic: str, packet: bytes) -> int:
-        """Send a packet to all subscribers of a topic; return how many of them lag too far behind to take it."""
+        """Send a packet to all subscribers of a topic; return how many of them lag too far behind to take it.
+
+        Where only the newest packet counts and the paths to all of them stand still, most are held back.
+        """
         with self._lock:
             subscribed = self._subscribed.get(topic)
             session = self._session
             if not subscribed or session is None:
                 return 0
-            number = self._numbers[topic] = self._numbers[topic] + 1
+            number, now_s = self._numbers[topic] + 1, self._clock()
+            paces = [connection.paces[topic] for connection in subscribed if topic in connection.paces]
+            if paces and not any(pace.may_send(now_s) for pace in paces):
+                self.held_back += 1
+                return len(subscribed)
+            for pace in paces:
+                pace.sent(number, now_s)
+            self._numbers[topic] = number
             publisher = self._publishers.get(topic)
             if publisher is None and not topic.startswith(_RESULTS):
                 publisher = self._publishers[topic] = self._declare(session, topic)
@@ -126,6 +141,8 @@ class Publisher:
             if topic.startswith(_VIDEO) and not self.video.subscribe(connection.id, topic):
                 return False
             connection.topics[topic] = self._numbers.setdefault(topic, 0)
+            if layout.newest_wins(topic):
+                connection.paces[topic] = Pace()
             self._subscribed[topic] = (*self._subscribed.get(topic, ()), connection)
             return True
 
@@ -146,6 +163,7 @@ class Publisher:
 
     def _forget(self, connection: ServerConnection, topic: str) -> None:
         connection.topics.pop(topic, None)
+        connection.paces.pop(topic, None)
         remaining = tuple(other for other in self._subscribed.get(topic, ()) if other is not connection)
         if remaining:
             self._subscribed[topic] = remaining
@@ -157,7 +175,7 @@ class Publisher:
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
         z = load()
-        newest_wins = topic.partition("?")[0] == FEEDBACK  # in whichever form
+        newest_wins = layout.newest_wins(topic)
         usual = z.Priority.DATA_LOW if topic.startswith(_STREAMS) else z.Priority.DATA  # as for frames
         return session.zenoh.declare_publisher(
             layout.topic(self._name, topic),

@@ -172,6 +172,7 @@ class FabricServer(TransportServer):
         return {
             SUPERSEDED: self._superseded,
             "network.dropped": self._registry.dropped,
+            "network.held_back": self._publisher.held_back,
             "network.refused": self.refused,
             "network.strays": self.strays,
             "network.turned_away": self._registry.turned_away,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
@@ -12,7 +13,7 @@ from skyloop.errors import DecodeError
 from skyloop.messages import FrameHeader
 from skyloop.transport.base import ClientHandler, video
 from skyloop.transport.fabric import layout, packets
-from skyloop.transport.fabric.delivery import DEPTH, AckPolicy, RecentPackets
+from skyloop.transport.fabric.delivery import ACKNOWLEDGE_EVERY_S, DEPTH, AckPolicy, RecentPackets
 from skyloop.transport.fabric.frames import WINDOW
 from skyloop.transport.fabric.sealing import Opener, contents
 from skyloop.transport.fabric.session import Session
@@ -48,7 +49,9 @@ class Subscription:
         self._opener = opener
         self._enqueue = enqueue
         self._reject = reject
-        self._ack_policy = AckPolicy()
+        #: Whether only the newest packet counts: it is sent by datagrams, and so is what acknowledges it.
+        self.newest_wins = layout.newest_wins(topic)
+        self._ack_policy = AckPolicy(ACKNOWLEDGE_EVERY_S) if self.newest_wins else AckPolicy()
         self._recent = RecentPackets()
         self._waiting = 0  # packets
         self._frames: deque[tuple[int, FrameHeader, bytes]] = deque()
@@ -91,7 +94,7 @@ class Subscription:
         if packet:
             self._waiting -= 1
             handler.packet(packet)
-            return packets.taken(self._topic, number) if self._ack_policy.count(number, 0) else b""
+            return packets.taken(self._topic, number) if self._ack_policy.count(number, 0, time.monotonic()) else b""
         number, header, data = self._frames.popleft()
         if self._ended:
             return b""
