@@ -160,8 +160,8 @@ def new_network(state: NDArray[np.float32], action: NDArray[np.float32]) -> Any:
     return Network()
 
 
-def train(network: Any, rows: Rows, epochs: int) -> float:
-    """Learn the teacher's actions from flights as they went, part by part; return the mean squared error."""
+def train(network: Any, rows: Rows, epochs: int) -> None:
+    """Learn the teacher's actions from flights as they went, part by part."""
     import torch
 
     pictures, state, action, first = (torch.from_numpy(each) for each in rows)
@@ -170,7 +170,6 @@ def train(network: Any, rows: Rows, epochs: int) -> float:
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, epochs * (length // STEPS))
     mirrored = torch.tensor([-1.0 if name in ("roll_rad", "velocity_left_m_s") else 1.0 for name in KNOWN])
     mirrored_action = torch.tensor([-1.0 if name in ("left", "yaw_rate") else 1.0 for name in ACTION])
-    total = 0.0
     network.train()
     for epoch in range(epochs):
         streams = (torch.arange(STREAMS * length) + torch.randint(len(state), (1,))) % len(state)
@@ -198,7 +197,6 @@ def train(network: Any, rows: Rows, epochs: int) -> float:
             total += error.item() * STEPS / length
         print(f"epoch {epoch + 1}: mean squared error {total:.3f}", flush=True)
     network.eval()
-    return total
 
 
 def write(network: Any, policy: Path) -> None:
@@ -226,10 +224,9 @@ def learn(folder: Path, rounds: int, flights: int, seconds: float, epochs: int) 
     for number in range(rounds):
         seeds = range(number * flights + 1, (number + 1) * flights + 1)
         known.append(rows_of(record(folder, seeds, seconds, policy if number else None)))
-        rows = tuple(np.concatenate(each) for each in zip(*known, strict=True))
-        if network is None:
-            network = new_network(rows[1], rows[2])
-        train(network, rows, epochs if number in (0, rounds - 1) else epochs // 2)
+        pictures, states, actions, first = (np.concatenate(each) for each in zip(*known, strict=True))
+        network = network or new_network(states, actions)
+        train(network, (pictures, states, actions, first), epochs)
         write(network, policy)
 
 
@@ -261,10 +258,10 @@ def fly(policy: Path, seconds: float, seed: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="of recordings, data sets and policy")
-    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--flights", type=int, default=12, help="of each round")
     parser.add_argument("--seconds", type=float, default=45.0, help="of each flight")
-    parser.add_argument("--epochs", type=int, default=12, help="of the first and the last round; half as many between")
+    parser.add_argument("--epochs", type=int, default=12, help="of each round")
     parser.add_argument("--seeds", type=int, nargs="*", default=range(1000, 1006), help="flights of what was learnt")
     parser.add_argument("--part", choices=["learn", "fly"], help="only this; else both")
     given = parser.parse_args()
