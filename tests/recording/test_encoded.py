@@ -303,8 +303,9 @@ def test_an_emulated_drone_is_recorded_as_it_sends_and_as_its_frames_show(emulat
                 WAIT_S,
             )
     assert recorder.dropped == {}
-    pictures = {picture.header.captured_ns: picture for picture in Recording.open(path).pictures("alpha", "front")}
-    assert next(iter(pictures.values())).record.key
+    recorded = list(Recording.open(path).pictures("alpha", "front"))
+    assert recorded[0].record.key
+    pictures = {picture.header.captured_ns: picture for picture in recorded}
     assert set(live) <= set(pictures)
     assert all(np.array_equal(pictures[at_ns].pixels(), frame) for at_ns, frame in live.items())
     assert all(picture.header.intrinsics is not None for picture in pictures.values())

@@ -5,6 +5,7 @@ https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
 
 from __future__ import annotations
 
+import itertools
 import json
 import struct
 import time
@@ -29,6 +30,7 @@ class Viewer:
         self.parameters: dict[str, Any] = {}
         self.answers: dict[str, list[dict[str, Any]]] = {}
         self._subscribed: dict[int, str] = {}
+        self._numbers = itertools.count(1)  # of subscriptions: what comes late for an old one is not for the next
         self._stack = ExitStack()
         dialled = connect(
             url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_queue=1, max_size=None, close_timeout=0.1
@@ -58,12 +60,12 @@ class Viewer:
     def subscribe(self, *topics: str) -> None:
         self.until(lambda viewer: set(topics) <= viewer.topics.keys(), f"the topics {topics}")
         for topic in topics:
-            number = self.topics[topic]["id"]
+            number = next(self._numbers)
             self._subscribed[number] = topic
-            self._send(op="subscribe", subscriptions=[{"id": number, "channelId": number}])
+            self._send(op="subscribe", subscriptions=[{"id": number, "channelId": self.topics[topic]["id"]}])
 
     def unsubscribe(self, topic: str) -> None:
-        number = self.topics[topic]["id"]
+        number = next(number for number, name in self._subscribed.items() if name == topic)
         del self._subscribed[number]
         self._send(op="unsubscribe", subscriptionIds=[number])
 
