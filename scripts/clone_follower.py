@@ -244,9 +244,10 @@ class Judged(OnnxPolicy):
         return super().look(frame)
 
 
-def fly(policy: Path, seconds: float, seed: int) -> float:
-    """Fly what was learnt, in real time, from before the marker on; return the share of frames that show the marker."""
-    with skyloop.connect(f"sim://?cameras=front&fps={FPS}&seed={seed}") as drone:
+def fly(policy: Path, seconds: float, seed: int, rehearsed: bool) -> float:
+    """Fly what was learnt, from before the marker on; return the share of frames that show the marker."""
+    uri = f"sim://?cameras=front&fps={FPS}&seed={seed}"
+    with rehearse(uri, radio=DIRECT) if rehearsed else skyloop.connect(uri) as drone:
         drone.takeoff()
         FollowMarker(drone, MARKER).run(seconds=8.0)  # finds it
         learnt = Judged(drone, policy)
@@ -263,12 +264,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=45.0, help="of each flight")
     parser.add_argument("--epochs", type=int, default=12, help="of each round")
     parser.add_argument("--seeds", type=int, nargs="*", default=range(1000, 1006), help="flights of what was learnt")
+    parser.add_argument("--rehearsed", action="store_true", help="those flights in simulated time: the same each time")
     parser.add_argument("--part", choices=["learn", "fly"], help="only this; else both")
     given = parser.parse_args()
     if given.part != "fly":
         learn(given.folder, given.rounds, given.flights, given.seconds, given.epochs)
     if given.part != "learn":
-        shares = [fly(given.folder / "policy.onnx", 30.0, seed) for seed in given.seeds]
+        shares = [fly(given.folder / "policy.onnx", 30.0, seed, given.rehearsed) for seed in given.seeds]
         print("flown by what was learnt, the marker in view:", ", ".join(f"{share:.0%}" for share in shares))
         print(f"mean of {len(shares)} flights: {np.mean(shares):.0%}")
 
