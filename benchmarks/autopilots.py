@@ -20,7 +20,7 @@ import skyloop
 from skyloop.cli.demo import MARKER_ID
 from skyloop.control.follow import FollowMarker
 from skyloop.errors import NoAnswerError, RefusedError
-from skyloop.messages import Feedback
+from skyloop.messages import Feedback, FlightState
 from skyloop.messages.geometry import wrap_angle
 
 KINDS: Final = ("ardupilot", "betaflight", "px4")
@@ -146,19 +146,21 @@ def take_off(drone: skyloop.Drone, ready_s: float = READY_S) -> float:
 
 
 def wait_ready(drone: skyloop.Drone, ready_s: float = READY_S) -> None:
-    """Wait until a MAVLink autopilot says that it can be armed; others say nothing."""
+    """Wait until an autopilot is connected and, if it is one that says so (MAVLink), can be armed."""
     until_s = time.monotonic() + ready_s
     while time.monotonic() < until_s:
-        native = drone.feedback().native or {}
-        if native.get("mavlink.ready", not any(name.startswith("mavlink.") for name in native)):
+        feedback = drone.feedback()
+        native = feedback.native or {}
+        heard = feedback.state is not FlightState.UNKNOWN
+        if native.get("mavlink.ready", heard and not any(name.startswith("mavlink.") for name in native)):
             return
         time.sleep(0.2)
 
 
-def fly_square(drone: skyloop.Drone, seconds: float) -> int:
-    """Fly the square again and again, for so long; return the corners that were reached."""
+def fly_square(drone: skyloop.Drone, seconds: float, least_corners: int = 0) -> int:
+    """Fly the square again and again, for so long and until so many corners; return the corners that were reached."""
     until_s, corners = time.monotonic() + seconds, 0
-    while time.monotonic() < until_s:
+    while time.monotonic() < until_s or corners < least_corners:
         x, y = SQUARE[corners % len(SQUARE)]
         try:
             drone.go_to(x=x, y=y, z=HEIGHT_M, speed=0.8, timeout_s=30.0, tolerance_m=0.3)

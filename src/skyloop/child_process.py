@@ -26,19 +26,25 @@ class ChildProcess:
         stdout: What it writes to standard output; open until :meth:`close`.
     """
 
-    def __init__(self, command: Sequence[str], *, keep_errors: bool = True) -> None:
+    def __init__(self, command: Sequence[str], *, keep_errors: bool = True, inherited: Sequence[int] = ()) -> None:
         """Start the child.
 
         Args:
             command: Its command line.
             keep_errors: Keep what it writes to standard error, for :attr:`last_words`; if False, that goes where this
                 process writes its own.
+            inherited: Numbers of descriptors that the child has too.
         """
         self._errors: IO[bytes] | None = tempfile.TemporaryFile() if keep_errors else None  # noqa: SIM115
         self._last_words = ""
         try:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, start_new_session=True
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                start_new_session=True,
+                pass_fds=inherited,
             )
         except BaseException:
             if self._errors is not None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.autopilots import betaflight
+from skyloop.autopilots import apart, betaflight
 from skyloop.autopilots.betaflight import LEAST_SPACING_S, SETTINGS, VARIABLE, Betaflight
 from skyloop.autopilots.coupling import STOPPED
 from skyloop.autopilots.ports import bound
@@ -79,7 +79,25 @@ def test_its_death_stops_the_rotors_and_it_is_started_again_as_it_is(rig: Rig) -
     rig.event(FirmwareEventKind.ANSWERS)
 
 
-def test_one_flies_on_a_computer(rig: Rig) -> None:
+def test_another_flies_in_a_network_of_its_own(rig: Rig, tmp_path: Path) -> None:
+    if not apart.is_possible():
+        pytest.skip("no network of one's own can be had here: it takes root or user namespaces")
+    rig.answered()
+    with flying(lambda on_event: Betaflight(on_event, folder=tmp_path / "other")) as other:
+        other.answered()
+        assert other.firmware.address != rig.firmware.address
+        other.event(FirmwareEventKind.STARTED)
+        other.until(lambda commands: commands == pytest.approx(COMMANDS), "its motors")
+        assert "place=" in (tmp_path / "other" / "states.txt").read_text()
+        os.kill(other.firmware.program.pid, signal.SIGKILL)
+        other.event(FirmwareEventKind.DIED)
+        other.event(FirmwareEventKind.ANSWERS)
+        other.until(lambda commands: commands == pytest.approx(COMMANDS), "the motors of the next")
+    rig.until(lambda commands: commands == pytest.approx(COMMANDS), "the first one's motors")
+
+
+def test_one_flies_where_there_is_one_network(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "is_possible", lambda: False)
     rig.answered()
     with pytest.raises(UsageError, match="no ports are free for another Betaflight: 1 at most"):
         Betaflight(print).start()

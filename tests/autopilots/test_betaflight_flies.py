@@ -16,6 +16,7 @@ import pytest
 
 import skyloop
 from benchmarks.autopilots import compared, follow
+from skyloop.autopilots import apart
 from skyloop.autopilots.betaflight import program_path
 from skyloop.control import FIVE_GATES, FlyThroughGates
 from skyloop.errors import NoAnswerError, RefusedError
@@ -153,6 +154,29 @@ def _lands_without_its_pilot(observer: skyloop.Drone, start: Callable[..., Proce
     observer.wait(lambda feedback: feedback.failsafe is Failsafe.LAND, timeout_s=PATIENCE_S)
     observer.wait("landed", timeout_s=PATIENCE_S)
     eventually(lambda: (observer.feedback().native or {}).get("armed") is False, "it is disarmed", PATIENCE_S)
+
+
+def test_another_flies_in_a_network_of_its_own(start: Callable[..., Process], tmp_path: Path) -> None:
+    if not apart.is_possible():
+        pytest.skip("no network of one's own can be had here: it takes root or user namespaces")
+    words = ("--world", "empty", "--option", "cameras=none", "--option", f"autopilot_folder={tmp_path}")
+    several = start("-m", "skyloop", "sim", "--autopilot", "betaflight", "--drones", "2", *words)
+    several.until("ready sim2", PATIENCE_S)
+    folders = [tmp_path / "drone1", tmp_path / "drone2"]
+    with skyloop.connect("sim1") as one, skyloop.connect("sim2") as two:
+        for drone in (one, two):
+            ready(drone)
+            eventually(lambda drone=drone: drone.feedback().position_m is not None, "it knows where it is")  # type: ignore[misc]
+        places = [drone.feedback().position_m for drone in (one, two)]
+        assert places[0] is not None
+        assert places[1] is not None
+        assert abs(places[0][0] - places[1][0]) > 0.5, "each is told its own place"
+        one.config["msp.aux3"] = 2000
+        eventually(lambda: flags(one) == "PARALYZE", "one has its reason", PATIENCE_S)
+        assert flags(two) == "", "the other has none"
+    assert all(process_in(folder) for folder in folders)
+    several.signal(signal.SIGKILL)
+    eventually(lambda: not any(process_in(folder) for folder in folders), "both end with it", PATIENCE_S)
 
 
 def test_it_flies_a_course_of_gates(proxy: Callable[..., Process]) -> None:

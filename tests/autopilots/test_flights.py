@@ -23,6 +23,7 @@ VARIABLES = {"ardupilot": ardupilot.VARIABLE, "px4": px4.VARIABLE}
 MOST_RMS_DEG = 2.0
 MOST_RMS_M = 0.5
 IN_VIEW = 0.9
+CORNERS = 12  # a minute of them, at the pace of the clock
 
 
 @pytest.fixture(params=sorted(VARIABLES))
@@ -41,14 +42,13 @@ def drone(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_it_flies_a_square_and_follows_the_marker(drone: skyloop.Drone) -> None:
     with compared(drone) as agreement:
-        corners = fly_square(drone, 60.0)
-    assert corners >= 8
+        fly_square(drone, 60.0, least_corners=CORNERS)  # however slow the computer is
     row = agreement.row()
     assert row.samples > 500
     for angle in (row.roll_deg, row.pitch_deg, row.yaw_deg):
         assert angle.rms < MOST_RMS_DEG, row
-    assert row.position_wander_m is not None
-    assert row.position_wander_m.rms < MOST_RMS_M, row
+    assert row.position_m is not None
+    assert row.position_m.rms < MOST_RMS_M, row
     score = follow(drone, 30.0).score
     assert (score.share_in_view or 0.0) >= IN_VIEW, score
     drone.land(timeout_s=60.0)

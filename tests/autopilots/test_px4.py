@@ -17,6 +17,7 @@ from skyloop.autopilots.ports import bound
 from skyloop.autopilots.program import FirmwareEventKind
 from skyloop.autopilots.px4 import STEP_US, STEPS, VARIABLE, Px4
 from skyloop.errors import UsageError
+from skyloop.sim.rotor_parameters import InstrumentParameters
 from tests.autopilots.rig import COMMANDS, FIX, Rig, flying, program
 
 pytestmark = pytest.mark.process
@@ -39,7 +40,8 @@ def free_ports(monkeypatch: pytest.MonkeyPatch) -> None:
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     monkeypatch.setenv(VARIABLE, str(program(tmp_path, "px4")))
     (tmp_path / "etc" / "init.d-posix").mkdir(parents=True)
-    with flying(lambda on_event: Px4(on_event, folder=tmp_path / "kept")) as rig:
+    late = InstrumentParameters(gps_delay_s=0.17)
+    with flying(lambda on_event: Px4(on_event, folder=tmp_path / "kept", instruments=late)) as rig:
         yield rig
 
 
@@ -66,6 +68,12 @@ def test_it_flies_in_step(rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert rig.firmware.address.startswith(
         f"mavlink://udpin:127.0.0.1:{port}?sysid=1&peer=127.0.0.1:{companion}&origin=47"
     )
+
+
+def test_it_is_told_how_late_the_gps_is(rig: Rig, tmp_path: Path) -> None:
+    rig.answered()
+    given = (tmp_path / "kept" / "parameters.txt").read_text().splitlines()
+    assert {"PX4_PARAM_EKF2_GPS_DELAY=170", "PX4_PARAM_SENS_GPS0_DELAY=170", "PX4_PARAM_MPC_THR_HOVER=0.7"} <= {*given}
 
 
 def test_silence_is_an_event_and_blocks_one_step_only(rig: Rig, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -27,7 +28,7 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
-from skyloop.sim import load_world
+from skyloop.sim import load_world, pacing
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 
@@ -289,6 +290,16 @@ def test_bad_values_are_refused(name: str, value: Value, message: str) -> None:
 
 def riding(host: SimHost, drone: int) -> SimDriver:
     return SimDriver(VehicleUri("sim"), host=host, drone=drone)
+
+
+def test_a_computer_that_is_too_slow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pacing, "SLOW_NS", 200_000_000)
+    host = SimHost(SimOptions(world="empty", cameras=(), speed=4.0, most_lag_s=0.02))
+    monkeypatch.setattr(host.simulation, "step", lambda _: time.sleep(0.1))
+    with opened(riding(host, 0)) as (_, heard):
+        assert heard.wait(lambda: any(event.data.get("reason") == "simulation_slow" for event in heard.events), 10.0)
+        text = next(event.text for event in heard.events if event.data.get("reason") == "simulation_slow")
+        assert text.startswith("the computer is too slow for speed=4: the simulation runs at ")
 
 
 def test_several_drones_fly_in_one_world() -> None:

@@ -166,8 +166,8 @@ def test_the_simulated_radio_cuts_the_firmware_s_driver_off() -> None:
 
 
 @pytest.mark.process
-def test_several_fly_in_one_world() -> None:
-    uri = parse_uri(ARDUPILOT)
+def test_several_fly_in_one_world(tmp_path: Path) -> None:
+    uri = parse_uri(f"{ARDUPILOT}&autopilot_folder={tmp_path / 'kept'}")
     host = SimHost(options_of(uri), 2)
     drivers = [SimDriver(uri, host=host, drone=number) for number in range(2)]
     with opened(drivers[0]) as first, opened(drivers[1]) as second:
@@ -176,6 +176,21 @@ def test_several_fly_in_one_world() -> None:
         assert pid_of(drivers[0]) != pid_of(drivers[1])
         assert first.wait(lambda: first.feedback_count > 0, LONG_S)
         assert second.wait(lambda: second.feedback_count > 0, LONG_S)
+    for name in ("drone1", "drone2"):  # settings of one would be those of the other
+        assert (tmp_path / "kept" / name / "skyloop.parm").is_file()
+
+
+@pytest.mark.process
+def test_each_in_a_world_is_flown_by_what_its_own_address_says() -> None:
+    flown = parse_uri(ARDUPILOT)
+    host = SimHost(options_of(flown), 2)
+    built_in = SimDriver(parse_uri("sim://?world=elsewhere&cameras=none"), host=host, drone=1)
+    assert built_in.firmware is None
+    assert built_in.options.world == "empty", "the rest is the world's"
+    with opened(SimDriver(flown, host=host)) as first, opened(built_in) as second:
+        assert first.wait(lambda: happened(first, "firmware_answers"), LONG_S)
+        built_in.apply(Takeoff())
+        assert second.wait(lambda: second.newest is not None and second.newest.state.airborne, LONG_S)
 
 
 def test_the_built_in_autopilot_takes_no_poses() -> None:

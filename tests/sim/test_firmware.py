@@ -334,6 +334,16 @@ def test_noise_and_bias_are_as_large_as_the_parameters_say() -> None:
     assert pressure.mean() == pytest.approx(pressure_pa(1.0), abs=4 * errors.barometer_bias_pa)
 
 
+def test_gyros_keep_their_error_and_accelerometers_do_not() -> None:
+    one = instruments(IRIS, gyro_noise_rad_s=0.0, accelerometer_noise_m_s2=0.0)
+    first, *_, last = read(one, 30_000)
+    errors = InstrumentParameters()
+    moved = np.abs(np.subtract(last.gyro_rad_s, first.gyro_rad_s))
+    assert 0.0 < moved.max() < 0.15 * errors.gyro_bias_rad_s  # 0.045 of it, 1 σ: heading is lost slowly
+    moved = np.abs(np.subtract(last.acceleration_m_s2, first.acceleration_m_s2))
+    assert moved.max() > 0.15 * errors.accelerometer_bias_m_s2
+
+
 def test_gps_comes_in_its_time_with_its_delay() -> None:
     errors = InstrumentParameters()
     fixes = [(reading.time_s, reading.gps) for reading in read(instruments(IRIS), 2000) if reading.gps is not None]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from skyloop.clock import ManualClock
 from skyloop.errors import UsageError
 from skyloop.sim import STEP_S, Pacer
-from skyloop.sim.pacing import MOST_LAG_S
+from skyloop.sim.pacing import MOST_LAG_S, SLOW_AGAIN_NS, SLOW_NS, SlownessWatch
 
 
 class Counter:
@@ -88,3 +89,18 @@ def test_times_of_the_simulation_map_to_the_clock() -> None:
 def test_a_speed_that_is_none_is_refused(speed: float) -> None:
     with pytest.raises(UsageError, match="speed"):
         Pacer(Counter(), speed=speed)
+
+
+def test_a_simulation_that_stays_behind_is_said_now_and_then() -> None:
+    watch, lost_s = SlownessWatch(0), 0.0
+    said = []
+    for n in range(1, 40):
+        now_ns = n * SLOW_NS
+        lost_s += 0.0 if n < 3 else 0.1 if n < 5 else 1.0  # of 5 s each
+        share = watch.update(lost_s, now_ns)
+        assert watch.update(lost_s + 1.0, now_ns + 1) is None, "over a while only"
+        if share is not None:
+            assert share == pytest.approx(0.8)
+            said.append(now_ns)
+    assert said[0] == 5 * SLOW_NS, "a little is no matter"
+    assert [b - a for a, b in itertools.pairwise(said)] == [SLOW_AGAIN_NS] * 2

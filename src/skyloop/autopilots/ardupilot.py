@@ -101,7 +101,8 @@ class ArduCopter(CoupledFirmware):
         """Where it sends MAVLink to. A ground station may use TCP 5762 or 5763; 10 more for each further vehicle."""
         assert self._instance is not None, "not started"
         place = f"{LOOPBACK}:{self._mavlink_port}"
-        return f"mavlink://udpin:{place}?sysid={self._instance + 1}&origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"
+        origin = f"world_origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"  # its own is where it had its first fix
+        return f"mavlink://udpin:{place}?sysid={self._instance + 1}&{origin}"
 
     def _open(self) -> None:
         self._program = find_program(VARIABLE, ("arducopter",), self.NAME, WHERE)

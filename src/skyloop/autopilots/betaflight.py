@@ -1,7 +1,7 @@
 """Betaflight in the simulated world. Its clock is the computer's: it flies in real time only.
 
 Attitude is given to it as it is; gyro, barometer and GPS are the simulation's. Its motors and serial ports have fixed
-numbers, so one flies on a computer.
+numbers, so all but the first on a computer get a network of their own.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Final
 
+from skyloop.autopilots import apart
+from skyloop.autopilots.apart import Apart
 from skyloop.autopilots.coupling import Commands, CoupledFirmware
 from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
-from skyloop.autopilots.program import FirmwareEvent, Launch, find_program, keeper_command
-from skyloop.child_process import ChildProcess
-from skyloop.errors import DecodeError
+from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
+from skyloop.errors import DecodeError, UsageError
 from skyloop.sim.earth import geodetic
 from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.wire.betaflight_sitl import MOTORS_PORT, MSP_PORT, STATE_PORT, FlightState, decode_motors, encode_state
@@ -71,6 +72,7 @@ class Betaflight(CoupledFirmware):
         super().__init__(on_event, folder=folder)
         self._program = ""
         self._instance: int | None = None
+        self._apart: Apart | None = None
         self._motors: socket.socket | None = None
         self._fix: GpsFix | None = None
         self._sent_s = 0.0
@@ -79,11 +81,21 @@ class Betaflight(CoupledFirmware):
     @property
     def address(self) -> str:
         """Its first serial port, by TCP. Betaflight's Configurator connects to the second, ``tcp://127.0.0.1:5762``."""
-        return f"msp://tcp:{LOOPBACK}:{MSP_PORT}"
+        return f"msp://tcp:{LOOPBACK}:{self._msp_port}"
+
+    @property
+    def _msp_port(self) -> int:
+        return MSP_PORT if self._apart is None else self._apart.port
 
     def _open(self) -> None:
         self._program = program_path()
-        self._instance = reserve_instance(self.NAME, 1, _ports)
+        try:
+            self._instance = reserve_instance(self.NAME, 1, _ports)
+        except UsageError:
+            if not apart.is_possible():
+                raise
+            self._apart = Apart(MOTORS_PORT, MSP_PORT)
+            return
         self._motors = bound(socket.SOCK_DGRAM, MOTORS_PORT)
         self._motors.setblocking(False)
 
@@ -91,6 +103,9 @@ class Betaflight(CoupledFirmware):
         if self._motors is not None:
             self._motors.close()
             self._motors = None
+        if self._apart is not None:
+            self._apart.close()
+            self._apart = None
         if self._instance is not None:
             release_instance(self.NAME, self._instance)
             self._instance = None
@@ -102,7 +117,7 @@ class Betaflight(CoupledFirmware):
 
     def _launch(self) -> Launch:
         # Its scheduler drops the flight control loop when that comes 250 µs late, and takes it up again by chance.
-        return Launch((self._program, LOOPBACK), prompt=True)
+        return Launch((self._program, LOOPBACK), prompt=True, apart=self._apart)
 
     def _configure(self, folder: Path) -> None:
         """Write :data:`SETTINGS` as a person would, by the command line on its serial port; it ends when it saves them.
@@ -110,10 +125,10 @@ class Betaflight(CoupledFirmware):
         Raises:
             OSError: It did not come so far.
         """
-        firmware = ChildProcess(keeper_command(self._launch(), folder, "configuring.log"))
+        firmware = self._launch().keep(folder, "configuring.log")
         saved = False
         try:
-            with connected(MSP_PORT, b"#", PROMPT) as link:
+            with connected(self._msp_port, b"#", PROMPT) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
                     if b"ERROR" in _read_until(link, PROMPT):
@@ -129,9 +144,15 @@ class Betaflight(CoupledFirmware):
 
     def _verify(self) -> None:
         """Ask it something on its serial port: one in twenty never listens there, by a race between its threads."""
-        with connected(MSP_PORT, encode(Frame(Function.API_VERSION)), b"$M>"):
+        with connected(self._msp_port, encode(Frame(Function.API_VERSION)), b"$M>"):
             pass
         time.sleep(_PAUSE_S)  # until it is ready for the next: it takes one
+        if self._apart is not None:
+            before, motors = self._motors, self._apart.receive_socket()
+            motors.setblocking(False)
+            self._motors = motors  # at once: the simulation's thread has it
+            if before is not None:
+                before.close()
 
     def _begin(self) -> None:
         self._receive(0.0)  # what the process before may have sent last

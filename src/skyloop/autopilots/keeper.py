@@ -1,7 +1,8 @@
 """Runs a flight firmware as its only child, and ends it when whoever started this process ends.
 
-``python -m skyloop.autopilots.keeper FOLDER LOG [--prompt] NAME=VALUE … -- COMMAND …``: the firmware's process id is
-written to standard output; what the firmware writes is appended to LOG. With ``--prompt`` it is woken before others.
+``python -m skyloop.autopilots.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …``: the firmware's
+process id is written to standard output; what the firmware writes is appended to LOG. With ``--prompt`` it is woken
+before others, with ``--apart`` it gets a network of its own (:mod:`skyloop.autopilots.apart`).
 Exits with the firmware's code, with 128 and the number of the signal that ended it, as a shell does.
 """
 
@@ -15,6 +16,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
+from skyloop.autopilots import apart
 from skyloop.autopilots.prompt import become_prompt
 from skyloop.child_process import on_parent_end
 
@@ -30,6 +32,8 @@ def main(arguments: list[str]) -> int:
     prompt = PROMPT in settings
     if prompt:
         settings.remove(PROMPT)
+    relays = [apart.Relay(setting) for setting in settings if setting.startswith(apart.OPTION)]
+    settings = [setting for setting in settings if not setting.startswith(apart.OPTION)]
     environment = {**os.environ, **dict(setting.split("=", 1) for setting in settings)}
     libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
@@ -50,6 +54,8 @@ def main(arguments: list[str]) -> int:
             preexec_fn=begin,  # noqa: PLW1509  there is one thread yet
         )
     print(firmware.pid, flush=True)
+    for relay in relays:
+        relay.start()
 
     def end() -> None:
         firmware.terminate()

@@ -16,6 +16,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
+from skyloop.autopilots.apart import Apart
 from skyloop.autopilots.keeper import PROMPT
 from skyloop.child_process import ChildProcess
 from skyloop.errors import SkyloopError, UsageError
@@ -53,6 +54,12 @@ class Launch:
     command: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)  #: what it has besides this process's
     prompt: bool = False  #: whether it must be woken on time; see :func:`~skyloop.autopilots.prompt.become_prompt`
+    apart: Apart | None = None  #: of one in a network of its own
+
+    def keep(self, folder: Path, log: str = LOG) -> ChildProcess:
+        """Start it in a folder, by a keeper."""
+        descriptors = () if self.apart is None else self.apart.descriptors
+        return ChildProcess(keeper_command(self, folder, log), inherited=descriptors)
 
 
 class Program:
@@ -148,7 +155,7 @@ class Program:
         with self._lock:
             if self._ending.is_set():
                 return ""
-            child = self._child = ChildProcess(keeper_command(launch, folder))
+            child = self._child = launch.keep(folder)
         try:
             number = child.stdout.readline()
             if not number:
@@ -171,6 +178,7 @@ class Program:
 def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
     """Return how a firmware is run in a folder, as a :class:`~skyloop.child_process.ChildProcess`."""
     settings = [PROMPT] if launch.prompt else []
+    settings += [launch.apart.option] if launch.apart is not None else []
     settings += [f"{name}={value}" for name, value in launch.environment.items()]
     keeper = [sys.executable, "-m", "skyloop.autopilots.keeper", str(folder), str(folder / log)]
     return [*keeper, *settings, "--", *launch.command]

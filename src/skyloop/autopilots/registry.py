@@ -8,16 +8,22 @@ from pathlib import Path
 from skyloop.autopilots.coupling import CoupledFirmware
 from skyloop.autopilots.kinds import AutopilotKind
 from skyloop.autopilots.program import FirmwareEvent
+from skyloop.sim.rotor_parameters import InstrumentParameters
 
 
 def make_firmware(
-    kind: AutopilotKind, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None
+    kind: AutopilotKind,
+    on_event: Callable[[FirmwareEvent], None],
+    *,
+    instruments: InstrumentParameters,
+    folder: Path | None = None,
 ) -> CoupledFirmware:
     """Return a firmware that is not yet started.
 
     Args:
         kind: Which.
         on_event: Called with each event, on the simulation's thread or one of the program; must return quickly.
+        instruments: Of the vehicle that it is to fly.
         folder: Where it runs and keeps its settings; None: a new one, removed at the end.
 
     Raises:
@@ -30,7 +36,7 @@ def make_firmware(
     if kind is AutopilotKind.PX4:
         from skyloop.autopilots.px4 import Px4
 
-        return Px4(on_event, folder=folder)
+        return Px4(on_event, folder=folder, instruments=instruments)
     from skyloop.autopilots.betaflight import Betaflight
 
     return Betaflight(on_event, folder=folder)

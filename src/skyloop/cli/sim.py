@@ -5,6 +5,7 @@ Each has a proxy of its own, or is the firmware of a real drone for other people
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlencode
 
@@ -56,11 +57,11 @@ def sim(
         typer.Option(metavar="KEY=VALUE", help="Any other option of sim://, e.g. cameras=front; may be repeated"),
     ] = None,
     autopilot: Annotated[
-        AutopilotKind | None,
+        list[AutopilotKind] | None,
         typer.Option(
             metavar="KIND",
             help="Real firmware flies the drones: ardupilot, betaflight or px4; its program by SKYLOOP_ARDUCOPTER, "
-            "SKYLOOP_BETAFLIGHT or SKYLOOP_PX4",
+            "SKYLOOP_BETAFLIGHT or SKYLOOP_PX4; several, by repeating it, are given to the drones in turn",
         ),
     ] = None,
     network: ServeOption = None,
@@ -116,12 +117,11 @@ def sim(
     cameras=front.
     """
     from skyloop.cli.simulating import settle
-    from skyloop.drivers.sim import options_of
     from skyloop.drivers.uri import parse_uri
 
-    chosen = [] if autopilot is None else [f"autopilot={autopilot}"]
-    uri = parse_uri(address(world, seed, speed, [*chosen, *(option or [])]))
-    options = options_of(uri)
+    chosen = [[f"autopilot={kind}"] for kind in autopilot] if autopilot else [[]]
+    uris = [parse_uri(address(world, seed, speed, [*each, *(option or [])])) for each in chosen]
+    uri, options = uris[0], _world_options(uris, drones)
     settings = {
         "--bind": bind,
         "--port-base": port_base,
@@ -141,7 +141,7 @@ def sim(
         names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
         warn_if_open(network_settings, names)
         look, beside = key_changes(network_settings), metrics_beside(metrics)
-        _serve_proxies(uri, options, names, server_ends(network_settings), look, beside)
+        _serve_proxies(uris, options, names, server_ends(network_settings), look, beside)
         return
     if metrics is not None:
         raise UsageError("--metrics is of proxies, and with --firmware there is none: leave it out")
@@ -165,8 +165,24 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
         raise UsageError(f"--option {fixed[0]} can't be chosen with --firmware: the emulated drone has its own")
 
 
+def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
+    """Return the options of the world that these drones share.
+
+    Raises:
+        UsageError: An option is not valid, or the drones can't share a world.
+    """
+    from skyloop.drivers.sim import options_of
+
+    if len(uris) > drones:
+        raise UsageError(f"--autopilot is given {len(uris)} times for --drones {drones}: give one for each at most")
+    each = [options_of(uri) for uri in uris]
+    if any(options.parameters != each[0].parameters for options in each):
+        raise UsageError("these --autopilot usually fly different vehicles: choose one, such as --option vehicle=iris")
+    return min(each, key=lambda options: options.most_lag_s)  # one that keeps the computer's time decides
+
+
 def _serve_proxies(
-    uri: VehicleUri,
+    uris: list[VehicleUri],
     options: SimOptions,
     names: list[str],
     make_end: MakeEnd,
@@ -179,8 +195,10 @@ def _serve_proxies(
     from skyloop.sim.host import SimHost
 
     host = SimHost(options, len(names))
-    drivers = [SimDriver(uri, host=host, drone=index) for index in range(len(names))]
-    proxies = [Proxy(driver, make_end(each, str(uri)), name=each) for driver, each in zip(drivers, names, strict=True)]
+    drivers = [SimDriver(uri, host=host, drone=n) for n, uri in zip(range(len(names)), cycle(uris), strict=False)]
+    proxies = [
+        Proxy(driver, make_end(each, str(driver.uri)), name=each) for driver, each in zip(drivers, names, strict=True)
+    ]
     run(proxies, look=look, beside=beside)
 
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.options import SimOptions
-from skyloop.sim.pacing import Pacer
-from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
+from skyloop.sim.pacing import Pacer, SlownessWatch
+from skyloop.sim.reports import Occurrence, OccurrenceKind, VehicleFeedback, VehicleTruth
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world import TargetState, Wind
 
@@ -241,6 +241,7 @@ class _RealTimeStepper:
         self._simulation = host.simulation
         options = host.options
         self._pacer = Pacer(self._simulation.step, speed=options.speed, most_lag_s=options.most_lag_s)
+        self._slowness = SlownessWatch(monotonic_ns())
         self._begun_s = self._simulation.time_s
         self._publisher = ReportPublisher(host, self._start_pipeline)
         self._stop = threading.Event()
@@ -268,9 +269,19 @@ class _RealTimeStepper:
             while not self._stop.wait(max(self._pacer.run_due(), least_s)):
                 with self._publishing:
                     self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
+                    self._report_slowness()
         except Exception as error:  # noqa: BLE001  reported to every driver, so that the thread does not die silently
             for observer, _ in self._host.observers.values():
                 observer.failed(error)
+
+    def _report_slowness(self) -> None:
+        share = self._slowness.update(self._pacer.lost_s, monotonic_ns())
+        if share is None:
+            return
+        speed = self._host.options.speed
+        text = f"the computer is too slow for speed={speed:g}: the simulation runs at {share * speed:.2g}"
+        for drone, (observer, _) in self._host.observers.items():
+            observer.happened(Occurrence(OccurrenceKind.SLOW, drone, self._simulation.time_s, text))
 
     def _start_pipeline(self) -> Exposing:
         from skyloop.sim.camera_pipeline import CameraPipeline

@@ -52,7 +52,8 @@ class Instruments:
             errors.gps_bias_m,
             errors.gps_bias_m * _GPS_VERTICAL,
         )
-        self._wandering = _wandering(seed, drone, np.array(deviations), errors.bias_time_constant_s)
+        constants_s = [errors.gyro_time_constant_s] * 3 + [errors.bias_time_constant_s] * (len(deviations) - 3)
+        self._wandering = _wandering(seed, drone, np.array(deviations), np.array(constants_s))
         self._bias = next(self._wandering)
         self._magnetometer_steps, self._barometer_steps, self._gps_steps, self._range_steps, self._flow_steps = (
             _steps(period_s)
@@ -193,12 +194,12 @@ def _rows(seed: int, drone: int, instrument: int, count: int) -> Iterator[tuple[
 
 
 def _wandering(
-    seed: int, drone: int, deviations: np.typing.NDArray[np.float64], constant_s: float
+    seed: int, drone: int, deviations: np.typing.NDArray[np.float64], constants_s: np.typing.NDArray[np.float64]
 ) -> Iterator[list[float]]:
-    """Yield biases for ever: a first-order Gauss-Markov process, every :data:`_WANDER_STEPS`."""
+    """Yield biases for ever: first-order Gauss-Markov processes, every :data:`_WANDER_STEPS`."""
     generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + 7)
-    keep = math.exp(-_WANDER_STEPS * PLANT_STEP_S / constant_s)
-    fresh = math.sqrt(1.0 - keep * keep)
+    keep = np.exp(-_WANDER_STEPS * PLANT_STEP_S / constants_s)
+    fresh = np.sqrt(1.0 - keep * keep)
     bias = deviations * generator.standard_normal(len(deviations))
     while True:
         yield bias.tolist()

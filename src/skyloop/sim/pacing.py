@@ -11,6 +11,9 @@ from skyloop.sim.dynamics import STEP_S
 
 MOST_LAG_S = 0.25
 _LONGEST_RUN_STEPS = 25
+SLOW_SHARE = 0.95  #: a simulation that reaches less of its speed is too slow,
+SLOW_NS = 5 * NS_PER_S  #: over this time,
+SLOW_AGAIN_NS = 60 * NS_PER_S  #: which is said again after this one
 
 
 class Pacer:
@@ -77,3 +80,33 @@ class Pacer:
 
     def _due_ns(self, step: float) -> int:
         return self._start_ns + round(step * self._ns_per_step)
+
+
+class SlownessWatch:
+    """Finds that a computer is too slow for a simulation, by what its :class:`Pacer` gave up. Pure.
+
+    Args:
+        now_ns: When the simulation begins.
+    """
+
+    def __init__(self, now_ns: int) -> None:
+        self._since_ns = now_ns
+        self._lost_s = 0.0
+        self._said_ns: int | None = None
+
+    def update(self, lost_s: float, now_ns: int) -> float | None:
+        """Return the share of its speed that the simulation reaches, when that is to be said; usually None.
+
+        Args:
+            lost_s: What was given up so far.
+            now_ns: The present time.
+        """
+        passed_ns = now_ns - self._since_ns
+        if passed_ns < SLOW_NS:
+            return None
+        share = 1.0 - (lost_s - self._lost_s) * NS_PER_S / passed_ns
+        self._since_ns, self._lost_s = now_ns, lost_s
+        if share >= SLOW_SHARE or (self._said_ns is not None and now_ns - self._said_ns < SLOW_AGAIN_NS):
+            return None
+        self._said_ns = now_ns
+        return share

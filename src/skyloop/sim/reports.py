@@ -54,6 +54,7 @@ class OccurrenceKind(StrEnum):
     COLLISION = "collision"
     EMERGENCY = "emergency"
     BATTERY_LOW = "battery_low"
+    SLOW = "slow"  #: to all: the computer is too slow for the speed that was asked for
 
 
 @dataclass(frozen=True, slots=True)

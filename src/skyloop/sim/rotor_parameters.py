@@ -22,7 +22,7 @@ class InstrumentParameters:
     """Errors, rates and delays of a vehicle's instruments.
 
     ``noise`` is the standard deviation of a sample, ``bias`` that of an error that a flight starts with and that
-    wanders with the time constant. ``docs/rotors.md`` says where the defaults come from.
+    wanders with the time constant, the gyro's with its own. ``docs/rotors.md`` says where the defaults come from.
 
     Raises:
         UsageError: A value is not finite or negative, or zero where it has to be more.
@@ -36,12 +36,13 @@ class InstrumentParameters:
     magnetometer_bias_gauss: float = 0.005
     barometer_noise_pa: float = 1.2
     barometer_bias_pa: float = 2.0
-    gps_noise_m: float = 0.05
-    gps_bias_m: float = 0.15
+    gps_noise_m: float = 0.005
+    gps_bias_m: float = 0.007
     gps_velocity_noise_m_s: float = 0.05
     range_noise_m: float = 0.01
     flow_noise_rad_s: float = 0.05
     bias_time_constant_s: float = 300.0
+    gyro_time_constant_s: float = 30000.0
     magnetometer_period_s: float = 0.01
     barometer_period_s: float = 0.02
     gps_period_s: float = 0.1

@@ -1,7 +1,8 @@
 """Stands in for PX4's program: its link to a simulator, without anything that flies.
 
 It answers from its fifth ``HIL_SENSOR`` on, as PX4 needs some to start. Its rotors get 0.1, 0.2, 0.3 and 0.4 in PX4's
-order. A line for each message goes to ``messages.txt`` where it runs.
+order. A line for each message goes to ``messages.txt`` where it runs, and the parameters that it is given to
+``parameters.txt``.
 """
 
 import os
@@ -16,6 +17,8 @@ instance = int(sys.argv[sys.argv.index("-i") + 1])
 files = Path(sys.argv[sys.argv.index("-d") + 1])
 assert (files / "init.d-posix").is_dir()
 assert os.environ["PX4_SIM_MODEL"] == "none_iris"
+given = sorted(f"{name}={value}\n" for name, value in os.environ.items() if name.startswith("PX4_PARAM_"))
+Path("parameters.txt").write_text("".join(given))
 codec = Codec(1, 1)
 while True:
     try:

@@ -46,6 +46,7 @@ def test_ways(text: str, way: ConnectionKind, place: str, number: int) -> None:
         ("mavlink://udpin:0.0.0.0:14550?speed=99", "speed"),
         ("mavlink://udpin:0.0.0.0:14550?takeoff_altitude=8", "above the ceiling of 3 m: raise that too"),
         ("mavlink://udpin:0.0.0.0:14550?origin=91,0,0", "origin"),
+        ("mavlink://udpin:0.0.0.0:14550?world_origin=47", "world_origin=47.3977,8.5456,488"),
         ("mavlink://udpin:0.0.0.0:14550?pose=mocap", "odometry"),
         ("mavlink://udpin:0.0.0.0:14550?signing_key=/nowhere", "can't be read"),
         ("mavlink://udpin:0.0.0.0:14550?camera_fps=30", "give camera="),

@@ -10,11 +10,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skyloop.drivers.base import ExternalPose
+from skyloop.drivers.mavlink.microservices import pose_message
+from skyloop.drivers.mavlink.options import PoseMessage
 from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession
 from skyloop.drivers.mavlink.setpoints import STEP_NS, Goal
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
-from skyloop.messages import EmergencyStop, FlightState, Hover, Idle, Land, LinkState, Severity, Takeoff, Velocity
+from skyloop.messages import (
+    EmergencyStop,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    LinkState,
+    Position,
+    Severity,
+    Takeoff,
+    Velocity,
+)
 from skyloop.wire.mavlink.codec import Codec
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.texts import chunks_of
@@ -394,6 +408,40 @@ def test_where_its_axes_begin_on_the_earth_is_known_with_a_fix(autopilot: int) -
     assert (origin.latitude_deg, origin.longitude_deg) == pytest.approx((0.0, 0.0), abs=2e-7)
     assert origin.altitude_m == pytest.approx(488.0)
     assert origin.position_of(north_e7 / 1e7, east_e7 / 1e7, 508.0) == pytest.approx((50.0, 100.0, 20.0), abs=0.02)
+
+
+@AUTOPILOTS
+def test_positions_are_counted_from_the_worlds_origin(autopilot: int) -> None:
+    world = options("mavlink://udpin:127.0.0.1:14540?parameters=no&world_origin=0,0,480")
+    bench = Bench(Vehicle(autopilot), world)
+    bench.hear(bench.vehicle.heartbeat())
+    bench.tick()
+    assert m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN in [each.param1 for each in bench.heard_of("COMMAND_LONG")]
+    bench.flying("GUIDED" if autopilot == ARDUPILOT else "OFFBOARD")
+    assert bench.newest.position_m is None, "where the autopilot's own axes begin is not known yet"
+    bench.hear(m.MAVLink_gps_global_origin_message(898, -180, 488_000))  # 10 m north, 2 m west, 8 m up
+    bench.go_on(0.1)
+    assert bench.newest.position_m == pytest.approx((-2.0, 10.0, 11.0), abs=0.02)
+    bench.apply(Position(x=-1.0, y=10.0, z=11.0))
+    bench.go_on(2.0)
+    sent = bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")[-1]
+    assert (sent.x, sent.y, sent.z) == pytest.approx((0.0, 1.0, -3.0), abs=0.02), "in the autopilot's own axes"
+    bench.go_on(3.0, silent=True)
+    bench.go_on(0.5)
+    assert bench.newest.position_m is None, "it was lost and found: it may have begun anew"
+
+
+def test_poses_from_outside_are_told_in_the_autopilots_axes() -> None:
+    bench = Bench(Vehicle(PX4), options("mavlink://udpin:127.0.0.1:14540?parameters=no&world_origin=0,0,480")).found()
+    pose = ExternalPose((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), bench.clock())
+    bench.session.send(pose_message(pose, PoseMessage.ODOMETRY))
+    bench.tick()
+    assert not bench.heard_of("ODOMETRY"), "they are not known yet"
+    bench.hear(m.MAVLink_gps_global_origin_message(898, 0, 480_000))
+    bench.session.send(pose_message(pose, PoseMessage.ODOMETRY))
+    bench.tick()
+    (told,) = bench.heard_of("ODOMETRY")
+    assert (told.x, told.y, told.z) == pytest.approx((2.0 - 10.0, 1.0, -3.0), abs=0.02)
 
 
 def test_places_of_different_times_are_not_taken_together() -> None:

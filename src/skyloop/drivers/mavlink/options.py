@@ -65,7 +65,7 @@ _EXAMPLES: Final = (
 )
 _HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 KNOWN: Final = {
-    *("sysid", "peer", "own_sysid", "rate", "parameters", "signing_key", "origin", "pose"),
+    *("sysid", "peer", "own_sysid", "rate", "parameters", "signing_key", "origin", "world_origin", "pose"),
     *(limit.option for limit in OWN_LIMITS),
     *("camera", "camera_name", "camera_width", "camera_height", "camera_fps", "camera_facing", "camera_stream"),
     *INTRINSICS_OPTIONS,
@@ -132,6 +132,7 @@ class MavlinkOptions:
     parameters: bool = True  #: whether they are read
     key: bytes | None = None
     origin: tuple[float, float, float] | None = None  #: latitude and longitude [degrees], altitude [m]
+    world_origin: tuple[float, float, float] | None = None  #: the same
     pose: PoseMessage = PoseMessage.ODOMETRY
     camera: CameraOptions | None = None
 
@@ -164,7 +165,8 @@ def options_of(uri: VehicleUri) -> MavlinkOptions:
         limits=limits,
         parameters=uri.flag("parameters", default=True),
         key=_key(uri),
-        origin=_origin(uri),
+        origin=_origin(uri, "origin"),
+        world_origin=_origin(uri, "world_origin"),
         pose=_pose(uri),
         camera=_camera(uri),
     )
@@ -213,8 +215,8 @@ def _key(uri: VehicleUri) -> bytes | None:
     return bytes.fromhex(text)
 
 
-def _origin(uri: VehicleUri) -> tuple[float, float, float] | None:
-    given = uri.options.get("origin")
+def _origin(uri: VehicleUri, option: str) -> tuple[float, float, float] | None:
+    given = uri.options.get(option)
     if given is None:
         return None
     try:
@@ -222,7 +224,7 @@ def _origin(uri: VehicleUri) -> tuple[float, float, float] | None:
     except ValueError:
         latitude = longitude = altitude = float("nan")
     if not (abs(latitude) <= 90 and abs(longitude) <= 180 and abs(altitude) <= 10_000):
-        raise UsageError(f"{uri}: origin is {given!r}; it looks like origin=47.3977,8.5456,488 (degrees and m)")
+        raise UsageError(f"{uri}: {option} is {given!r}; it looks like {option}=47.3977,8.5456,488 (degrees and m)")
     return latitude, longitude, altitude
 
 

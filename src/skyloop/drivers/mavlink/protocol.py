@@ -21,6 +21,7 @@ from skyloop.drivers.mavlink.options import ConnectionKind, MavlinkOptions, Peer
 from skyloop.drivers.mavlink.parameters import ParameterExchange
 from skyloop.drivers.mavlink.setpoints import SetpointController
 from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
+from skyloop.drivers.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Severity, Value
@@ -70,6 +71,7 @@ class MavlinkSession(VehicleSession):
         self.setpoints: SetpointController | None = None  #: None until then, and for what can't be flown
         self.version: Message | None = None  #: its AUTOPILOT_VERSION
         self.limits = options.limits  #: the driver's own
+        self._axes = WorldAxes(options.world_origin)
         self._extra = extra
         self._selector = VehicleSelector(options.system, options.peer)
         self._health = HealthMonitor()
@@ -181,6 +183,8 @@ class MavlinkSession(VehicleSession):
             self._find(message, now_ns)
         self._received_ns = now_ns
         self._old = message.get_msgbuf()[0] == m.PROTOCOL_MARKER_V1
+        if self.autopilot is not None and not self._axes.received(message, self.autopilot.EARTH_RADIUS_M):
+            return
         if kind not in _ANSWERS:
             self.telemetry.on_message(message, now_ns)
         self._dispatch(kind, message, now_ns)
@@ -253,7 +257,7 @@ class MavlinkSession(VehicleSession):
             vehicle = self.vehicle_state(now_ns)
             out += self._fly(vehicle, now_ns)
             self._check_health(vehicle, now_ns)
-        packets += [(self._encoded(message), peer) for message in out]
+        packets += [(self._encoded(message), peer) for message in out if self._axes.sent(message)]
         self.due_ns = self._next_ns(now_ns)
         return packets
 
@@ -326,6 +330,7 @@ class MavlinkSession(VehicleSession):
     def _lose(self, reason: str, now_ns: int) -> None:
         self._received_ns = self._said = None
         self._selector.forget()
+        self._axes.forget()
         self.parameters.fail_writes(reason)
         self.commands.reset()
         self._out.clear()
@@ -342,7 +347,10 @@ class MavlinkSession(VehicleSession):
         if self.autopilot is None:
             self._identify(heartbeat)
         if self.autopilot is not None:
-            self._intervals = MessageIntervals(self.autopilot.message_rates(self.options.rate_hz))
+            rates = self.autopilot.message_rates(self.options.rate_hz)
+            if self._axes.begin is not None:
+                rates = {ORIGIN: ORIGIN_HZ, **rates}
+            self._intervals = MessageIntervals(rates)
         if self.options.origin is not None:
             self._out.append(_origin(target[0], self.options.origin))
         if self.options.parameters and not self.parameters.complete:

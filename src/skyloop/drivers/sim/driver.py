@@ -43,6 +43,7 @@ _OCCURRENCES: Final = {
     OccurrenceKind.COLLISION: (EventKind.COLLISION, Severity.WARNING),
     OccurrenceKind.EMERGENCY: (EventKind.EMERGENCY, Severity.ERROR),
     OccurrenceKind.BATTERY_LOW: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
+    OccurrenceKind.SLOW: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
 }
 
 
@@ -59,14 +60,17 @@ class SimDriver(Driver):
     ``docs/autopilots.md``.
 
     Args:
-        uri: The vehicle's address; its options count only without a host.
+        uri: The vehicle's address. With a host, only what it says of firmware counts: the rest is the host's.
         host: A world that is shared; None: :meth:`open` makes one.
         drone: Its number in the host.
     """
 
     def __init__(self, uri: VehicleUri, *, host: SimHost | None = None, drone: int = 0) -> None:
         super().__init__(uri)
-        self.options = options_of(uri) if host is None else host.options
+        own = options_of(uri)
+        self.options = own
+        if host is not None:
+            self.options = replace(host.options, autopilot=own.autopilot, autopilot_folder=own.autopilot_folder)
         self.drone = drone
         self.host = host  #: the world; None until a driver with a world of its own is opened
         self._shared = host is not None
@@ -286,7 +290,8 @@ class SimDriver(Driver):
         if occurrence.kind is OccurrenceKind.COLLISION:
             sink.event(kind, occurrence.text, severity, speed_m_s=occurrence.speed_m_s)
         else:
-            sink.event(kind, occurrence.text, severity, reason=occurrence.text)
+            reason = "simulation_slow" if occurrence.kind is OccurrenceKind.SLOW else occurrence.text
+            sink.event(kind, occurrence.text, severity, reason=reason)
 
     def wants(self, camera: str) -> bool:
         """Return whether anybody would see an image of this camera."""

@@ -35,6 +35,7 @@ from skyloop.messages import (
 )
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.sim.rotor_dynamics import rotors_of
 
 #: Of a driver that has not been opened: what its kind of vehicle can do does not depend on where it is.
 _SOMEWHERE: Final = {
@@ -120,7 +121,10 @@ class FirmwareFlight:
         """
         self._host, self._drone, self._sink = host, drone, sink
         folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
-        self._firmware = firmware = make_firmware(self.kind, self._happened, folder=folder)
+        if folder is not None and host.drones > 1:
+            folder /= f"drone{drone + 1}"  # each has settings of its own
+        instruments = rotors_of(host.simulation.parameters[drone]).instruments
+        self._firmware = firmware = make_firmware(self.kind, self._happened, instruments=instruments, folder=folder)
         self._linked = True
         sink.link(LinkState.CONNECTING, f"{_NAMES[self.kind]} is being started")
         firmware.start()
