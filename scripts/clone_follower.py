@@ -1,16 +1,22 @@
-"""Clones a controller: records how FollowMarker flies, learns it from pictures and state, and flies what it learnt.
+"""Clones a controller: the marker follower teaches a network that sees pictures and state, and the network flies.
 
     pip install 'skyloop[all]' torch onnx
-    python -m scripts.clone_follower clone                         # into this folder; half an hour on two cores
-    python -m scripts.clone_follower clone --flights 2 --epochs 1  # does it work here?
+    python -m scripts.clone_follower clone                                   # into this folder
+    python -m scripts.clone_follower clone --rounds 1 --flights 1 --epochs 1 # does it work here?
 
-The flights are recordings like any others: those of a real drone are learnt from in the same way.
+The lessons are flights in simulated time. In the first round the teacher flies, in all others mostly the network as it
+is by then, and always the teacher's answer to each picture is what is learnt: so the network learns from its own
+mistakes (DAgger: Ross, Gordon and Bagnell, "A reduction of imitation learning and structured prediction to no-regret
+online learning", AISTATS 2011). The recordings are like any others: a real drone's are learnt from in the same way.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from concurrent.futures import ProcessPoolExecutor
+from itertools import repeat
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -22,132 +28,175 @@ from numpy.typing import NDArray
 
 import skyloop
 from skyloop.clock import nanoseconds
-from skyloop.control import FollowMarker, OnnxPolicy
-from skyloop.control.follow_law import Mode
+from skyloop.control import FollowMarker, OnnxPolicy, PolicyNetwork
+from skyloop.control.rehearsal import Radio, rehearse
 from skyloop.logfile.reader import Recording
 from skyloop.messages import Attitude, Velocity
 from skyloop.messages.annotation import Shape
+from skyloop.messages.rows import ACTIONS, state_row
 from skyloop.recording.review.lerobot import export_lerobot
 from skyloop.vision import MarkerDetector
+from skyloop.vision.planar import pixels_of
 
 TASK = "follow the marker"
 MARKER = 7  # that somebody carries about in the simulated room
-WIDTH, HEIGHT = 96, 72  # of the pictures that the network takes
+FPS = 15
+WIDTH, HEIGHT = 64, 48  # of the pictures that the network takes
+MEMORY = 64  # numbers that it keeps from picture to picture
+STREAMS, STEPS = 12, 8  # learnt from at once: so many parts of flights, so many pictures of each
 KNOWN = ["roll_rad", "pitch_rad", "altitude_m", "velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s"]
+ACTION = ACTIONS["velocity"]
+DIRECT = Radio(command_delay_s=0, feedback_delay_s=0, picture_delay_s=0, drop=0, position_noise_m=0)
 
 
-class Disturbed(FollowMarker):
-    """The teacher, pushed aside now and then: what is learnt must know the way back, which a good teacher never shows.
+class Lesson(FollowMarker):
+    """The teacher answers each picture; by turns its answer is flown, the pupil's, or a push aside."""
 
-    Marks part the flight: a push is an episode of less than a second, which the export leaves out.
-    """
-
-    def __init__(self, drone: skyloop.Drone, seed: int) -> None:
+    def __init__(self, drone: skyloop.Drone, seed: int, pupil: PolicyNetwork | None) -> None:
         super().__init__(drone, MARKER)
         self.random = np.random.default_rng(seed)
-        self.until_ns = 0
-        self.pushed = False
+        self.pupil = pupil
+        self.answer: Velocity | Attitude | None = None  # the pupil's
+        self.pilot, self.until_ns = "teacher", 0
         self.push = Velocity()
+        self.captured_ns = 0
+
+    def look(self, frame: skyloop.Frame) -> list[Shape]:
+        row = None if frame.feedback is None else state_row(frame.feedback, KNOWN)
+        # Whoever flies, the pupil looks on, so that it remembers.
+        self.answer = None if self.pupil is None or row is None else self.pupil(pixels_of(frame), row)
+        self.captured_ns = frame.captured_ns
+        return super().look(frame)
 
     def fly(self, now_ns: int) -> None:
-        if self.mode is Mode.FOLLOWING and now_ns >= self.until_ns:
-            self.pushed = not self.pushed
-            self.until_ns = now_ns + nanoseconds(0.7 if self.pushed else self.random.uniform(1.5, 3.0))
+        if now_ns >= self.until_ns:
+            pushed = self.pilot != "push" and self.random.random() < 0.4
+            flies = "teacher" if self.pupil is None or self.random.random() < 0.25 else "pupil"
+            self.pilot = "push" if pushed else flies
+            self.until_ns = now_ns + nanoseconds(
+                self.random.uniform(0.3, 1.0) if pushed else self.random.uniform(1.5, 4.0)
+            )
             self.push = Velocity(*(self.random.uniform(-1, 1, 4) * (0.5, 0.5, 0.3, 1.2)).tolist())
-            self.drone.log.text("pushed" if self.pushed else TASK, name="mark")
         super().fly(now_ns)
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        super().steer(self.push if self.pushed and self.mode is Mode.FOLLOWING else wanted)
+        self.drone.log.array("action", [getattr(wanted, name) for name in ACTION], at_ns=self.captured_ns)
+        super().steer({"teacher": wanted, "push": self.push, "pupil": self.answer or wanted}[self.pilot])
 
 
-def record(folder: Path, flights: int, seconds: float) -> list[Path]:
-    """Fly the teacher, every second time disturbed; each flight has noise and gusts of its own."""
-    paths = [folder / f"flight-{number}.mcap" for number in range(flights)]
-    for number, path in enumerate(paths):
-        with skyloop.connect(f"sim://?cameras=front&fps=15&wind=2&seed={number + 1}") as drone:
-            drone.takeoff()
-            with skyloop.record(drone, path, overwrite=True):
-                follower = Disturbed(drone, number) if number % 2 else FollowMarker(drone, MARKER)
-                follower.run(seconds=seconds)
-            drone.land()
-        print(f"{path}: the marker was in view in {follower.score.share_in_view or 0.0:.0%} of the frames", flush=True)
-    return paths
+def fly_lesson(path: Path, seed: int, seconds: float, policy: Path | None) -> float:
+    """Record a lesson, in noise and gusts of its own; return the share of frames that show the marker."""
+    with rehearse(f"sim://?cameras=front&fps={FPS}&wind=2&seed={seed}", radio=DIRECT) as drone:
+        drone.takeoff()
+        with skyloop.record(drone, path, channels=["feedback", "commands", "logs", "video"], overwrite=True):
+            lesson = Lesson(drone, seed, None if policy is None else PolicyNetwork(policy))
+            lesson.run(seconds=seconds)
+        drone.land()
+    return lesson.score.share_in_view or 0.0
 
 
-def rows_of(dataset: Path) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
-    """Pictures (n, 3, HEIGHT, WIDTH) uint8 in red, green, blue; states (n, 6); actions (n, 4)."""
+def record(folder: Path, seeds: range, seconds: float, policy: Path | None) -> Path:
+    """Fly lessons, as many at a time as there are cores, and export them; return the data set."""
+    paths = [folder / f"flight-{seed}.mcap" for seed in seeds]
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
+        each = repeat(seconds), repeat(policy)
+        for path, share in zip(paths, pool.map(fly_lesson, paths, seeds, *each), strict=True):
+            print(f"{path}: the marker was in view in {share:.0%} of the frames", flush=True)
+    dataset = folder / f"dataset-{seeds[0]}"
+    found = export_lerobot([Recording.open(path) for path in paths], dataset, cameras=["front"], fps=FPS, task=TASK)
+    print(f"{dataset}: {found.episodes} episodes, {found.rows} rows", flush=True)
+    return dataset
+
+
+Rows = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
+
+
+def rows_of(dataset: Path) -> Rows:
+    """Pictures (n, 3, HEIGHT, WIDTH) in red, green, blue; states (n, 6); actions (n, 4); where episodes begin (n,)."""
     table = pq.read_table(dataset / "data" / "chunk-000" / "file-000.parquet")
     names = json.loads((dataset / "meta" / "info.json").read_text())["features"]["observation.state"]["names"]
     state = np.array(table["observation.state"].to_pylist(), np.float32)[:, [names.index(name) for name in KNOWN]]
     with av.open(str(dataset / "videos" / "observation.images.front" / "chunk-000" / "file-000.mp4")) as film:
         whole = (frame.to_ndarray(format="rgb24") for frame in film.decode(video=0))
         pictures = [cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for image in whole]
-    seen = np.stack(pictures).transpose(0, 3, 1, 2).astype(np.uint8, copy=False)
-    return seen, state, np.array(table["action"].to_pylist(), np.float32)
+    seen = np.stack(pictures).transpose(0, 3, 1, 2).astype(np.uint8)
+    return seen, state, np.array(table["action"].to_pylist(), np.float32), table["frame_index"].to_numpy() == 0
 
 
-def train(dataset: Path, policy: Path, epochs: int) -> float:
-    """Learn the action of each row, and write the network; return its RMS error on rows that it has not learnt from."""
+def new_network(state: NDArray[np.float32], action: NDArray[np.float32]) -> Any:
+    """A network that has not learnt yet, for numbers like these."""
     import torch
     from torch import nn
 
-    pictures, state, action = rows_of(dataset)
-    torch.manual_seed(0)
-    mean, spread, scale = state.mean(0), state.std(0) + 1e-3, action.std(0) + 1e-2
-
-    class Policy(nn.Module):  # type: ignore[misc]
+    class Network(nn.Module):  # type: ignore[misc]
         def __init__(self) -> None:
             super().__init__()
-            steps = [(3, 24), (24, 32), (32, 48), (48, 64)]
-            self.see = nn.Sequential(
-                *(layer for a, b in steps for layer in (nn.Conv2d(a, b, 5, 2, 2), nn.BatchNorm2d(b), nn.ReLU())),
+            layers = [(3, 16, 5), (16, 32, 3), (32, 48, 3), (48, 64, 3)]
+            self.eyes = nn.Sequential(
+                *(each for a, b, k in layers for each in (nn.Conv2d(a, b, k, 2, k // 2), nn.BatchNorm2d(b), nn.ReLU())),
                 nn.Flatten(),
                 nn.Dropout(0.1),
-                nn.Linear(64 * (HEIGHT // 16 + (HEIGHT % 16 > 0)) * (WIDTH // 16), 64),
+                nn.Linear(64 * (HEIGHT // 16) * (WIDTH // 16), 64),
                 nn.ReLU(),
             )
-            self.act = nn.Sequential(nn.Linear(64 + len(KNOWN), 64), nn.ReLU(), nn.Linear(64, action.shape[1]))
-            self.mean, self.spread, self.scale = (nn.Buffer(torch.tensor(each)) for each in (mean, spread, scale))
-
-        def forward(self, picture: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
-            known = (state - self.mean) / self.spread
-            return self.act(torch.cat([self.see(picture), known], 1)) * self.scale
-
-    # The last tenth of the rows is kept apart: rows beside each other are too much alike to judge by.
-    count = len(pictures) * 9 // 10
-    seen, known, wanted = torch.from_numpy(pictures), torch.from_numpy(state), torch.from_numpy(action)
-    network = Policy()
-    optimiser = torch.optim.AdamW(network.parameters(), 1e-3, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, epochs * (count // 64 + 1))
-    mirrored_state = torch.tensor([name in ("roll_rad", "velocity_left_m_s") for name in KNOWN])
-    mirrored_action = torch.tensor([False, True, False, True])
-    weights = 1 / torch.from_numpy(scale)
-    for epoch in range(epochs):
-        network.train()
-        total = 0.0
-        for batch in torch.randperm(count).split(64):
-            picture = seen[batch].float() / 255
-            flip = torch.rand(len(batch)) < 0.5  # in a mirror, left is right
-            picture = torch.where(flip[:, None, None, None], picture.flip(3), picture)
-            side = torch.where(flip[:, None], -1.0, 1.0)
-            state_sign = torch.where(mirrored_state, side, torch.ones_like(side))
-            action_sign = torch.where(mirrored_action, side, torch.ones_like(side))
-            picture = (picture * (0.7 + 0.6 * torch.rand(len(batch), 1, 1, 1))).clamp(0, 1)  # in other light
-            error = (
-                ((network(picture, known[batch] * state_sign) - wanted[batch] * action_sign) * weights).square().mean()
+            self.remember = nn.GRUCell(64 + len(KNOWN), MEMORY)
+            self.act = nn.Sequential(nn.Linear(64 + len(KNOWN) + MEMORY, 64), nn.ReLU(), nn.Linear(64, len(ACTION)))
+            self.mean, self.spread = (
+                nn.Buffer(torch.tensor(state.mean(0))),
+                nn.Buffer(torch.tensor(state.std(0) + 1e-3)),
             )
+            self.scale = nn.Buffer(torch.tensor(action.std(0) + 1e-2))
+
+        def see(self, pictures: torch.Tensor, states: torch.Tensor) -> torch.Tensor:
+            return torch.cat([self.eyes(pictures), (states - self.mean) / self.spread], 1)
+
+        def decide(self, seen: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            memory = self.remember(seen, memory)
+            return self.act(torch.cat([seen, memory], 1)) * self.scale, memory
+
+        def forward(self, picture: torch.Tensor, state: torch.Tensor, memory: torch.Tensor) -> Any:
+            return self.decide(self.see(picture, state), memory)
+
+    return Network()
+
+
+def train(network: Any, rows: Rows, epochs: int) -> None:
+    """Learn the teacher's actions from flights as they went, part by part."""
+    import torch
+
+    pictures, state, action, first = (torch.from_numpy(each) for each in rows)
+    length = len(state) // STREAMS // STEPS * STEPS
+    optimiser = torch.optim.AdamW(network.parameters(), weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, epochs * (length // STEPS))
+    mirrored = torch.tensor([-1.0 if name in ("roll_rad", "velocity_left_m_s") else 1.0 for name in KNOWN])
+    mirrored_action = torch.tensor([-1.0 if name in ("left", "yaw_rate") else 1.0 for name in ACTION])
+    network.train()
+    for epoch in range(epochs):
+        streams = (torch.arange(STREAMS * length) + torch.randint(len(state), (1,))) % len(state)
+        memory, total = torch.zeros(STREAMS, MEMORY), 0.0
+        flip = (torch.rand(STREAMS) < 0.5)[:, None]  # in a mirror, left is right
+        for part in streams.view(STREAMS, length).split(STEPS, 1):
+            many = part.flatten()
+            wide = flip.expand(-1, STEPS).reshape(-1, 1)
+            light = (0.7 + 0.6 * torch.rand(STREAMS, 1)).expand(-1, STEPS).reshape(-1, 1, 1, 1)
+            picture = (pictures[many].float() / 255 * light).clamp(0, 1)
+            picture = torch.where(wide[:, None, None], picture.flip(3), picture)
+            seen = network.see(picture, torch.where(wide, state[many] * mirrored, state[many]))
+            wanted = torch.where(wide, action[many] * mirrored_action, action[many]).view(STREAMS, STEPS, -1)
+            error = torch.zeros(())
+            for step, now in enumerate(seen.view(STREAMS, STEPS, -1).unbind(1)):
+                memory = torch.where(first[part[:, step], None], 0.0, memory)
+                found, memory = network.decide(now, memory)
+                error = error + ((found - wanted[:, step]) / network.scale).square().mean() / STEPS
+            memory = memory.detach()
             optimiser.zero_grad()
             error.backward()
+            torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             optimiser.step()
             schedule.step()
-            total += error.item() * len(batch)
-        print(f"epoch {epoch + 1}: mean squared error {total / count:.3f}", flush=True)
+            total += error.item() * STEPS / length
+        print(f"epoch {epoch + 1}: mean squared error {total:.3f}", flush=True)
     network.eval()
-    with torch.no_grad():
-        rest = [network(seen[part].float() / 255, known[part]) for part in torch.arange(count, len(seen)).split(64)]
-    write(network, policy)
-    return float((torch.cat(rest) - wanted[count:]).square().mean().sqrt())
 
 
 def write(network: Any, policy: Path) -> None:
@@ -155,13 +204,30 @@ def write(network: Any, policy: Path) -> None:
     import onnx
     import torch
 
-    example = torch.zeros(1, 3, HEIGHT, WIDTH), torch.zeros(1, len(KNOWN))
-    names = ["observation.images.front", "observation.state"]
-    torch.onnx.export(network, example, policy, input_names=names, output_names=["action"], dynamo=False)
+    example = torch.zeros(1, 3, HEIGHT, WIDTH), torch.zeros(1, len(KNOWN)), torch.zeros(1, MEMORY)
+    given, found = ["observation.images.front", "observation.state", "memory"], ["action", "next_memory"]
+    torch.onnx.export(network, example, policy, input_names=given, output_names=found, dynamo=False)
     model = onnx.load(policy)
-    about = {"skyloop.state": KNOWN, "skyloop.action": ["forward", "left", "up", "yaw_rate"]}
-    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in about.items()})
+    onnx.helper.set_model_props(model, {"skyloop.state": json.dumps(KNOWN), "skyloop.action": json.dumps(ACTION)})
     onnx.save(model, policy)
+
+
+def learn(folder: Path, rounds: int, flights: int, seconds: float, epochs: int) -> None:
+    """Record and learn, round by round, from all that was recorded so far; write the network after each."""
+    import torch
+
+    torch.manual_seed(0)
+    torch.set_num_threads(1)  # for so small a network more are slower
+    policy, network = folder / "policy.onnx", None
+    folder.mkdir(parents=True, exist_ok=True)
+    known: list[Rows] = []
+    for number in range(rounds):
+        seeds = range(number * flights + 1, (number + 1) * flights + 1)
+        known.append(rows_of(record(folder, seeds, seconds, policy if number else None)))
+        pictures, states, actions, first = (np.concatenate(each) for each in zip(*known, strict=True))
+        network = network or new_network(states, actions)
+        train(network, (pictures, states, actions, first), epochs)
+        write(network, policy)
 
 
 class Judged(OnnxPolicy):
@@ -178,12 +244,12 @@ class Judged(OnnxPolicy):
         return super().look(frame)
 
 
-def fly(policy: Path, seconds: float, seed: int) -> float:
-    """Fly what was learnt, from before the marker on; return the share of frames with the marker in view."""
-    with skyloop.connect(f"sim://?cameras=front&fps=15&seed={seed}") as drone:
+def fly(policy: Path, seconds: float, seed: int, rehearsed: bool) -> float:
+    """Fly what was learnt, from before the marker on; return the share of frames that show the marker."""
+    uri = f"sim://?cameras=front&fps={FPS}&seed={seed}"
+    with rehearse(uri, radio=DIRECT) if rehearsed else skyloop.connect(uri) as drone:
         drone.takeoff()
-        follower = FollowMarker(drone, MARKER)
-        follower.run(seconds=8.0)  # finds it: the policy has no memory, so it can't search
+        FollowMarker(drone, MARKER).run(seconds=8.0)  # finds it
         learnt = Judged(drone, policy)
         learnt.run(seconds=seconds)
         drone.land()
@@ -192,23 +258,19 @@ def fly(policy: Path, seconds: float, seed: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="of recordings, data set and policy")
-    parser.add_argument("--flights", type=int, default=16)
+    parser.add_argument("folder", type=Path, help="of recordings, data sets and policy")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--flights", type=int, default=12, help="of each round")
     parser.add_argument("--seconds", type=float, default=45.0, help="of each flight")
-    parser.add_argument("--epochs", type=int, default=26)
-    parser.add_argument("--judged", type=int, default=6, help="flights of what was learnt")
-    parser.add_argument("--part", choices=["record", "train", "fly"], help="only this; else all, one after the other")
+    parser.add_argument("--epochs", type=int, default=12, help="of each round")
+    parser.add_argument("--seeds", type=int, nargs="*", default=range(1000, 1006), help="flights of what was learnt")
+    parser.add_argument("--rehearsed", action="store_true", help="those flights in simulated time: the same each time")
+    parser.add_argument("--part", choices=["learn", "fly"], help="only this; else both")
     given = parser.parse_args()
-    dataset, policy = given.folder / "dataset", given.folder / "policy.onnx"
-    if given.part in (None, "record"):
-        given.folder.mkdir(parents=True, exist_ok=True)
-        flights = [Recording.open(path) for path in record(given.folder, given.flights, given.seconds)]
-        found = export_lerobot(flights, dataset, cameras=["front"], fps=15.0, task=TASK)
-        print(f"{dataset}: {found.episodes} episodes, {found.rows} rows", flush=True)
-    if given.part in (None, "train"):
-        print(f"{policy}: RMS error {train(dataset, policy, given.epochs):.3f} on what it has not learnt from")
-    if given.part in (None, "fly"):
-        shares = [fly(policy, 30.0, seed) for seed in range(1000, 1000 + given.judged)]
+    if given.part != "fly":
+        learn(given.folder, given.rounds, given.flights, given.seconds, given.epochs)
+    if given.part != "learn":
+        shares = [fly(given.folder / "policy.onnx", 30.0, seed, given.rehearsed) for seed in given.seeds]
         print("flown by what was learnt, the marker in view:", ", ".join(f"{share:.0%}" for share in shares))
         print(f"mean of {len(shares)} flights: {np.mean(shares):.0%}")
 

@@ -98,6 +98,61 @@ def test_a_frame_is_flown_by_its_picture_and_the_state_at_its_capture(drone: Rec
     assert "forward +" in drone.drawn[0][0].text
 
 
+def counting(
+    path: Path, *, shape: Sequence[Any] = (1, 4), after: Sequence[int] = (1, 4), step: float = 1.0, output: str = ""
+) -> Path:
+    """Write a policy with a memory that counts pictures: its action is how many there were."""
+    picture = helper.make_tensor_value_info("observation.images.front", TensorProto.FLOAT, [1, 3, 12, 16])
+    memory = helper.make_tensor_value_info("memory", TensorProto.FLOAT, list(shape))
+    output = output or "next_memory"
+    weights = [numpy_helper.from_array(np.full((1, 4), step, np.float32), "step")]
+    weights.append(numpy_helper.from_array(np.array(after), "after"))
+    nodes = [
+        helper.make_node("Add", ["memory", "step"], ["action"]),
+        helper.make_node("Expand", ["action", "after"], [output]),
+    ]
+    outputs = [
+        helper.make_tensor_value_info("action", TensorProto.FLOAT, [1, 4]),
+        helper.make_tensor_value_info(output, TensorProto.FLOAT, list(after)),
+    ]
+    graph = helper.make_graph(nodes, "policy", [picture, memory], outputs, weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    helper.set_model_props(model, {"skyloop.action": json.dumps(ACTIONS["velocity"])})
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def test_what_a_network_remembers_is_given_to_it_with_the_next_picture(tmp_path: Path) -> None:
+    network = PolicyNetwork(counting(tmp_path / "policy.onnx"))
+    image = np.zeros((12, 16), np.uint8)
+    assert [network(image, []).yaw_rate for _ in range(3)] == [1, 2, 3]
+    network.forget()
+    assert network(image, []).yaw_rate == 1
+    endless = PolicyNetwork(counting(tmp_path / "endless.onnx", step=3e38))
+    assert [endless(image, []).finite for _ in range(3)] == [True, False, True], "what is not finite is forgotten"
+
+
+def test_after_a_gap_in_the_pictures_it_starts_anew(drone: Recorder, tmp_path: Path) -> None:
+    pilot = fly(drone, counting(tmp_path / "policy.onnx"))
+    for at_s in (1.0, 1.1, 1.2, 1.8):
+        pilot.on_frame(frame(round(at_s * 1e9), []))
+    assert [sent["forward"] for sent in drone.velocities] == [1, 2, 3, 1]
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"output": "kept"}, "both the input memory and the output next_memory, or neither"),
+        ({"shape": (1, "n")}, "must take float32 of a fixed shape"),
+        ({"shape": (1 << 21, 1)}, "at most 1048576 numbers"),
+        ({"after": (2, 4)}, r"takes memory as \(1, 4\) and gives next_memory as \(2, 4\): they must be alike"),
+    ],
+)
+def test_a_memory_that_can_not_be_handed_on_is_refused(tmp_path: Path, how: dict[str, Any], words: str) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        PolicyNetwork(counting(tmp_path / "policy.onnx", **how))
+
+
 def test_it_hovers_while_it_does_not_know_what_the_policy_needs(drone: Recorder, tmp_path: Path) -> None:
     pilot = fly(drone, write(tmp_path / "policy.onnx"))
     pilot.on_frame(frame(1_000_000_000, [], known=False))

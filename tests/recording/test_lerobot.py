@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -117,6 +117,40 @@ def test_hovering_is_a_set_point_of_zeros_and_the_proxys_own_commands_are_none(r
     own = replace(commands, columns={**commands.columns, "app_id": np.zeros(len(commands), np.int64)})
     with pytest.raises(FileFormatError, match="no set-points of an application"):
         form_of({**found, "commands": own}, ["front"], 10.0)
+
+
+def taught(found: dict[str, Table], at_ns: Sequence[int], values: Sequence[str]) -> dict[str, Table]:
+    """Logs of a teacher's answers, and of another array."""
+    columns = {
+        "t_s": np.zeros(len(at_ns) + 1),
+        "name": np.array(["other", *["action"] * len(at_ns)]),
+        "text": np.array([""] * (len(at_ns) + 1)),
+        "at_ns": np.array([0, *at_ns], np.int64),
+        "values": np.array(["9", *values]),
+    }
+    return {**found, "logs": Table("logs", columns)}
+
+
+def test_actions_that_are_logged_stand_for_what_was_flown(recording: Path) -> None:
+    found = read(recording)
+    form, (flown,) = cut(recording)
+    pictures = flown.frames_ns["front"]
+    half = len(pictures) // 2
+    answers = [f"{row} 0.25 -0.5 1" for row in range(len(pictures))]
+    (episode,) = episodes(taught(found, pictures[::-1].tolist(), answers[::-1]), form, "")
+    assert episode.action.tolist() == [[row, 0.25, -0.5, 1] for row in range(len(pictures))]
+    late = (pictures[:half] + 40 * MS).tolist()  # with the time at which they were computed
+    (episode,) = episodes(taught(found, late, answers[:half]), form, "")
+    assert episode.action[:, 0].tolist() == list(range(half)), "no row without an answer"
+    assert (episode.state == flown.state[:half]).all()
+    with pytest.raises(FileFormatError, match=r"4 numbers of a set-point \(forward, left, up, yaw_rate\)"):
+        episodes(taught(found, late, ["1 2 3"] * half), form, "")
+
+
+def test_logged_arrays_are_read_with_their_own_time(recording: Path) -> None:
+    logs = read(recording)["logs"]
+    assert logs["at_ns"].dtype == np.int64
+    assert abs(int(logs["at_ns"][0]) - BEGIN_NS - PLAN.seconds / 2 * NS_PER_S) < NS_PER_S
 
 
 def test_what_can_not_be_learnt_from_is_told(tmp_path: Path, recording: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.control.behaviour import Behaviour
+from skyloop.clock import nanoseconds
+from skyloop.control.behaviour import BLIND_S, Behaviour
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.messages import Attitude, Feedback, Text, Velocity
 from skyloop.messages.annotation import Shape
@@ -26,9 +28,12 @@ if TYPE_CHECKING:
 STATE_INPUT: Final = "observation.state"
 IMAGE_INPUT: Final = "observation.images."
 OUTPUT: Final = "action"
+MEMORY: Final = "memory"
+NEXT_MEMORY: Final = "next_memory"  #: the output that the memory is at the next picture
 STATE_NAMES: Final = "skyloop.state"  #: of a file's metadata: the state's numbers by name, as a JSON list
 ACTION_NAMES: Final = "skyloop.action"  #: and the action's
 _MOST_SIDE: Final = 4096
+_MOST_MEMORY: Final = 2**20
 _PURPOSE: Final = "flying by an ONNX file"
 
 
@@ -46,7 +51,8 @@ class PolicyNetwork:
     The file has an input ``observation.images.CAMERA`` of float32 (1, 3, height, width), red, green, blue, 0 to 1, and
     may have ``observation.state`` of float32 (1, n); its output is ``action`` of (1, m). These are the names and the
     numbers of ``skyloop log export --to lerobot``. Its metadata names the numbers, as JSON lists in ``skyloop.state``
-    and ``skyloop.action``.
+    and ``skyloop.action``. A network that remembers has an input ``memory``, float32 of a fixed shape, and an output
+    ``next_memory`` of the same shape, which is its ``memory`` at the next picture; at the first it is zeros.
 
     Args:
         path: The ONNX file.
@@ -82,12 +88,17 @@ class PolicyNetwork:
         self._image, self.camera, self.size = self._picture(inputs)
         self.state = self._state(inputs, state, metadata)
         self.action = self._action(action, metadata)
-        if [each.name for each in self._session.get_outputs()].count(OUTPUT) != 1:
+        outputs = [each.name for each in self._session.get_outputs()]
+        if outputs.count(OUTPUT) != 1:
             raise FileFormatError(f"{path} must have one output with the name {OUTPUT}")
+        self._outputs = [OUTPUT, *([NEXT_MEMORY] if MEMORY in inputs else [])]
+        self._blank = self._memory_of(inputs, outputs)
+        self._memory = self._blank
         self(np.zeros((self.size[1], self.size[0], 3), np.uint8), [0.0] * len(self.state))
+        self.forget()
 
     def __call__(self, image: NDArray[np.uint8], state: Sequence[float]) -> Velocity | Attitude:
-        """Compute the set-point.
+        """Compute the set-point, and remember what the network keeps for the next picture.
 
         Args:
             image: BGR, shape (height, width, 3), or grey (height, width), uint8, of any size.
@@ -107,23 +118,59 @@ class PolicyNetwork:
         feed: dict[str, Any] = {self._image: np.divide(planes[None], np.float32(255), dtype=np.float32)}
         if self.state:
             feed[STATE_INPUT] = np.array([state], np.float32)
+        if self._memory is not None:
+            feed[MEMORY] = self._memory
         try:
-            (row,) = self._session.run([OUTPUT], feed)
+            row, *kept = self._session.run(self._outputs, feed)
         except self._errors as error:
             raise FileFormatError(f"{self._path} can't be run: {reason(error)}") from error
+        self._remember(kept)
         values = np.asarray(row, np.float64).ravel()
         try:
             return set_point(self.action, values.tolist())
         except UsageError as error:
             raise FileFormatError(f"{self._path}: {error}") from None
 
+    def forget(self) -> None:
+        """Start anew: the next picture is the first."""
+        self._memory = self._blank
+
+    def _remember(self, kept: Sequence[NDArray[np.float32]]) -> None:
+        if self._blank is None:
+            return
+        (memory,) = kept
+        if memory.shape != self._blank.shape:
+            raise FileFormatError(
+                f"{self._path} takes {MEMORY} as {self._blank.shape} and gives {NEXT_MEMORY} as {memory.shape}: "
+                "they must be alike"
+            )
+        # What is not finite would stay so with every picture to come.
+        self._memory = memory if np.isfinite(memory).all() else self._blank
+
+    def _memory_of(self, inputs: Mapping[str, Any], outputs: Sequence[str]) -> NDArray[np.float32] | None:
+        """Return what the network is given with its first picture; None for one without a memory."""
+        if (MEMORY in inputs) != (NEXT_MEMORY in outputs):
+            raise FileFormatError(
+                f"{self._path} must have both the input {MEMORY} and the output {NEXT_MEMORY}, or neither"
+            )
+        if MEMORY not in inputs:
+            return None
+        shape, kind = list(inputs[MEMORY].shape), inputs[MEMORY].type
+        fixed = all(isinstance(each, int) and each > 0 for each in shape)
+        if not fixed or math.prod(shape) > _MOST_MEMORY or kind != "tensor(float)":
+            raise FileFormatError(
+                f"{self._path} takes {MEMORY} as {kind} {tuple(shape)}, and must take float32 of a fixed shape, "
+                f"at most {_MOST_MEMORY} numbers"
+            )
+        return np.zeros(shape, np.float32)
+
     def _picture(self, inputs: Mapping[str, Any]) -> tuple[str, str, tuple[int, int]]:
         pictures = [name for name in inputs if name.startswith(IMAGE_INPUT)]
-        others = [name for name in inputs if name not in (*pictures, STATE_INPUT)]
+        others = [name for name in inputs if name not in (*pictures, STATE_INPUT, MEMORY)]
         if len(pictures) != 1 or others:
             raise FileFormatError(
                 f"{self._path} has the inputs {', '.join(inputs) or 'none'}, and must have one picture, "
-                f"{IMAGE_INPUT}CAMERA, and may have {STATE_INPUT}"
+                f"{IMAGE_INPUT}CAMERA, and may have {STATE_INPUT} and {MEMORY}"
             )
         (name,) = pictures
         shape = list(inputs[name].shape)
@@ -183,6 +230,7 @@ class OnnxPolicy(Behaviour):
 
     Limits, zones and failsafe of the proxy hold as for any application. It hovers, and says so in an event, when frames
     stop, when the drone does not know a number of the state that the network takes, and when the action is not finite.
+    A network that remembers starts anew after each of these.
     The vehicle must be airborne when :meth:`run` is called. All callbacks run on the thread that called it.
     """
 
@@ -219,6 +267,7 @@ class OnnxPolicy(Behaviour):
         self._newest = _Newest()
         super().__init__(drone, self._newest, self.network.camera if camera is None else camera)
         self._phase = PolicyPhase.FLYING
+        self._looked_at_ns = 0  # capture of the newest frame that the network was given
 
     @property
     def phase(self) -> PolicyPhase:
@@ -227,14 +276,20 @@ class OnnxPolicy(Behaviour):
 
     def look(self, frame: Frame) -> list[Shape]:
         """Compute the set-point of a frame, and write it into the frame."""
+        if frame.captured_ns - self._looked_at_ns > nanoseconds(BLIND_S):
+            self.network.forget()
+        self._looked_at_ns = frame.captured_ns
         believed = frame.feedback
         row = None if believed is None else state_row(believed, self.network.state)
         if row is None:
             self._phase, self._newest.wanted = PolicyPhase.NO_STATE, Velocity()
+            self.network.forget()
             return [Text(self._phase, (8.0, 16.0))]
         wanted = self.network(pixels_of(frame), row)
         self._phase = PolicyPhase.FLYING if wanted.finite else PolicyPhase.NO_ACTION
         self._newest.wanted = wanted if wanted.finite else Velocity()
+        if not wanted.finite:
+            self.network.forget()
         return [self._written(self._newest.wanted)]
 
     def steer(self, wanted: Velocity | Attitude) -> None:

@@ -19,6 +19,7 @@ from skyloop.messages.rows import ACTIONS, STATE
 from skyloop.recording.review.tables import Table
 
 MARK: Final = "mark"  #: the name of a logged text that begins another episode, whose task it is
+TAUGHT: Final = "action"  #: the name of logged arrays: what ought to have been done about a picture
 _STILL: Final = "hover"
 _STEERED: Final = (FlightState.HOVERING.value, FlightState.FLYING.value)
 _GAP_S: Final = 0.5  #: without a picture, or a state, for so long, an episode ends
@@ -57,7 +58,7 @@ class Episode:
     Attributes:
         task: What was to be done, in words.
         state: At the capture of the first camera's picture, shape (rows, len(form.state)), float64.
-        action: Commanded by the time of the next row, shape (rows, len(form.action)), float64.
+        action: Taught, or commanded by the time of the next row, shape (rows, len(form.action)), float64.
         frames_ns: By camera, the capture of each row's picture, on the proxy's clock, shape (rows,).
     """
 
@@ -108,7 +109,8 @@ def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode
     An episode lasts while the drone follows set-points, without a gap in pictures or state, and is cut at marks. Its
     rows are ``1 / form.fps`` apart. Each has the newest picture of every camera, the state at the first camera's
     capture, and the set-point in force when the next row begins: what was done about that picture. Hovering is a
-    set-point of zeros.
+    set-point of zeros. Where an application logs arrays with the name ``action``, they are the actions instead: each
+    row has the first one at or after its picture's capture, and a gap in them ends an episode.
 
     Args:
         tables: Of one drone.
@@ -117,12 +119,16 @@ def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode
 
     Returns:
         Those that last a second at least.
+
+    Raises:
+        FileFormatError: A logged action has another number of values than the set-points of the form.
     """
     feedback, commands = tables["feedback"], tables["commands"]
     state_ns, frames = (
         _times(feedback, "captured_ns"),
         {camera: np.sort(_times(tables[f"frames.{camera}"], "captured_ns")) for camera in form.cameras},
     )
+    taught = _taught(tables.get("logs"), form)
     found = []
     for begin_ns, end_ns, what in _parts(feedback, tables.get("logs"), task):
         grid = np.arange(begin_ns, end_ns, NS_PER_S / form.fps).astype(np.int64)
@@ -135,6 +141,11 @@ def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode
         nearest = np.searchsorted(state_ns, at_ns).clip(1, max(len(state_ns) - 1, 1))
         good &= np.abs(state_ns[nearest - 1] - at_ns) < nanoseconds(_GAP_S)
         state, action = _states(feedback, form, at_ns), _actions(commands, form, grid + round(NS_PER_S / form.fps))
+        if taught is not None:
+            answers_ns, answers = taught
+            answered = np.searchsorted(answers_ns, at_ns).clip(max=len(answers) - 1)
+            good &= (answers_ns[answered] >= at_ns) & (answers_ns[answered] - at_ns < nanoseconds(_GAP_S))
+            action = answers[answered]
         for part in _runs(good):
             if (part.stop - part.start) / form.fps >= _SHORTEST_S:
                 pictures = {camera: times[part] for camera, times in shown.items()}
@@ -150,6 +161,24 @@ def _piloted(commands: Table) -> NDArray[np.bool_]:
     """Which commands an application gave, and not the proxy itself."""
     given: NDArray[np.bool_] = commands.numbers("app_id") > 0
     return given
+
+
+def _taught(logs: Table | None, form: Form) -> tuple[Times, Floats] | None:
+    """Return times and values of the actions that were logged; None if none were."""
+    if logs is None or "values" not in logs.columns:
+        return None
+    kept = (logs["name"] == TAUGHT) & (logs["values"] != "")
+    if not kept.any():
+        return None
+    rows = [[float(number) for number in text.split()] for text in logs["values"][kept]]
+    if any(len(row) != len(form.action) for row in rows):
+        raise FileFormatError(
+            f"an array that is logged as {TAUGHT} must have the {len(form.action)} numbers of a set-point "
+            f"({', '.join(form.action)})"
+        )
+    times = _times(logs, "at_ns")[kept]
+    order = np.argsort(times, kind="stable")
+    return times[order], np.array(rows, np.float64)[order]
 
 
 def _parts(feedback: Table, logs: Table | None, task: str) -> list[tuple[int, int, str]]:

@@ -179,6 +179,7 @@ def row(item: Item) -> dict[str, Cell]:
         cells = {"name": value.name, "value": str(_cell(value.value)), "unit": value.unit}
     elif isinstance(value, LogEntry):
         cells = {"source": value.source, "name": value.name, "number": value.number, "text": value.text or ""}
+        cells["at_ns"] = value.at_ns
         if value.values is not None:
             cells["values"] = _cell(value.values)
     elif isinstance(value, FrameRecord):
