@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -87,6 +88,17 @@ def test_a_picture_has_the_stamps_of_its_frame(bench: Bench) -> None:
     assert second.captured_ns == bench.clock()
     assert second.intrinsics == LENS
     assert np.allclose(image(first), 90, atol=4)
+
+
+def test_the_vehicle_knows_how_many_frames_are_used(bench: Bench) -> None:
+    publisher = bench.proxy.publisher
+    assert publisher.wanted_fps("front") == 0.0
+    watcher(bench, f"{TOPIC}&max_fps=10", "ten")
+    five = watcher(bench, f"{TOPIC}&max_fps=5", "five")
+    assert publisher.wanted_fps("front") == pytest.approx(10.0)
+    five.end.subscribe("video/front")
+    five.sync()
+    assert publisher.wanted_fps("front") == math.inf
 
 
 def test_nothing_is_encoded_for_nobody(bench: Bench) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns
+from skyloop.messages.rate import RateLimiter
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.camera_pipeline import Camera, CameraPipeline, Exposure, Shutter, expose
 from skyloop.sim.render import SceneState
@@ -108,3 +110,27 @@ def test_a_picture_that_cannot_be_drawn_is_told_and_the_next_one_comes(monkeypat
         assert [str(error) for error in wall.failures] == ["spilt ink"]
         pipeline.expose([exposure(front, monotonic_ns())])
         wait_until(lambda: wall.shown, "the next one is shown")
+
+
+@pytest.mark.parametrize(("fps", "rendered"), [(0.0, 0), (12.0, 15), (8.0, 10), (24.0, 30), (30.0, 30), (math.inf, 30)])
+def test_no_more_is_rendered_than_is_used(fps: float, rendered: int) -> None:
+    front = camera(Wall())
+    assert front.model.fps == 30.0
+    times_ns = [round(n * 1e9 / 30.0) for n in range(90)]
+    assert sum(front.wanted(at_ns, fps) for at_ns in times_ns) == pytest.approx(3 * rendered, abs=2)
+
+
+def test_whoever_takes_fewer_finds_one_in_time_whenever_it_began() -> None:
+    front, chosen = camera(Wall()), RateLimiter(12.0)
+    times_ns = [round(n * 1e9 / 30.0) for n in range(300)]
+    rendered = [at_ns for at_ns in times_ns if front.wanted(at_ns, chosen.max_hz)]
+    assert len(rendered) < 160
+    assert sum(chosen.in_time(at_ns) for at_ns in rendered[1:]) >= 115
+
+
+def test_after_nobody_looked_the_next_exposure_is_rendered() -> None:
+    front = camera(Wall())
+    assert front.wanted(0, 12.0)
+    assert not front.wanted(1_000_000_000, 0.0)
+    assert front.wanted(1_033_000_000, 12.0)
+    assert front.wanted(1_066_000_000, math.inf)

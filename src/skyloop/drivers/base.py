@@ -80,6 +80,12 @@ class Sink(Protocol):
     def wants(self, camera: str) -> bool:
         """Return whether anybody uses this camera's frames now. If not, a driver may save itself the decoding."""
 
+    def wanted_fps(self, camera: str) -> float:
+        """Return how many of this camera's frames a second are used now, by whoever uses most of them.
+
+        0: none; infinity: all. A driver for which a frame is expensive may leave out what exceeds it.
+        """
+
     def stream(
         self,
         camera: str,

@@ -134,6 +134,10 @@ class RecordingSink:
         """Return whether the camera is in ``watch``, or True if that is None."""
         return self.watch is None or camera in self.watch
 
+    def wanted_fps(self, camera: str) -> float:
+        """Return infinity for a camera that is watched, 0 for any other."""
+        return math.inf if self.wants(camera) else 0.0
+
     def stream(
         self,
         camera: str,

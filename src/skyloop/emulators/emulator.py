@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
 from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
@@ -80,9 +81,9 @@ class RunningEmulator(ABC):
         """Log a collision or the like; what comes of it shows in what the drone sends."""
         _log.info("drone %d: %s", occurrence.drone, occurrence.text)
 
-    def wants(self, camera: str) -> bool:
-        """Return whether a picture of this camera would be sent."""
-        return self._video is not None and self._video.wants(camera)
+    def wanted_fps(self, camera: str) -> float:
+        """Return how many pictures a second of this camera would be sent: all or none."""
+        return math.inf if self._video is not None and self._video.wants(camera) else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
         """Encode a picture that is due.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from skyloop.clock import NS_PER_S
@@ -23,6 +24,11 @@ class RateLimiter:
         """
         self.period_ns = 0 if max_hz is None else round(NS_PER_S / max_hz)  #: 0: every sample is in time
         self._due_ns: int | None = None
+
+    @property
+    def max_hz(self) -> float:
+        """Most samples a second that are in time; infinity: all."""
+        return NS_PER_S / self.period_ns if self.period_ns else math.inf
 
     def in_time(self, at_ns: int) -> bool:
         """Return whether a sample is to be kept. Call it once for each sample, in order.

@@ -5,6 +5,7 @@ It also knows which topics the proxy has: no others can be subscribed to, so tha
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 from collections.abc import Callable, Collection
@@ -275,10 +276,16 @@ class VehiclePublisher:
 
     def wants(self, camera: str) -> bool:
         """Whether anybody looks at this camera now."""
+        return self.wanted_fps(camera) > 0.0
+
+    def wanted_fps(self, camera: str) -> float:
+        """How many of this camera's frames a second anybody looks at: infinity if it is all, 0 if none."""
         topic = self._topics.get(camera)
         if topic is None:
             topic = self._topics[camera] = video(camera)
-        return self._subscribers(topic) > 0 or (bool(self.streams.known) and self.streams.wanted(camera))
+        if self._subscribers(topic) > 0:
+            return math.inf
+        return self.streams.wanted_fps(camera) if self.streams.known else 0.0
 
     def stream(
         self,

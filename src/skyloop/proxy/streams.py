@@ -117,6 +117,11 @@ class StreamForm:
         """Whether the vehicle's own pictures are handed on now: not if it has stopped to send them."""
         return self._passing and self._clock() - self._own_ns < _OWN_SILENT_NS
 
+    @property
+    def max_fps(self) -> float:
+        """How many frames a second it takes at most; infinity: all."""
+        return self._limiter.max_hz
+
     def _encode_again(self) -> None:
         """Encode from here on, beginning with a key picture. The lock is held."""
         self._passing, self._wants_key, self._anew = False, True, True
@@ -335,10 +340,14 @@ class Streams:
             f"{', '.join(form.topic for form in self.known if not form.request.subscriber) or 'its frames as JPEG'}"
         )
 
-    def wanted(self, camera: str) -> bool:
-        """Whether anybody watches an encoded form of this camera."""
-        forms = self._forms.known
-        return any(one.request.camera == camera and not one.passing and self._subscribers(one.topic) for one in forms)
+    def wanted_fps(self, camera: str) -> float:
+        """Return how many frames a second the encoded forms of this camera that anybody watches take at most."""
+        watched = (
+            one.max_fps
+            for one in self._forms.known
+            if one.request.camera == camera and not one.passing and self._subscribers(one.topic)
+        )
+        return max(watched, default=0.0)
 
     def wants_own(self, camera: str) -> bool:
         """Whether a form may hand on the vehicle's own pictures of this camera."""

@@ -11,12 +11,16 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.clock import monotonic_ns, nanoseconds, seconds
+from skyloop.clock import NS_PER_S, monotonic_ns, nanoseconds, seconds
+from skyloop.messages.rate import RateLimiter
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Quality, Renderer, Scene, SceneState, SensorEffects
 from skyloop.sim.world import World
 
 _LONGEST_WAIT_S: Final = 0.5
+#: Where fewer pictures are used than a camera takes, so many times as many are rendered: whoever chooses some of them,
+#: by a count of its own, finds one in time.
+SPARE: Final = 1.25
 
 
 class Screen(Protocol):
@@ -66,6 +70,18 @@ class Camera:
     dropped: int = 0  #: exposures that were replaced by a newer one before they were rendered
     gone: bool = False  #: whether its observer was detached
     _effects: tuple[CameraModel, SensorEffects] | None = field(default=None, init=False)
+    _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
+
+    def wanted(self, captured_ns: int, fps: float) -> bool:
+        """Return whether the exposure that is due now is worth rendering.
+
+        Args:
+            captured_ns: When it is.
+            fps: How many pictures a second are used: 0: none; infinity: all.
+        """
+        enough = fps * SPARE
+        self._limiter.period_ns = round(NS_PER_S / enough) if 0.0 < enough < self.model.fps else 0
+        return fps > 0.0 and self._limiter.in_time(captured_ns)
 
     def finish(self, picture: NDArray[np.uint8], number: int, rates_rad_s: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Apply the sensor's flaws to an ideal image."""

@@ -42,7 +42,8 @@ class Observer(Protocol):
 
     def happened(self, occurrence: Occurrence) -> None: ...
 
-    def wants(self, camera: str) -> bool: ...
+    def wanted_fps(self, camera: str) -> float:
+        """Return how many pictures a second of this camera are used: 0: none; infinity: all."""
 
     def failed(self, error: Exception) -> None:
         """Handle the failure of the simulation: nothing more will be reported."""
@@ -216,7 +217,8 @@ class ReportPublisher:
             camera
             for observer, cameras in self._host.observers.values()
             for camera in cameras
-            if camera.shutter.due(now_s, camera.model.fps) and observer.wants(camera.model.name)
+            if camera.shutter.due(now_s, camera.model.fps)
+            and camera.wanted(captured_ns, observer.wanted_fps(camera.model.name))
         ]
         if not due:
             return

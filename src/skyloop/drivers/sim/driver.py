@@ -293,10 +293,10 @@ class SimDriver(Driver):
             reason = "simulation_slow" if occurrence.kind is OccurrenceKind.SLOW else occurrence.text
             sink.event(kind, occurrence.text, severity, reason=reason)
 
-    def wants(self, camera: str) -> bool:
-        """Return whether anybody would see an image of this camera."""
+    def wanted_fps(self, camera: str) -> float:
+        """Return how many images a second of this camera anybody would see."""
         sink = self._sink
-        return sink is not None and self._link and sink.wants(camera)
+        return sink.wanted_fps(camera) if sink is not None and self._link else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
         """Publish an image that is due.

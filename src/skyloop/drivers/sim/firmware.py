@@ -238,6 +238,9 @@ class _InnerSink:
     def wants(self, camera: str) -> bool:  # noqa: ARG002
         return False
 
+    def wanted_fps(self, camera: str) -> float:  # noqa: ARG002
+        return 0.0
+
     def stream(
         self,
         camera: str,

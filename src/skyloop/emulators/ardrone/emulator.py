@@ -197,9 +197,9 @@ class RunningFirmware(RunningEmulator):
 
     # Called by the host, on its threads ------------------------------------------------------------------------
 
-    def wants(self, camera: str) -> bool:
-        """Return whether a picture of this camera would be sent to anybody."""
-        return self._seen and super().wants(camera)
+    def wanted_fps(self, camera: str) -> float:
+        """Return how many pictures a second of this camera would be sent to anybody: all or none."""
+        return super().wanted_fps(camera) if self._seen else 0.0
 
 
 VERSIONS: Final = (1, 2)

@@ -153,9 +153,9 @@ class RunningFirmware(RunningEmulator):
 
     # Called by the host, on its threads --------------------------------------------------------------------------
 
-    def wants(self, camera: str) -> bool:
-        """Return whether a picture of this camera would be sent to anybody."""
-        return self.logic.streaming and self.logic.client is not None and super().wants(camera)
+    def wanted_fps(self, camera: str) -> float:
+        """Return how many pictures a second of this camera would be sent to anybody: all or none."""
+        return super().wanted_fps(camera) if self.logic.streaming and self.logic.client is not None else 0.0
 
 
 class TelloFirmware(Emulator[RunningFirmware]):
