@@ -9,6 +9,8 @@ from benchmarks import swarm
 pytest.importorskip("zenoh")
 pytest.importorskip("cv2")
 
+pytestmark = pytest.mark.process
+
 
 @pytest.mark.usefixtures("_possible")
 def test_ten_drones_of_three_users_with_observers_fail_safe_with_their_users() -> None:
