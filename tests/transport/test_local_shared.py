@@ -9,11 +9,13 @@ from functools import partial
 
 import pytest
 
+from skyloop.transport.backlog import Lane
 from skyloop.transport.base import FEEDBACK, Dialer, Peer, TransportServer
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.conformance import TransportSuite
-from skyloop.transport.local import dial
-from skyloop.transport.local.reactor import Reactor
+from skyloop.transport.local import dial, packets
+from skyloop.transport.local.client import LocalClient
+from skyloop.transport.local.reactor import Reactor, Source
 from skyloop.transport.local.shared_server import SharedLocalServer
 from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
 
@@ -201,3 +203,49 @@ def test_a_handler_may_stop_another_server_of_its_reactor(reactor: Reactor) -> N
     assert one.server.publish(FEEDBACK, b"y") == 0
     one.close()
     two.close()
+
+
+@pytest.fixture
+def served(reactor: Reactor) -> Iterator[Served]:
+    made = Served(reactor)
+    yield made
+    made.close()
+
+
+def test_a_connection_that_can_not_be_received_from_ends_with_the_reason(served: Served) -> None:
+    (connection,) = served.server._served
+
+    def fail(*_: object) -> bytes:
+        raise OSError(5, "Input/output error")
+
+    connection.receive = fail
+    served.client.send(b"lost")
+    wait_until(lambda: served.log.left, "it left")
+    assert served.log.left[0][1] == "receiving failed: [Errno 5] Input/output error"
+    assert served.packets == []
+
+
+def test_a_packet_that_only_wakes_is_nobody_s_business(served: Served) -> None:
+    client = served.client
+    assert isinstance(client, LocalClient)
+    assert client._socket is not None
+    client._socket.send(packets.WAKE)
+    assert client.send(b"next")
+    wait_until(lambda: served.packets, "the next packet")
+    assert served.packets == [b"next"]
+
+
+def test_a_socket_that_was_dropped_meanwhile_is_left_alone(served: Served, reactor: Reactor) -> None:
+    """A reactor's turn may hold sockets that another thread has ended, or moved."""
+    (connection,) = served.server._served
+    ended, empty = Source(served.server, connection=connection), Source(served.server, connection=connection)
+    ended.ended = True
+    assert not served.server.receive(reactor, ended, at_once=False)
+    assert served.server.deliver(reactor, ended, Lane.STEERING) is None
+    empty.lane = Lane.STEERING
+    assert served.server.deliver(reactor, empty, Lane.STEERING) is None
+    assert empty.lane is None
+    served.server.end_silent(reactor, empty, empty.since_s)
+    assert served.client.send(b"goes on")
+    wait_until(lambda: served.packets, "a packet")
+    assert served.got(b"goes on")

@@ -7,17 +7,19 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from skyloop.drivers.base import Driver, ExternalPose
+from skyloop.drivers.base import Driver, ExternalPose, ServedLink
 from skyloop.drivers.mavlink import MavlinkDriver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import DriverError, UnsupportedError, UsageError
+from skyloop.host.links import LinkThread
 from skyloop.messages import FlightState, Land, LinkState, Takeoff, Velocity
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
@@ -55,6 +57,49 @@ def up(sink: RecordingSink) -> None:
 def test_udp_that_speaks_first() -> None:
     with firmware() as it, opened(f"mavlink://udpout:127.0.0.1:{it.settings.ports.udp}") as (_, sink):
         up(sink)
+
+
+def test_a_thread_that_serves_several_serves_it_too() -> None:
+    thread = LinkThread()
+    with firmware() as it:
+        driver = MavlinkDriver(parse_uri(f"mavlink://udpout:127.0.0.1:{it.settings.ports.udp}"))
+        driver.serve_link = partial(thread.add, vehicle=driver)
+        sink, threads = RecordingSink(watch=set()), set[str]()
+        sink.feedback = lambda feedback: threads.add(threading.current_thread().name)  # type: ignore[method-assign]
+        driver.open(sink)
+        try:
+            up(sink)
+            wait_until(lambda: threads, "its state")
+            assert threads == {"skyloop-links"}
+        finally:
+            driver.close()
+            thread.close()
+    assert not sink.problems
+
+
+def test_what_fails_on_a_thread_that_serves_several_is_an_event_and_told_to_the_thread() -> None:
+    given: list[ServedLink] = []
+    driver = MavlinkDriver(parse_uri("mavlink://udpout:127.0.0.1:9"))
+    driver.serve_link = given.append
+    sink = RecordingSink(watch=set())
+    driver.open(sink)
+    (link,) = given
+    try:
+        due_ns = link.serve(readable=False)
+        assert due_ns is not None
+        assert due_ns > 0
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(link, "_step", lambda **_: 1 / 0)
+            with pytest.raises(ZeroDivisionError):
+                link.serve(readable=True)
+        assert "the link to the vehicle failed: ZeroDivisionError" in sink.events[-1].text
+    finally:
+        ending = threading.Thread(target=driver.close)
+        ending.start()  # waits until the thread that serves it says that it has ended
+        wait_until(lambda: link.serve(readable=False) is None, "it is to end")
+        link.end()
+        ending.join(PATIENCE_S)
+    assert not ending.is_alive()
 
 
 def test_tcp_is_up_when_a_heartbeat_comes_and_not_when_it_is_connected() -> None:
