@@ -7,8 +7,6 @@ import logging
 import pkgutil
 import sys
 
-import atheris
-
 #: What a target runs through, instrumented before it is imported.
 PACKAGES = {
     "samples": ["skyloop.messages"],
@@ -17,6 +15,7 @@ PACKAGES = {
     "ardrone": ["skyloop.wire.ardrone"],
     "tello": ["skyloop.wire.tello"],
     "mavlink": ["skyloop.wire.mavlink"],
+    "msp": ["skyloop.wire.msp"],
     "vrpn": ["skyloop.wire.vrpn", "skyloop.motion_capture.vrpn"],
     "recording": ["skyloop.logfile", "mcap"],
     "files": ["skyloop.sim", "skyloop.calibration", "skyloop.proxy.core.safety", "skyloop.drivers.uri", "tomllib"],
@@ -26,6 +25,8 @@ PACKAGES = {
 
 def main() -> None:
     """Runs until libFuzzer's options end it."""
+    import atheris
+
     name = sys.argv.pop(1)
     logging.disable()
     with atheris.instrument_imports(include=PACKAGES[name]):

@@ -6,9 +6,14 @@ import time
 
 import pytest
 
+from tests.fuzz.run import PACKAGES
 from tests.fuzz.targets import TARGETS, seeds
 
 LONGEST_S = 5.0
+
+
+def test_each_target_says_what_it_runs_through() -> None:
+    assert PACKAGES.keys() == TARGETS.keys()
 
 
 @pytest.mark.parametrize("name", TARGETS)
