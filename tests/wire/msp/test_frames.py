@@ -33,6 +33,13 @@ def test_round_trip_in_any_pieces(sent: list[Frame], size: int) -> None:
     assert (parser.skipped, parser.damaged) == (0, 0)
 
 
+@pytest.mark.parametrize("size", [254, 255, 256, 700, MOST])
+@pytest.mark.parametrize("version", [1, 2])
+def test_long_payloads(size: int, version: int) -> None:
+    frame = Frame(116, (bytes(range(256)) * 4)[:size], Direction.REPLY)
+    assert Parser().feed(encode(frame, version=version)) == [frame]
+
+
 @given(frames)
 def test_both_versions_say_it(frame: Frame) -> None:
     assert Parser().feed(encode(frame, version=2)) == [frame]

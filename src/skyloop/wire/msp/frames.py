@@ -92,9 +92,9 @@ def encode(frame: Frame, *, version: int | None = None) -> bytes:
         return b"$X" + bytes((frame.direction.value,)) + checked + bytes((crc8(checked),))
     if version != 1 or function >= LONG:
         raise ValueError(f"version {version} of MSP has no function {function}")
-    size = bytes((len(payload), function))
+    size = bytes((min(len(payload), LONG), function))
     if len(payload) >= LONG:
-        size = bytes((LONG, function)) + struct.pack("<H", len(payload))
+        size += struct.pack("<H", len(payload))
     return b"$M" + bytes((frame.direction.value,)) + size + payload + bytes((xor(size + payload),))
 
 
