@@ -22,13 +22,17 @@ class RateLimiter:
         Args:
             max_hz: Most samples a second, above 0; None: all.
         """
-        self.period_ns = 0 if max_hz is None else round(NS_PER_S / max_hz)  #: 0: every sample is in time
+        self.max_hz = math.inf if max_hz is None else max_hz
         self._due_ns: int | None = None
 
     @property
     def max_hz(self) -> float:
         """Most samples a second that are in time; infinity: all."""
-        return NS_PER_S / self.period_ns if self.period_ns else math.inf
+        return NS_PER_S / self._period_ns if self._period_ns else math.inf
+
+    @max_hz.setter
+    def max_hz(self, max_hz: float) -> None:
+        self._period_ns = round(NS_PER_S / max_hz)  # 0: every sample is in time
 
     def in_time(self, at_ns: int) -> bool:
         """Return whether a sample is to be kept. Call it once for each sample, in order.
@@ -36,7 +40,7 @@ class RateLimiter:
         Args:
             at_ns: Its time, on any one clock.
         """
-        period_ns, due_ns = self.period_ns, self._due_ns
+        period_ns, due_ns = self._period_ns, self._due_ns
         if not period_ns:
             return True
         # A time long before the last one is of another run of the source, and restarts the count.

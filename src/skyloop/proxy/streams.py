@@ -8,6 +8,7 @@ does not.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -291,9 +292,9 @@ class StreamForm:
             elif scale == self._scale:
                 self._better_ns = now_ns
             if share < 1.0 or self.request.max_fps is not None:
-                self._limiter.period_ns = nanoseconds(1.0 / (self._fps * share))
+                self._limiter.max_hz = self._fps * share
             else:
-                self._limiter.period_ns = 0
+                self._limiter.max_hz = math.inf
         return kbit_s
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import math
 import threading
 from dataclasses import dataclass, field
 from typing import Final, Protocol
@@ -11,7 +12,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.clock import NS_PER_S, monotonic_ns, nanoseconds, seconds
+from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.messages.rate import RateLimiter
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Quality, Renderer, Scene, SceneState, SensorEffects
@@ -79,9 +80,11 @@ class Camera:
             captured_ns: When it is.
             fps: How many pictures a second are used: 0: none; infinity: all.
         """
+        if not fps:
+            return False
         enough = fps * SPARE
-        self._limiter.period_ns = round(NS_PER_S / enough) if 0.0 < enough < self.model.fps else 0
-        return fps > 0.0 and self._limiter.in_time(captured_ns)
+        self._limiter.max_hz = enough if enough < self.model.fps else math.inf
+        return self._limiter.in_time(captured_ns)
 
     def finish(self, picture: NDArray[np.uint8], number: int, rates_rad_s: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Apply the sensor's flaws to an ideal image."""

@@ -95,12 +95,12 @@ class StreamRate:
         if waits_s >= MOST_WAIT_S:
             if waits_s >= SILENT_S:
                 self._stands_still()
-            return seldom and (quiet_s >= SILENT_S or self._gives(self._bytes, PROBES_S))
-        return len(under_way) < 2 or self._gives(self._bytes, seconds(least_ns) + MOST_WAIT_S)
+            return seldom and (quiet_s >= SILENT_S or self._holds(PROBES_S))
+        return len(under_way) < 2 or self._holds(seconds(least_ns) + MOST_WAIT_S)
 
-    def _gives(self, size: int, time_s: float) -> bool:
-        """Return whether the rate gives so many bytes in so long [s]."""
-        return size * 8e-3 <= self.kbit_s * time_s
+    def _holds(self, time_s: float) -> bool:
+        """Return whether no more is under way than the rate gives in so long [s]."""
+        return self._bytes * 8e-3 <= self.kbit_s * time_s
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:
         """Note a picture.

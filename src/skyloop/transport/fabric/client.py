@@ -483,8 +483,12 @@ class FabricClient(TransportClient):
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
         """Acknowledge something, ``once`` by a datagram, which may be lost."""
         with self._lock:
-            if not self._ended:
-                _ = self._send_report(packet) if once else self._put(layout.ASK, packet, 0)
+            if self._ended:
+                return
+            if once:
+                self._send_report(packet)
+            else:
+                self._put(layout.ASK, packet, 0)
 
 
 _UNNUMBERED: Final = packets.number(0)
