@@ -73,6 +73,11 @@ def test_feedback_of_an_older_proxy_has_no_reason_of_its_link_and_nobody_else_wh
     assert older == msgspec.structs.replace(SAMPLES[name], **before)
 
 
+@pytest.mark.parametrize("name", ["reply-value", "reply-page"])
+def test_an_older_proxy_marks_no_parameter_as_momentary(name: str) -> None:
+    assert decode((PACKETS / "older" / f"{name}.bin").read_bytes()) == SAMPLES[name]
+
+
 def test_an_older_proxy_does_not_tell_its_clock() -> None:
     older = decode((PACKETS / "older" / "reply-welcome-without-clock.bin").read_bytes())
     newer = SAMPLES["reply-welcome"]

@@ -208,6 +208,15 @@ class App:
         assert self.end.send(encode(Request(self._ids, body)))
         return self._ids
 
+    def reserve(self) -> int:
+        """Return the number of a request that is lost on the way."""
+        self._ids += 1
+        return self._ids
+
+    def repeat(self, number: int, body: AnyRequest) -> None:
+        """Send a request once more under its number, as the library does while no answer comes."""
+        assert self.end.send(encode(Request(number, body)))
+
     def answer(self, number: int) -> AnyReply:
         reply = self._replies.get(timeout=WAIT_S)
         assert reply.id == number

@@ -143,6 +143,7 @@ def flip_parameter(value: str) -> Parameter:
         default=NO_FLIP,
         choices=(NO_FLIP, *FLIPS),
         description="flips in this direction (sent once); in flight only",
+        momentary=True,
     )
 
 
