@@ -108,3 +108,21 @@ def test_the_end_of_the_parents_pipe_is_heard() -> None:
     never_open = threading.Event()
     on_parent_end(never_open.set, reading + 1000)
     assert never_open.wait(20.0), "a pipe that can't be read is as good as ended"
+
+
+def test_a_fork_leaves_the_child_of_its_parent_alone() -> None:
+    """What a fork of this process does to its copy of the object; the process itself goes on."""
+    code = "import sys; print('x', flush=True); sys.stdin.read(); print('y', flush=True)"
+    child = ChildProcess([sys.executable, "-c", code])
+    assert child.stdout.readline() == b"x\n"
+    keep = os.dup(child._process.stdin.fileno())  # type: ignore[union-attr]  # the parent's end of the pipe
+    child.forked()
+    child.terminate()
+    child.kill()
+    child.end(0.0, 0.0)
+    child.close(0.0, 0.0)
+    assert child.code is None, "it still runs"
+    os.close(keep)
+    assert child.stdout.readline() == b"y\n", "no copy of the pipe is left that would keep it running"
+    child._ours = True
+    child.close()

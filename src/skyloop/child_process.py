@@ -1,7 +1,10 @@
-"""Child processes that end with their parent, and whose last words are in the error.
+"""Child processes that end with their parent, and what a fork of this process leaves to it.
 
 A child's standard input is a pipe into which nothing is written. When the parent closes its end or is gone, however it
 ended, the child reads the end of file (:func:`on_parent_end`) and ends too.
+
+A child made by ``os.fork`` is another matter: it has copies of its parent's objects, but none of its threads, and their
+ends would end what the parent still uses (:func:`leave_to_parent`).
 """
 
 from __future__ import annotations
@@ -10,12 +13,44 @@ import os
 import subprocess
 import tempfile
 import threading
+import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import IO, Final
+from typing import IO, Final, Protocol
 
 GRACE_S: Final = 4.0  #: for a child to end by itself, and again to end when it is terminated
 _TAIL: Final = 2000  # bytes of a child's standard error that an error shows
+
+
+class LeftToParent(Protocol):
+    """What belongs to the process that made it."""
+
+    def forked(self) -> None:
+        """In a child made by ``os.fork``: let nothing that is called from now on reach what the parent uses.
+
+        Other threads are gone, and their locks may be held for ever: take none.
+        """
+
+
+_left: Final[weakref.WeakSet[LeftToParent]] = weakref.WeakSet()
+_left_lock: Final = threading.RLock()
+
+
+def leave_to_parent(owner: LeftToParent) -> None:
+    """Have ``owner.forked()`` called in each child made by ``os.fork``, for as long as ``owner`` is in use."""
+    with _left_lock:
+        _left.add(owner)
+
+
+def _leave_all() -> None:
+    _left_lock.release()
+    for owner in list(_left):
+        owner.forked()
+    _left.clear()
+
+
+if hasattr(os, "register_at_fork"):  # where there is no fork nothing is inherited
+    os.register_at_fork(before=_left_lock.acquire, after_in_parent=_left_lock.release, after_in_child=_leave_all)
 
 
 class ChildProcess:
@@ -53,6 +88,13 @@ class ChildProcess:
         assert self._process.stdout is not None
         self.pid = self._process.pid
         self.stdout: IO[bytes] = self._process.stdout
+        self._ours = True
+        leave_to_parent(self)
+
+    def forked(self) -> None:
+        """Leave the child to the process that started it, without a copy of the pipe that keeps it running."""
+        self.part()
+        self._ours = False
 
     @property
     def code(self) -> int | None:
@@ -88,11 +130,13 @@ class ChildProcess:
 
     def terminate(self) -> None:
         """Send it SIGTERM. Does not wait. Idempotent."""
-        self._process.terminate()
+        if self._ours:
+            self._process.terminate()
 
     def kill(self) -> None:
         """Kill it. Does not wait. Idempotent."""
-        self._process.kill()
+        if self._ours:
+            self._process.kill()
 
     def wait(self, timeout_s: float | None = None) -> int | None:
         """Wait until it has ended; return its exit code, None if it still runs after ``timeout_s`` [s]."""
@@ -107,6 +151,8 @@ class ChildProcess:
             grace_s: Time to end by itself [s].
             harder_s: Time to end when it was terminated [s].
         """
+        if not self._ours:
+            return
         self.part()
         if self.wait(grace_s) is None:
             self._process.terminate()
@@ -116,6 +162,8 @@ class ChildProcess:
 
     def close(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
         """End it as :meth:`end` does, and close its output, which nobody may be reading then. Idempotent."""
+        if not self._ours:
+            return  # and its output may be locked for ever by a thread that the fork left behind
         self.end(grace_s, harder_s)
         self.stdout.close()
         if self._errors is not None:

@@ -286,6 +286,34 @@ def test_a_cancelled_connect_leaves_no_drone(proxy: ScriptedProxy, monkeypatch: 
     run(give_up())
 
 
+def test_a_connect_cancelled_as_it_succeeds_leaves_no_drone(
+    proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop was busy while the connection was made: result and cancellation come in the same round."""
+    made, closed = threading.Event(), threading.Event()
+    connect: Any = skyloop.client.connect
+
+    def noted(target: str, **options: Any) -> skyloop.client.Drone:
+        drone: skyloop.client.Drone = connect(target, on_close=closed.set, **options)
+        made.set()
+        return drone
+
+    monkeypatch.setattr("skyloop.client.connect", noted)
+
+    async def give_up() -> None:
+        task = asyncio.ensure_future(aio.connect("me")._connect())
+        await asyncio.sleep(0)
+        assert made.wait(WAIT_S)
+        for worker in [thread for thread in threading.enumerate() if thread.name == "skyloop-aio"]:
+            worker.join()  # which has handed its result to the loop
+        asyncio.get_running_loop().call_soon(task.cancel)
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert await asyncio.to_thread(closed.wait, WAIT_S)
+
+    run(give_up())
+
+
 def test_a_connect_whose_loop_has_ended_leaves_no_drone(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on, closed = threading.Event(), threading.Event()
     connect: Any = skyloop.client.connect  # the one that was put in its place

@@ -135,7 +135,14 @@ def test_what_another_pilot_wrote_is_not_overwritten(proxy: ScriptedProxy, drone
     drone.config["limits.tilt"] = 0.2
     drone.config["limits.speed"] = 1.0
     proxy.event(EventKind.PARAMETER_CHANGED, "", "other", name="limits.tilt", value=0.1, app_id=99)
-    proxy.event(EventKind.PARAMETER_CHANGED, "", "me", name="limits.speed", value=1.0, app_id=proxy.owner[0] if proxy.owner else 0)
+    proxy.event(
+        EventKind.PARAMETER_CHANGED,
+        "",
+        "me",
+        name="limits.speed",
+        value=1.0,
+        app_id=proxy.owner[0] if proxy.owner else 0,
+    )
     drone.wait(lambda _: len(drone.recent_events()) >= 2, WAIT_S)
     proxy.stop()
     proxy.requests.clear()

@@ -263,3 +263,13 @@ def test_what_others_fly_is_not_at_rest(bench: Bench) -> None:
     bench.run(1.1)
     assert bench.proxy.handler.ownership.others
     assert not bench.proxy.at_rest
+
+
+def test_in_a_fork_the_proxy_leaves_its_vehicle_to_the_parent(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.proxy.forked()
+    bench.proxy.stop()
+    assert bench.driver.told == []
+    assert not bench.driver.closed
+    bench.proxy._stopped = False  # the parent's
+    assert pilot.told(EventKind.PROXY_CLOSING) == []

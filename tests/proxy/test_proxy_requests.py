@@ -272,7 +272,8 @@ def test_a_request_that_arrives_after_its_release_is_refused(bench: Bench) -> No
     assert app.ask(ReleaseAuthority()) == Done()
     app.repeat(late, RequestAuthority(16))
     reply = app.answer(late)
-    assert isinstance(reply, Refused) and reply.code is Refusal.NOT_FRESH
+    assert isinstance(reply, Refused)
+    assert reply.code is Refusal.NOT_FRESH
     assert bench.proxy.handler.authority.holder is None
 
 
@@ -299,5 +300,6 @@ def test_a_repeated_read_is_answered_with_what_is_true_now(bench: Bench) -> None
     app.ask(SetParameter("limits.tilt", 0.2, app.lease))
     app.repeat(number, read)
     after = app.answer(number)
-    assert isinstance(before, ParameterValue) and isinstance(after, ParameterValue)
+    assert isinstance(before, ParameterValue)
+    assert isinstance(after, ParameterValue)
     assert (before.parameter.value, after.parameter.value) == (0.35, 0.2)

@@ -237,6 +237,10 @@ class AuthorityTracker:
             return self._set(replace(self.status, position=position, expected_wait_s=expected))
         if event.kind is EventKind.AUTHORITY_DECLINED and ours:
             self.declined = event.text
+        overtaken = self.status.state == "preempted" and _whole(data.get("lease")) == self._lease
+        if ours and overtaken and event.kind is EventKind.AUTHORITY_LOST:
+            # Feedback that named the next holder came first: it was not pre-empted, and is not in the queue.
+            return self.given_back() if data.get("reason") == "expired" else self._lost(None)
         if not ours or not self.held or _whole(data.get("lease")) < self.status.lease:
             return False
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
@@ -258,6 +262,9 @@ class AuthorityTracker:
             )
         if self.held:
             newer = feedback.lease > self.status.lease
+            until_ns = self.status.until_ns
+            if newer and until_ns is not None and feedback.captured_ns >= until_ns:
+                return self.given_back()  # its time is over, and the event that says so was lost or is late
             nobody = not feedback.lease and now_ns - self._granted_ns > self.SETTLE_NS
             return (newer or nobody) and self._lost(feedback.owner if feedback.lease else None)
         if self.status.state in ("queued", "preempted"):

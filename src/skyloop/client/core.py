@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final, Literal, Protocol, TypedDict
 
+from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
 from skyloop.client.channels import Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
@@ -129,6 +131,7 @@ class DroneCore:
         self.app = app
         self.role = Role.PILOT if access == "pilot" else Role.OBSERVER
         self.closed = False
+        self._why_closed = "this drone was closed: connect again"
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
         self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
@@ -162,6 +165,7 @@ class DroneCore:
             begin=scheduler.begin,
         )
         connection.subscribe(EVENTS)
+        leave_to_parent(self)
 
     # Beginning and end -------------------------------------------------------------------------------------------
 
@@ -230,6 +234,15 @@ class DroneCore:
             if self._on_close is not None:
                 self._on_close()
 
+    def forked(self) -> None:
+        """Leave the vehicle and the connection to the parent process; in a child made by ``os.fork``."""
+        if not self.closed:
+            self.closed = True
+            self._why_closed = (
+                f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect here as well"
+            )
+            self.connection.forked()
+
     def leave(self) -> SkyloopError | None:
         """Do what the end of a block does: land what this application flies, or hover (see ``on_exit``), and close.
 
@@ -267,7 +280,7 @@ class DroneCore:
     def check_open(self) -> None:
         """Raise :class:`ClosedError` after :meth:`close`."""
         if self.closed:
-            raise ClosedError("this drone was closed: connect again")
+            raise ClosedError(self._why_closed)
 
     def check_may_wait(self) -> None:
         """Raise :class:`UsageError` on the receiving thread."""

@@ -105,8 +105,8 @@ class Config(Mapping[str, Value]):
 
     ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority.
     After a restart of the proxy, which forgets them, the values that were written are written again with the next grant
-    of the authority, unless another application held it in between. Momentary parameters, such as a flip, never are. Every
-    method waits for the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
+    of the authority, unless another application held it in between. Momentary parameters, such as a flip, never are.
+    Every method waits for the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
     """
 
     def __init__(self, connection: ProxyConnection, authority: AuthorityTracker, restorer: Restorer) -> None:

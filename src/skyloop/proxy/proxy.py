@@ -17,6 +17,7 @@ from typing import Final
 
 import msgspec
 
+from skyloop.child_process import leave_to_parent
 from skyloop.clock import Clock, clock_identity, monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Driver
 from skyloop.errors import DecodeError, UsageError
@@ -197,6 +198,7 @@ class Proxy:
             if self._started:
                 raise UsageError(f"proxy {self.name} was started before: make another one")
             self._started = True
+        leave_to_parent(self)
         self._parameter_requests.read_driver()
         self.handler.begin(self.clock())
         try:
@@ -260,6 +262,10 @@ class Proxy:
             self.publisher.streams.end()
             self.server.stop()
             self._close_records()
+
+    def forked(self) -> None:
+        """Leave the vehicle and the clients to the parent process; in a child made by ``os.fork``."""
+        self._stopped = True
 
     def abandon(self, reason: str) -> None:
         """Publish that the proxy ends because its driver does not work, and give back what can be. Idempotent.
