@@ -9,6 +9,7 @@ ends would end what the parent still uses (:func:`leave_to_parent`).
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import tempfile
@@ -20,6 +21,10 @@ from typing import IO, Final, Protocol
 
 GRACE_S: Final = 4.0  #: for a child to end by itself, and again to end when it is terminated
 _TAIL: Final = 2000  # bytes of a child's standard error that an error shows
+_LOOK_S: Final = 0.25  # how often a child that may fall silent is looked at
+#: How long what a dead child has written is read. A grandchild that holds the pipe keeps it open for longer.
+_DRAIN_S: Final = 1.0
+_log = logging.getLogger(__name__)
 
 
 class LeftToParent(Protocol):
@@ -166,9 +171,146 @@ class ChildProcess:
             return  # and its output may be locked for ever by a thread that the fork left behind
         self.end(grace_s, harder_s)
         self.stdout.close()
-        if self._errors is not None:
+        self.close_errors()
+
+    def close_errors(self) -> None:
+        """Keep the end of what it wrote to standard error, and nothing else of it. Idempotent."""
+        if self._errors is not None and not self._errors.closed:
             self._last_words = self.last_words
             self._errors.close()
+
+
+class RestartingChild:
+    """Keeps one child running: whenever it ends another is started, until :meth:`stop`. Any thread.
+
+    Everything is decided under one lock, so that no child begins after :meth:`request_stop`, and each is ended.
+
+    Attributes:
+        child: The present one, or the last; None before the first.
+        restarts: How many were started in place of another.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        *,
+        name: str,
+        read: Callable[[ChildProcess], object],
+        ended: Callable[[ChildProcess | None, str], float | None],
+        started: Callable[[ChildProcess], object] = lambda _: None,
+        silent: Callable[[], bool] | None = None,
+        keep_errors: bool = False,
+    ) -> None:
+        """Prepare; :meth:`start` starts the first child.
+
+        Args:
+            command: The children's command line.
+            name: Of the threads.
+            read: Reads a child's ``stdout`` to its end, on a thread of its own for each child.
+            ended: Called when a child has ended, with how, for people; with None when one could not be started.
+                Returns the pause before the next one is started [s]; None: none is.
+            started: Called with each child before anything of it is read, under the lock: must be quick.
+            silent: Whether the present child has hung and is to be killed; asked four times a second.
+            keep_errors: See :class:`ChildProcess`.
+        """
+        self._command = command
+        self._read = read
+        self._ended = ended
+        self._started = started
+        self._silent = silent
+        self._keep_errors = keep_errors
+        self._changed = threading.Condition(threading.RLock())
+        self._stopping = False
+        self._reader: threading.Thread | None = None
+        self._name = name
+        self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
+        self.child: ChildProcess | None = None
+        self.restarts = 0
+
+    @property
+    def stopping(self) -> bool:
+        """Whether no other child will be started."""
+        return self._stopping
+
+    @property
+    def over(self) -> bool:
+        """Whether the last child has ended and no other will be started."""
+        return not self._keeper.is_alive()
+
+    def start(self) -> None:
+        """Start the first child. Once.
+
+        Raises:
+            OSError: It can't be started.
+        """
+        self._begin()
+        self._keeper.start()
+
+    def request_stop(self) -> ChildProcess | None:
+        """Start no other child, and return the present one, which goes on. Does not wait. Idempotent."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+            return self.child
+
+    def stop(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
+        """End the present child as :meth:`ChildProcess.end` does, and start no other. Idempotent."""
+        child = self.request_stop()
+        if child is not None:
+            child.end(grace_s, harder_s)
+        for thread in (self._keeper, self._reader):
+            if thread is not None and thread.ident is not None and thread is not threading.current_thread():
+                thread.join(_DRAIN_S if thread is self._reader else None)
+
+    def _begin(self) -> ChildProcess | None:
+        with self._changed:
+            if self._stopping:
+                return None
+            child = self.child = ChildProcess(self._command, keep_errors=self._keep_errors)
+            self._started(child)
+        self._reader = threading.Thread(target=self._listen, args=(child,), name=f"{self._name}-output", daemon=True)
+        self._reader.start()
+        return child
+
+    def _listen(self, child: ChildProcess) -> None:
+        try:
+            self._read(child)
+        except Exception:  # noqa: BLE001  the child is replaced all the same
+            _log.exception("the output of a child process could not be read: it is killed")
+            child.kill()
+        finally:
+            child.stdout.close()  # only here: closing what another thread reads would wait for it
+
+    def _keep(self) -> None:
+        child, ending = self.child, ""
+        while True:
+            if child is not None:
+                ending = self._wait(child)
+            pause_s = self._ended(child, ending)
+            with self._changed:
+                if pause_s is None or self._stopping or self._changed.wait_for(lambda: self._stopping, pause_s):
+                    self._stopping = True
+                    return
+                self.restarts += 1
+            try:
+                child = self._begin()
+            except OSError as error:  # no memory or no descriptors left, for a moment
+                child, ending = None, f"could not be started: {error}"
+                continue
+            if child is None:
+                return
+
+    def _wait(self, child: ChildProcess) -> str:
+        """Wait until a child has ended and its output was read; return how it ended, for people."""
+        while child.wait(None if self._silent is None else _LOOK_S) is None:
+            if self._silent is not None and self._silent():
+                child.kill()
+        reader = self._reader
+        assert reader is not None
+        reader.join(_DRAIN_S)
+        child.part()
+        child.close_errors()
+        return child.ending
 
 
 def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:

@@ -1,9 +1,9 @@
 """Requests: each is carried out once and answered as often as it is asked.
 
 A client repeats a request until its answer arrives, with the same number. A repeat of one that is being answered joins
-it; a repeat of one that changed something gets the kept answer. What concerns only the proxy's own state (Hello, authority,
-Ping) is answered at once on the receiving thread, so that a take-over never waits behind a slow parameter. What may ask
-the driver is answered on a thread of its own.
+it; a repeat of one that changed something gets the kept answer. What concerns only the proxy's own state (Hello,
+authority, Ping) is answered at once on the receiving thread, so that a take-over never waits behind a slow parameter.
+What may ask the driver is answered on a thread of its own.
 """
 
 from __future__ import annotations
