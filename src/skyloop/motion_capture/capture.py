@@ -277,7 +277,7 @@ class MotionCapture:
     def calibrate(self, drone: Drone, *, heading: float = 0.0, seconds: float = REST_S) -> Calibration:
         """Measure the rotation between the tracked body's axes and the drone's, while it stands at rest on the ground.
 
-        From then on the poses of that body are the drone's. An earlier calibration stays in force until this one is found.
+        From then on the poses of that body are the drone's; until it is found an earlier calibration stays in force.
 
         Args:
             drone: Its proxy's name must be one of ``bodies``.
