@@ -1,7 +1,7 @@
 """The control socket of a host: what ``skyloop host add``, ``remove`` and ``status`` ask it.
 
 One request and one answer for each connection, in JSON, cut into packets. The socket ``NAME.host`` lies beside those of
-the proxies, and who may connect to them may use it: the host's user, the superuser, and members of the group that it was
+the proxies, and who may connect to them may use it: the host's user, the superuser, and members of the group it was
 given.
 """
 
