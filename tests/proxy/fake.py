@@ -289,7 +289,7 @@ class Bench:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.proxy.stop()
+        self.proxy.end()
         for app in self.apps:
             app.end.close()
 

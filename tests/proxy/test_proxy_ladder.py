@@ -19,6 +19,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.proxy.core.flight import BELIEF_NS
 from skyloop.transport.testing import wait_until
 from tests.proxy.fake import App, Bench
 
@@ -148,7 +149,7 @@ def test_nothing_is_done_on_the_ground(bench: Bench) -> None:
 def test_a_flight_that_an_earlier_run_began_waits_for_its_pilot_and_is_ended() -> None:
     bench = Bench()
     bench.driver.now = Feedback(captured_ns=0)
-    bench.proxy.handler.ownership.began_before()
+    bench.proxy.handler.flight.began_before(bench.clock() + BELIEF_NS)
     with bench:
         witness = bench.join("witness")
         bench.run(20.0)  # until the vehicle is heard
@@ -181,8 +182,7 @@ def test_landing_before_the_end(bench: Bench) -> None:
     pilot.command(Velocity(0.5))
     assert pilot.refusals() == [Refusal.WRONG_STATE]
     bench.driver.report(state=FlightState.LANDED)
-    assert bench.proxy.land(1.0)
-    bench.proxy.stop(reason="it is late")
+    assert bench.proxy.end(1.0, reason="it is late")
     # What was published before the end still comes, on the pilot's own thread.
     wait_until(lambda: any(event.kind is EventKind.PROXY_CLOSING for event in pilot.events), "the pilot hears of it")
     assert "it is late" in next(event.text for event in pilot.events if event.kind is EventKind.PROXY_CLOSING)
@@ -193,7 +193,7 @@ def test_landing_before_the_end(bench: Bench) -> None:
 def test_ending_in_the_air_leaves_it_hovering(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
-    bench.proxy.stop()
+    bench.proxy.end()
     assert bench.driver.told == [Velocity(0.5), Hover()]
 
 
@@ -261,5 +261,5 @@ def test_a_link_that_broke_and_feedback_that_is_due_are_no_rest(bench: Bench) ->
 def test_what_others_fly_is_not_at_rest(bench: Bench) -> None:
     bench.driver.report(state=FlightState.FLYING)
     bench.run(1.1)
-    assert bench.proxy.handler.ownership.others
+    assert bench.proxy.handler.flight.others
     assert not bench.proxy.at_rest

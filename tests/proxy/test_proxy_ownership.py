@@ -37,7 +37,7 @@ def test_a_proxy_beside_a_vehicle_that_somebody_else_flies_does_nothing(bench: B
         bench.driver.link(link, "")
         bench.run(1.0)
     assert not bench.proxy.handler.order_landing(bench.clock())
-    bench.proxy.stop()
+    bench.proxy.end()
     assert bench.driver.told == []
     assert bench.published(EventKind.FAILSAFE) == []
     (told,) = [event.text for event in bench.published(EventKind.VEHICLE_MESSAGE)]

@@ -7,8 +7,8 @@ from typing import Final
 from skyloop.messages import Command, EventKind, Failsafe, Refusal, Severity, Value
 from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
+from skyloop.proxy.core.flight import Changed, Whose
 from skyloop.proxy.core.limits import Clamp
-from skyloop.proxy.core.ownership import Changed, Whose
 
 _ENFORCED: Final = "enforced: its position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
