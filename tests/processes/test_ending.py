@@ -11,6 +11,7 @@ import pytest
 
 import skyloop
 from skyloop.errors import SkyloopError
+from skyloop.messages import EventKind
 from tests.processes.conftest import Process
 
 pytestmark = pytest.mark.process
@@ -35,7 +36,7 @@ def test_what_stands_stays_on_the_ground_while_another_one_lands(
         process.until("hosting 2", 40.0)
     with skyloop.connect(names[0], on_exit="hover") as flying, skyloop.connect(names[1], on_exit="hover") as standing:
         flying.takeoff()
-        climbing = time.monotonic() + 3.5
+        climbing = time.monotonic() + 2.0
         while time.monotonic() < climbing:  # so that its landing takes some seconds
             flying.velocity(up=0.8)
             time.sleep(0.05)
@@ -44,5 +45,6 @@ def test_what_stands_stays_on_the_ground_while_another_one_lands(
         with pytest.raises(SkyloopError):
             standing.takeoff(timeout_s=8.0)
         assert process.wait(30.0) == 0
+        assert [event for event in standing.recent_events() if event.kind is EventKind.STATE_CHANGED] == []
         assert standing.feedback(max_age_s=None).state == "landed"
         assert flying.feedback(max_age_s=None).state == "landed"

@@ -16,6 +16,7 @@ from skyloop.messages import (
     LinkState,
     Refusal,
     ReleaseAuthority,
+    RequestAuthority,
     Takeoff,
     Velocity,
 )
@@ -226,6 +227,32 @@ def test_a_driver_whose_failsafe_raises_against_its_contract_is_tried_again(
     monkeypatch.undo()
     bench.run(0.3)
     assert bench.driver.told == [Hover()]
+
+
+def test_pilots_who_hang_one_after_another_keep_it_in_the_air_no_longer_than_one_does(bench: Bench) -> None:
+    """Ten programs wait in the queue and hang: each is granted the authority, and never heard."""
+    bench.airborne()
+    for number in range(10):
+        bench.join(f"pilot {number}").ask(RequestAuthority(16, queue=True))
+    bench.run(4.98)
+    assert bench.driver.told[-1] == Hover()
+    assert bench.proxy.handler.authority.granted > 2
+    bench.run(0.04)
+    assert bench.driver.told[-1] == Land()
+
+
+def test_a_landing_is_repeated_until_the_vehicle_shows_it(bench: Bench) -> None:
+    """It flew, and has told nothing of its flight since the ladder's landing was sent."""
+    bench.airborne()
+    bench.tick()
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.UNKNOWN)
+    bench.run(7.0)
+    assert bench.driver.told.count(Land()) >= 7
+    bench.driver.report(state=FlightState.LANDING)
+    count = len(bench.driver.told)
+    bench.run(1.0)
+    assert len(bench.driver.told) == count
 
 
 def test_nothing_is_at_rest_from_a_grant_until_the_flight_is_over(bench: Bench) -> None:

@@ -57,7 +57,7 @@ from skyloop.messages.overview import MAX_ADDRESS, MAX_EVENT_TEXT
 from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
 from skyloop.proxy.core.events import EventDraft
-from skyloop.proxy.core.flight import BELIEF_NS, Flight
+from skyloop.proxy.core.flight import Flight
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.flight_record import FlightRecord
@@ -211,8 +211,9 @@ class Proxy:
         if self._trail is not None:
             self._trail.begin(str(self.driver.uri))
         if self._record is not None:  # now that the name is ours
-            if self._record.believed():
-                self.handler.flight.began_before(self.clock() + BELIEF_NS)
+            left_s = self._record.left_s()
+            if left_s > 0.0:
+                self.handler.flight.began_before(self.clock() + nanoseconds(left_s))
             self._record.start()
         self._requests.start()
         self.overview.begin()

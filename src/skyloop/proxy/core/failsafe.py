@@ -36,7 +36,7 @@ _LAND_AT_START: Final = ReturnToStart(land=True)
 #: States that show that an action which the driver took did not reach the vehicle.
 _CONTRADICTIONS: Final = {
     Hover: frozenset({FlightState.FLYING}),
-    Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING}),
+    Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN}),
     ReturnToStart: frozenset(),  # it is steered all the way
 }
 
@@ -63,7 +63,7 @@ class FailsafeInputs:
 
     state: FlightState
     airborne: bool
-    last_command_ns: int  #: when the last valid command came, or the authority was granted
+    last_command_ns: int  #: when the last valid command came, whoever held the authority then
     pilot: str  #: ``held``, or why nobody holds the authority: ``released``, ``silent``, ``gone``, ``none``
     link_up: bool  #: hop proxy–vehicle
     battery: float | None
