@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from skyloop.clock import slept_ns
 from skyloop.messages import (
     Attitude,
     EventKind,
@@ -157,3 +158,57 @@ def test_a_vehicle_that_reports_to_fly_flies(lift: Lift) -> None:
     pilot.command(Hover())
     lift.bench.tick()
     assert lift.climb == 0.0
+
+
+# A computer that slept -------------------------------------------------------------------------------------------
+
+
+def sleep(bench: Bench, seconds: float) -> None:
+    bench.slept_ns += round(seconds * 1e9)
+
+
+def test_what_was_asked_for_before_the_computer_slept_is_not_done_afterwards(bench: Bench) -> None:
+    """The program slept with it, and repeats its velocity as the first thing of all."""
+    pilot = bench.airborne()
+    pilot.command(Velocity(1.0))
+    sleep(bench, 1.0)
+    pilot.command(Velocity(1.0), repeat=True)
+    assert pilot.refusals() == [Refusal.NOT_FRESH]
+    assert bench.driver.told == [Velocity(1.0), Hover()]
+    pilot.command(Velocity(0.5))
+    assert bench.driver.told[-1] == Velocity(0.5)
+    assert "slept for 1.0 s" in bench.published(EventKind.VEHICLE_MESSAGE)[-1].text
+
+
+def test_a_command_that_waited_while_the_computer_slept_is_as_old_as_it_is(bench: Bench) -> None:
+    """It was received only now, and never before."""
+    pilot = bench.airborne()
+    sent_ns = bench.clock()
+    sleep(bench, 600.0)
+    bench.clock.advance(0.02)
+    bench.tick()
+    pilot.take_authority()
+    pilot.command(Velocity(1.0), sent_ns=sent_ns)
+    assert pilot.refusals() == [Refusal.STALE]
+    assert "it is 600.0" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
+
+
+def test_silence_counts_while_the_computer_sleeps(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(1.0))
+    sleep(bench, 6.0)
+    bench.run(0.02)
+    assert bench.driver.told[-1] == Land()
+    assert bench.proxy.handler.authority.holder is None
+
+
+def test_what_flies_after_a_long_sleep_may_be_somebody_elses(bench: Bench) -> None:
+    bench.airborne()
+    sleep(bench, 3600.0)
+    bench.run(6.0)
+    assert bench.driver.told == []
+    assert bench.proxy.handler.flight.others
+
+
+def test_the_computers_own_sleep_is_known_where_it_says_so() -> None:
+    assert -(10**9) < slept_ns() < 10 * 365 * 24 * 3600 * 10**9

@@ -19,7 +19,7 @@ from skyloop.proxy.core.flight import BELIEF_NS
 
 LIFE_S: Final = seconds(
     BELIEF_NS
-)  #: a supervisor starts a proxy again within seconds; nobody changes the pilot in that time
+)  #: a supervisor starts a proxy again within seconds, and nobody changes the pilot then
 KEEP_S: Final = 2.0  #: how often it is made young
 CLOSE_S: Final = 2.0  #: how long the end of a proxy waits for the file
 MAX_BYTES: Final = 4096  #: of an address; a longer file is none of ours

@@ -14,7 +14,9 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from skyloop.clock import Clock, nanoseconds, seconds
+import msgspec
+
+from skyloop.clock import NS_PER_S, Clock, nanoseconds, seconds
 from skyloop.errors import RefusedError
 from skyloop.messages import (
     AnswerTakeover,
@@ -56,6 +58,7 @@ from skyloop.proxy.core.flight_events import (
     failsafe_event,
     ownership_event,
     refused_event,
+    slept_event,
     taken_event,
 )
 from skyloop.proxy.events import Counters, EventPublisher
@@ -68,6 +71,8 @@ from skyloop.transport.base import COMMANDS, TransportServer
 
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
+#: So much more sleep of the computer than was known is one: shorter ones are not told from a delay.
+SLEEP_NS: Final = NS_PER_S // 4
 
 
 class CommandHandler:
@@ -81,6 +86,7 @@ class CommandHandler:
         server: where echoes of commands are published.
         sessions: the connections, by the application's number; read here, changed by the proxy.
         clock: the proxy's clock [ns].
+        slept: for how long the computer has slept, in all [ns].
     """
 
     def __init__(
@@ -93,6 +99,7 @@ class CommandHandler:
         server: TransportServer,
         sessions: Mapping[int, Session],
         clock: Clock,
+        slept: Clock,
     ) -> None:
         self.authority = Authority()
         self.ladder = FailsafeLadder()
@@ -117,6 +124,9 @@ class CommandHandler:
         self._clock = clock
         self._pilot = "none"  # why nobody holds the authority, or "held"
         self._breaks_seen = 0  # of the vehicle's link, when last looked at
+        self._slept = slept
+        self._slept_seen = slept()  # when last looked at, or noticed
+        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
         self._enforced = True  # whether the safety box and zones could be, at the last set-point
         self._stamp()
 
@@ -141,6 +151,15 @@ class CommandHandler:
             self._executor.guarded = settings.safety is not None
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
+
+    def aged(self, command: Command, now_ns: int) -> Command:
+        """Return a command as old as it is: one from before the computer slept looks as if it had just been sent."""
+        if self._slept() - self._slept_seen >= SLEEP_NS:
+            with self._lock:
+                self._observe_sleep(now_ns)
+        if command.sent_ns >= self._awake_ns:
+            return command
+        return msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and carry it out, on the thread that received it."""
@@ -209,6 +228,7 @@ class CommandHandler:
     def tick(self, now_ns: int) -> None:
         """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace."""
         with self._lock:
+            self._observe_sleep(now_ns)
             self._observe_link(now_ns)
             effects = self.authority.update(now_ns)
             if effects:
@@ -448,9 +468,25 @@ class CommandHandler:
         breaks = self._vehicle.link_breaks
         if breaks != self._breaks_seen:
             self._breaks_seen = breaks
-            self._end_intents()
-            self.ladder.hand_over(now_ns)
-            self._update_failsafe(now_ns)
+            self._start_over(now_ns)
+
+    def _observe_sleep(self, now_ns: int) -> None:
+        """Act on a sleep of the computer: all that is known is older than its clock says."""
+        slept_ns = self._slept() - self._slept_seen
+        if slept_ns < SLEEP_NS:
+            return
+        self._slept_seen += slept_ns
+        self._slept_ns, self._awake_ns = slept_ns, now_ns
+        self.authority.slept(slept_ns)
+        self.flight.slept(slept_ns)
+        self._events.publish_draft(slept_event(seconds(slept_ns)))
+        self._start_over(now_ns)
+
+    def _start_over(self, now_ns: int) -> None:
+        """Hover, and let nothing that was asked for until now be done later."""
+        self._end_intents()
+        self.ladder.hand_over(now_ns)
+        self._update_failsafe(now_ns)
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""

@@ -17,7 +17,7 @@ from typing import Final
 
 import msgspec
 
-from skyloop.clock import Clock, clock_identity, monotonic_ns, nanoseconds, seconds
+from skyloop.clock import Clock, clock_identity, monotonic_ns, nanoseconds, seconds, slept_ns
 from skyloop.drivers.base import Driver
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import (
@@ -89,6 +89,7 @@ class Proxy:
         ticker: False leaves :meth:`tick` to the caller, for many proxies in a process, for tests, and for
             time that stands still.
         jobs: Answers what may wait for the vehicle; by default a thread of its own.
+        slept: For how long the computer has slept, in all [ns]; by default what it says, where the clock is its own.
 
     Raises:
         UsageError: for a name that is empty or too long.
@@ -103,6 +104,7 @@ class Proxy:
         clock: Clock = monotonic_ns,
         ticker: bool = True,
         jobs: JobQueue | None = None,
+        slept: Clock | None = None,
     ) -> None:
         if not 1 <= len(name) <= MAX_NAME:
             raise UsageError(f"a proxy's name has 1 to {MAX_NAME} characters, and {name!r} has {len(name)}")
@@ -141,6 +143,7 @@ class Proxy:
             server=server_end,
             sessions=self._sessions,
             clock=clock,
+            slept=slept or (slept_ns if clock is monotonic_ns else _never),
         )
         self.parameters = Parameters(lambda: described(driver), driver.set_parameter)
         self.workers = ProcessorWorkers(server_end, self.events, self._counters, self.publisher.cameras)
@@ -179,7 +182,7 @@ class Proxy:
         self._trail: AuditTrail | None = None
         self._record: FlightRecord | None = None
         self._decode = decode
-        self._command = self.handler.command
+        self._command, self._aged = self.handler.command, self.handler.aged
 
     def keep_trail(self, trail: AuditTrail) -> None:
         """Write who flies when to this trail and close it with the proxy. Call before :meth:`start`."""
@@ -336,7 +339,7 @@ class Proxy:
             return
         kind = type(sample)
         if kind is Command:
-            self._command(session, sample, now_ns)  # type: ignore[arg-type]
+            self._command(session, self._aged(sample, now_ns), now_ns)  # type: ignore[arg-type]
         elif isinstance(sample, Request):
             self._requests.handle(session, sample, now_ns)
         elif isinstance(sample, Annotation):
@@ -519,6 +522,10 @@ class Proxy:
     def _refresh_parameters(self) -> None:
         """Read the driver's parameters again, now that its vehicle has come. On the driver's thread."""
         self._requests.call_later(self._parameter_requests.read_driver)
+
+
+def _never() -> int:
+    return 0
 
 
 def _let_be(period_s: float) -> None:

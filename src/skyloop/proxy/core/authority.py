@@ -260,6 +260,13 @@ class Authority:
             effects.append(Expired(holder.app_id, self.lease))
         return effects
 
+    def slept(self, ns: int) -> None:
+        """Let everything be older by so much: the computer slept, and its clock stood still."""
+        self.last_command_ns -= ns
+        self._granted_ns -= ns
+        if self.until_ns is not None:
+            self.until_ns -= ns
+
     # Inside ----------------------------------------------------------------------------------------------------
 
     def _dequeue(
