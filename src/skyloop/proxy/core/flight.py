@@ -104,7 +104,7 @@ class Flight:
             if self._has_no_notion or state in _MANOEUVRES:
                 return state
             return state if reported is FlightState.FLYING and state is FlightState.HOVERING else reported
-        if not self._has_no_notion or (reported.airborne and state in (FlightState.LANDED, FlightState.UNKNOWN)):
+        if not self._has_no_notion or (reported.airborne and not state.airborne):
             return reported
         return state
 
