@@ -222,7 +222,7 @@ def test_all_land_at_the_end_though_one_hangs(hosting: Hosting) -> None:
         hosting.add(name)
         hosting.airborne(name)
     hosting.drivers["stuck"].hangs = {"land"}
-    landing = threading.Thread(target=hosting.host.land, args=(20.0,))
+    landing = threading.Thread(target=hosting.host.close, args=("it is late", 20.0))
     landing.start()
     for name in ("one", "two"):
         wait_until(partial(hosting.drivers[name].told.__contains__, Land()), "it lands")

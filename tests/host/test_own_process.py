@@ -55,7 +55,7 @@ def test_one_that_dies_again_and_again_is_started_after_longer_and_longer_pauses
     assert "ended with exit code 7" in lines[0]
     assert dying.status().restarts >= 1
     assert "exit code 7" in dying.status().failed
-    dying.stop("it is enough")
+    dying.end(0.0, "it is enough")
     assert dying.status().condition == "stopped"
     count = len(pauses)
     time.sleep(0.05)
@@ -69,7 +69,7 @@ def test_one_that_reports_nothing_any_more_is_killed(monkeypatch: pytest.MonkeyP
     hung = vehicle("say(); time.sleep(60)", lines)
     hung.start()
     wait_until(lambda: any("was killed by signal 9" in line for line in lines), "it was killed")
-    hung.stop("it is enough")
+    hung.end(0.0, "it is enough")
 
 
 def test_it_lands_at_sigterm_and_is_not_started_again(tmp_path: Path) -> None:
@@ -89,18 +89,18 @@ time.sleep(60)
     landing.start()
     assert landing.status().pilot == "jane"
     assert landing.runs
-    assert landing.land(10.0)
+    assert landing.end(10.0, "it was removed", unless_flying=True)
     assert (tmp_path / "landed").exists()
-    landing.stop("it was removed")
+    landing.end(0.0, "it was removed")
     assert lines == []
-    assert landing.land(0.0)
+    assert landing.end(0.0, "it was removed", unless_flying=True)
 
 
 def test_one_that_does_not_land_is_ended(tmp_path: Path) -> None:
     stubborn = vehicle("import signal; signal.signal(signal.SIGTERM, lambda *_: None); say(); sys.stdin.read()", [])
     stubborn.start()
-    assert not stubborn.land(0.05)
-    stubborn.stop("it was removed")
+    assert not stubborn.end(0.05, "it was removed", unless_flying=True)
+    stubborn.end(0.0, "it was removed")
     assert stubborn.status().condition == "stopped"
 
 

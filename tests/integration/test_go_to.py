@@ -43,7 +43,7 @@ def flown(vehicle: str) -> Iterator[Drone]:
         server = MemoryServer("v")
         proxy = Proxy(make_driver(address), server, name="v")
         proxy.start()
-        stack.callback(proxy.stop)
+        stack.callback(proxy.end)
         drone = stack.enter_context(open_drone(server.dial, app="me", on_exit="hover", timeout_s=WAIT_S))
         drone.wait(lambda feedback: feedback.vehicle_link == "up" and feedback.position_m is not None, LONG_S)
         drone.takeoff(timeout_s=LONG_S)
@@ -167,7 +167,7 @@ def test_a_swarm_and_asyncio_fly_to_places() -> None:
         for name, server in servers.items():
             proxy = Proxy(make_driver(SIM), server, name=name)
             proxy.start()
-            stack.callback(proxy.stop)
+            stack.callback(proxy.end)
         drones = {name: open_drone(server.dial, app="me", timeout_s=WAIT_S) for name, server in servers.items()}
         swarm = stack.enter_context(Swarm(drones, on_error="raise"))
         swarm.takeoff(timeout_s=LONG_S)

@@ -278,7 +278,10 @@ class Bench:
             transport = memory, memory.dial
         self.server, self.dial = transport
         self.driver = FakeDriver(self.clock, actions, parameters)
-        self.proxy = Proxy(self.driver, self.server, name="bench", clock=self.clock, ticker=False)
+        self.slept_ns = 0  #: for how long the computer has slept
+        self.proxy = Proxy(
+            self.driver, self.server, name="bench", clock=self.clock, ticker=False, slept=lambda: self.slept_ns
+        )
         self.apps: list[App] = []
         self.events: list[Event] = []  #: published, whether or not they arrive anywhere
         self._publish, self.proxy.events._publish = self.proxy.events._publish, self._publish_event
@@ -298,7 +301,7 @@ class Bench:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.proxy.stop()
+        self.proxy.end()
         for app in self.apps:
             app.end.close()
 

@@ -65,7 +65,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeVehicle]:
     proxy.start()
     monkeypatch.setattr("skyloop.ros.bridge.dial_by_name", lambda name: server.dial)
     yield vehicle
-    proxy.stop()
+    proxy.end()
 
 
 @pytest.fixture

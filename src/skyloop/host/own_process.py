@@ -24,6 +24,7 @@ LONGEST_PAUSE_S: Final = 30.0
 SILENT_LOOKS: Final = 40
 STARTING_LOOKS: Final = 80  #: the same before its first report
 STEADY_S: Final = 60.0  #: a process that ran for so long is started again after the first pause
+_POLL_S: Final = 0.05
 _decoder: Final = msgspec.json.Decoder(VehicleStatus)
 _log = logging.getLogger(__name__)
 
@@ -134,18 +135,26 @@ class OwnProcessVehicle(HostedVehicle):
             reported, condition=self.condition, failed=row.failed, restarts=row.restarts, uptime_s=row.uptime_s
         )
 
-    def land(self, timeout_s: float) -> bool:
-        """Ask its process to land and to end; return whether it has. It is not started again."""
+    def end(
+        self,
+        within_s: float,
+        reason: str,  # noqa: ARG002  (its process knows one of its own)
+        hurry: Callable[[], bool] = lambda: False,
+        *,
+        unless_flying: bool = False,
+    ) -> bool:
+        """Ask its process to land and to end. It is not started again."""
         asked = self._runner.stopping
         child = self._runner.request_stop()
-        if child is None or child.code is not None:
-            return True
-        if not asked:
-            child.terminate()
-        return child.wait(timeout_s) is not None
-
-    def stop(self, reason: str) -> None:  # noqa: ARG002  (its process knows one of its own)
-        self.land(0.0)
+        if child is not None and child.code is None:
+            if not asked:
+                child.terminate()
+            deadline_s = time.monotonic() + within_s
+            while (left_s := deadline_s - time.monotonic()) > 0 and not hurry() and child.code is None:
+                child.wait(min(left_s, _POLL_S))
+            if unless_flying and child.code is None:
+                return False
         self._runner.stop()
         if self.condition is not Condition.FAILED:
             self.condition = Condition.STOPPED
+        return True

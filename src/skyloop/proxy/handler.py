@@ -14,7 +14,9 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from skyloop.clock import Clock, nanoseconds, seconds
+import msgspec
+
+from skyloop.clock import NS_PER_S, Clock, nanoseconds, seconds
 from skyloop.errors import RefusedError
 from skyloop.messages import (
     AnswerTakeover,
@@ -28,8 +30,8 @@ from skyloop.messages import (
     EmergencyStop,
     Failsafe,
     FlightState,
-    Hover,
     Idle,
+    Land,
     Refusal,
     Refused,
     ReleaseAuthority,
@@ -47,6 +49,7 @@ from skyloop.proxy.core.authority_events import EventContext, authority_event
 from skyloop.proxy.core.command_checks import CommandChecks, Decision
 from skyloop.proxy.core.failsafe import BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
+from skyloop.proxy.core.flight import Whose
 from skyloop.proxy.core.flight_events import (
     battery_event,
     clamped_event,
@@ -55,9 +58,9 @@ from skyloop.proxy.core.flight_events import (
     failsafe_event,
     ownership_event,
     refused_event,
+    slept_event,
     taken_event,
 )
-from skyloop.proxy.core.ownership import Ownership, Whose
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.parameters import FlightSettings
@@ -68,6 +71,8 @@ from skyloop.transport.base import COMMANDS, TransportServer
 
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
+#: So much more sleep of the computer than was known is one: shorter ones are not told from a delay.
+SLEEP_NS: Final = NS_PER_S // 4
 
 
 class CommandHandler:
@@ -81,7 +86,7 @@ class CommandHandler:
         server: where echoes of commands are published.
         sessions: the connections, by the application's number; read here, changed by the proxy.
         clock: the proxy's clock [ns].
-        shared: whether others may fly the vehicle too.
+        slept: for how long the computer has slept, in all [ns].
     """
 
     def __init__(
@@ -94,13 +99,13 @@ class CommandHandler:
         server: TransportServer,
         sessions: Mapping[int, Session],
         clock: Clock,
-        shared: bool,
+        slept: Clock,
     ) -> None:
         self.authority = Authority()
         self.ladder = FailsafeLadder()
-        self.ownership = Ownership(shared=shared)
+        self.flight = executor.flight
         self.checks = CommandChecks(
-            self.authority, self.ladder, self.ownership, supported=executor.supported, why_not=executor.why_not
+            self.authority, self.ladder, self.flight, supported=executor.supported, why_not=executor.why_not
         )
         self._back = ReturnSupervisor(self.checks, self.ladder, executor, publisher)
         self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
@@ -119,6 +124,9 @@ class CommandHandler:
         self._clock = clock
         self._pilot = "none"  # why nobody holds the authority, or "held"
         self._breaks_seen = 0  # of the vehicle's link, when last looked at
+        self._slept = slept
+        self._slept_seen = slept()  # when last looked at, or noticed
+        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
         self._enforced = True  # whether the safety box and zones could be, at the last set-point
         self._stamp()
 
@@ -143,6 +151,15 @@ class CommandHandler:
             self._executor.guarded = settings.safety is not None
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
+
+    def aged(self, command: Command, now_ns: int) -> Command:
+        """Return a command as old as it is: one from before the computer slept looks as if it had just been sent."""
+        if self._slept() - self._slept_seen >= SLEEP_NS:
+            with self._lock:
+                self._observe_sleep(now_ns)
+        if command.sent_ns >= self._awake_ns:
+            return command
+        return msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and carry it out, on the thread that received it."""
@@ -211,39 +228,50 @@ class CommandHandler:
     def tick(self, now_ns: int) -> None:
         """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace."""
         with self._lock:
+            self._observe_sleep(now_ns)
             self._observe_link(now_ns)
             effects = self.authority.update(now_ns)
             if effects:
                 self._apply_authority(effects, now_ns)
             self._update_failsafe(now_ns)
-            if self._back.update(now_ns, ours=self.ownership.ours):
+            if self._back.update(now_ns, ours=self.flight.ours):
                 self._stamp()
             steered = self._executor.step(now_ns)
             if steered is not None:
                 self._echo_own(steered, now_ns)
 
     def order_landing(self, now_ns: int) -> bool:
-        """Land because the proxy is about to end. Returns whether there is anything to land."""
+        """Land because the proxy is about to end; from now on only landing and emergency stop are accepted.
+
+        Returns:
+            Whether anything of the proxy's flies, or may be about to.
+        """
         with self._lock:
-            self._observe_ownership(now_ns)
-            if not (self._executor.airborne and self.ownership.ours):
-                return False
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
-            return True
+            self._call_off(now_ns)
+            return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
         """The proxy ends now: leave what flies hovering, as far as the vehicle can by itself."""
         with self._lock:
-            self._observe_ownership(now_ns)
-            flies = self._executor.airborne and self._executor.state is not FlightState.LANDING
-            if flies and self.ownership.ours:
-                self._executor.failsafe(Hover(), now_ns)
+            self.ladder.order_landing()
+            self._observe_flight(now_ns)
+            self._call_off(now_ns)
+            executor = self._executor
+            if self.flight.ours and executor.airborne and executor.state is not FlightState.LANDING:
+                executor.leave(now_ns)
+
+    def _call_off(self, now_ns: int) -> None:
+        """Land what was told to take off and does not show it yet."""
+        if self.flight.ours and self.flight.may_begin(now_ns) and self._executor.state is FlightState.LANDED:
+            self._executor.failsafe(Land(), now_ns)
+            self.flight.call_off(now_ns)
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies, or may, and is the proxy's to land. Takes no lock."""
-        return self._executor.airborne and self.ownership.ours
+        """Whether the vehicle flies, or may, or may be about to, and is the proxy's to land. Takes no lock."""
+        return self.flight.ours and (self._executor.airborne or self.flight.may_begin(self._clock()))
 
     @property
     def at_rest(self) -> bool:
@@ -251,7 +279,7 @@ class CommandHandler:
         return (
             self.authority.holder is None
             and self.ladder.idle
-            and not self.ownership.ours
+            and not self.flight.ours
             and self._vehicle.link_breaks == self._breaks_seen
             and not self._executor.airborne
         )
@@ -267,7 +295,7 @@ class CommandHandler:
         """Return what was applied, and when: the time of receipt for a command that was refused."""
         # Each call of a function costs microseconds on a machine that was idle, and a command comes when it was: an
         # ordinary command is received, decided and executed here; what went wrong is put into words elsewhere.
-        vehicle, checks, ownership = self._vehicle, self.checks, self.ownership
+        vehicle, checks, flight = self._vehicle, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
         refusal = checks.receive(command, session.sequence, session.app_id, now_ns)
@@ -280,8 +308,8 @@ class CommandHandler:
         if kind is Idle:
             return _NOTHING, self._count_applied(command)
         state = self._executor.state
-        if not ownership.ours:
-            self._observe_ownership(now_ns)
+        if not flight.ours:
+            self._observe_flight(now_ns)
         decision = checks.decide(command, session.sequence, state, vehicle.link_state, vehicle.feedback_now, now_ns)
         if decision.refusal is not None:
             if decision.action is not None:
@@ -296,13 +324,13 @@ class CommandHandler:
             except RefusedError as error:
                 return self._refuse(session, command, Refusal.WRONG_STATE, str(error)), now_ns
             except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
-                if kind is Takeoff and ownership.ours:
-                    ownership.claim(now_ns)  # it may be trying
+                if kind is Takeoff and flight.ours:
+                    flight.claim(now_ns)  # it may be trying
                 why = vehicle.driver_refused("apply", error)
                 return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
             if decision.takes_off:
-                ownership.claim(now_ns)
-            if not ownership.ours or kind is Takeoff:
+                flight.claim(now_ns)
+            if not flight.ours or kind is Takeoff:
                 self._take_vehicle(session, applied, decision.new)
         if kind is not ReturnToStart and decision.action is not None:
             checks.back = None
@@ -423,7 +451,7 @@ class CommandHandler:
                 "owner_priority": owner.priority if owner is not None else None,
                 "lease": self.authority.lease,
                 "failsafe": self.ladder.step,
-                "others": self.ownership.others or None,
+                "others": self.flight.others or None,
                 "start_position_m": self._back.start,
                 "return_phase": self._back.phase,
             }
@@ -440,29 +468,45 @@ class CommandHandler:
         breaks = self._vehicle.link_breaks
         if breaks != self._breaks_seen:
             self._breaks_seen = breaks
-            self._end_intents()
-            self.ladder.hand_over(now_ns)
-            self._update_failsafe(now_ns)
+            self._start_over(now_ns)
+
+    def _observe_sleep(self, now_ns: int) -> None:
+        """Act on a sleep of the computer: all that is known is older than its clock says."""
+        slept_ns = self._slept() - self._slept_seen
+        if slept_ns < SLEEP_NS:
+            return
+        self._slept_seen += slept_ns
+        self._slept_ns, self._awake_ns = slept_ns, now_ns
+        self.authority.slept(slept_ns)
+        self.flight.slept(slept_ns)
+        self._events.publish_draft(slept_event(seconds(slept_ns)))
+        self._start_over(now_ns)
+
+    def _start_over(self, now_ns: int) -> None:
+        """Hover, and let nothing that was asked for until now be done later."""
+        self._end_intents()
+        self.ladder.hand_over(now_ns)
+        self._update_failsafe(now_ns)
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""
-        if type(applied) is Idle or not (new or self.ownership.whose is not Whose.OTHERS):
+        if type(applied) is Idle or not (new or self.flight.whose is not Whose.OTHERS):
             return
-        others = self.ownership.others
-        self.ownership.take()
+        others = self.flight.others
+        self.flight.take()
         self._stamp()
         if others:
             self._events.publish_draft(taken_event(session.name, applied.name, others))
         self.on_ownership(True)
 
-    def _observe_ownership(self, now_ns: int) -> None:
+    def _observe_flight(self, now_ns: int) -> None:
         """Observe whose flight it is by now, and act on a change."""
         executor = self._executor
-        state = executor.state
-        changed = self.ownership.observe(state, executor.is_airborne(state), executor.left_to(), now_ns)
+        changed = executor.observe(now_ns)
+        if not self.flight.awaited:  # else the note of it stays as it is
+            self.on_ownership(self.flight.ours)
         if changed is None:
             return
-        self.on_ownership(changed.whose is Whose.OURS)
         self._stamp()
         if changed.whose is Whose.OTHERS:
             executor.stop_autopilot()
@@ -474,17 +518,17 @@ class CommandHandler:
     # Failsafe ----------------------------------------------------------------------------------------------------
 
     def _update_failsafe(self, now_ns: int) -> None:
-        self._observe_ownership(now_ns)
+        self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
         state = self._executor.state
         inputs = FailsafeInputs(
             state=state,
-            airborne=self._executor.is_airborne(state),
+            airborne=self.flight.flies(state),
             last_command_ns=self.authority.last_command_ns,
             pilot=self._pilot,
             link_up=self._vehicle.link_up,
             battery=feedback.battery if feedback is not None else None,
-            ours=self.ownership.ours,
+            ours=self.flight.ours,
             return_problem=self._back.why_not(now_ns),
         )
         effects = self.ladder.update(now_ns, inputs)

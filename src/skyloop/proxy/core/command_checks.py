@@ -34,8 +34,8 @@ from skyloop.messages import (
 from skyloop.messages.command import SET_POINTS
 from skyloop.proxy.core.authority import Authority
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
+from skyloop.proxy.core.flight import Flight, Whose
 from skyloop.proxy.core.limits import Ceiling, Clamp, Limits
-from skyloop.proxy.core.ownership import Ownership, Whose
 from skyloop.proxy.core.places import decide_place
 from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, ReturnSettings, StartPoint
 from skyloop.proxy.core.safety import Safety
@@ -140,7 +140,7 @@ class CommandChecks:
     Args:
         authority: who holds the lease; :meth:`receive` notes when its holder's last command came.
         ladder: the failsafe ladder.
-        ownership: whose the flight is.
+        flight: whose flight it is.
         supported: the actions that the vehicle or the software autopilot can do.
         why_not: why others are not supported, for people; may be empty.
     """
@@ -149,7 +149,7 @@ class CommandChecks:
         self,
         authority: Authority,
         ladder: FailsafeLadder,
-        ownership: Ownership,
+        flight: Flight,
         *,
         supported: frozenset[type[Action]],
         why_not: str,
@@ -163,7 +163,7 @@ class CommandChecks:
         self.max_age_ns = 0
         self._authority = authority
         self._ladder = ladder
-        self._ownership = ownership
+        self._flight = flight
         self._supported = supported
         self._why_not = why_not
         self._ceiling = Ceiling()
@@ -288,8 +288,8 @@ class CommandChecks:
         if kind not in self._supported:
             why = self._why_not or "neither the vehicle nor the software autopilot can do it"
             return Refusal.UNSUPPORTED, f"{command.action.name} is not possible: {why}"
-        if self._ownership.whose is Whose.OTHERS:
-            others = self._ownership.others
+        if self._flight.whose is Whose.OTHERS:
+            others = self._flight.others
             if kind in SET_POINTS:
                 return Refusal.WRONG_STATE, f"{others}: hover, take off or land first to take it over"
             if not new and kind in _TAKING:

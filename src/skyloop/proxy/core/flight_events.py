@@ -7,8 +7,8 @@ from typing import Final
 from skyloop.messages import Command, EventKind, Failsafe, Refusal, Severity, Value
 from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
+from skyloop.proxy.core.flight import Changed, Whose
 from skyloop.proxy.core.limits import Clamp
-from skyloop.proxy.core.ownership import Changed, Whose
 
 _ENFORCED: Final = "enforced: its position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
@@ -70,3 +70,10 @@ def ownership_event(changed: Changed) -> EventDraft:
     """The flight is somebody else's, or an earlier run's."""
     reason = "others" if changed.whose is Whose.OTHERS else "flight"
     return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})
+
+
+def slept_event(slept_s: float) -> EventDraft:
+    """The computer slept in the meantime, for so long [s]."""
+    text = f"this computer slept for {slept_s:.1f} s: nothing that was asked for before is done any more"
+    data: dict[str, Value] = {"reason": "slept", "seconds": slept_s}
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)

@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 
 from skyloop.clock import NS_PER_S, seconds
 from skyloop.messages import Feedback, FlightState, Land, Position, Refusal, ReturnPhase, ReturnToStart
+from skyloop.proxy.core.flight import STANDING_NS
 from skyloop.proxy.core.limits import Clamp, Limits
-from skyloop.proxy.core.ownership import STANDING_NS
 from skyloop.proxy.core.places import decide_place
 from skyloop.proxy.core.safety import STALE_NS
 from skyloop.zones import Space, Vec3
