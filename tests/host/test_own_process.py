@@ -116,7 +116,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     began_s = time.monotonic()
     dying.start()
     wait_until(lambda: dying.status().restarts >= 1, "it was started again")
-    dying.stop("it is enough")
+    dying.end(0.0, "it is enough")
     assert time.monotonic() - began_s < 15.0
 
 
@@ -138,7 +138,7 @@ def test_no_process_is_left_if_it_ends_while_it_is_started_again(monkeypatch: py
     dying.start()
     begun[0].kill()
     assert stopping.wait(10.0)
-    dying.stop("it was removed")
+    dying.end(0.0, "it was removed")
     assert all(child.code is not None for child in begun)
     assert dying.status().condition == "stopped"
 
@@ -156,7 +156,7 @@ sys.stdin.read(1)
         [],
     )
     landing.start()
-    assert not landing.land(0.05), "it takes its time"
+    assert not landing.end(0.05, "it is removed", unless_flying=True), "it takes its time"
     child = landing._runner.child
     assert child is not None
     child.part()  # landed: it ends by itself
@@ -164,4 +164,4 @@ sys.stdin.read(1)
     row = landing.status()
     assert (row.airborne, row.pilot, row.state) == (False, None, "")
     assert not landing.runs, "its name is free"
-    landing.stop("it was removed")
+    landing.end(0.0, "it was removed")

@@ -100,8 +100,9 @@ class Host:
             if isinstance(error, SkyloopError):
                 raise
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
-        if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
-            with self._lock:
+        with self._lock:
+            # It may have been removed the moment it ran: what has ended is not ticked, see _forget.
+            if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None and vehicle.runs:
                 self._ticker.add(vehicle.proxy)
         return vehicle
 
@@ -185,13 +186,23 @@ class Host:
         proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
         ended = vehicle.end(within_s, reason, hurry, unless_flying=unless_flying)
         if ended and proxy is not None:
-            self._untick(proxy)
+            self._forget(proxy)
         return ended
 
-    def _untick(self, proxy: Proxy) -> None:
-        for loop in list(self._loops):
-            if isinstance(loop, Ticker):
-                loop.remove(proxy)
+    def _forget(self, proxy: Proxy) -> None:
+        """Tick an ended proxy no more, and close the loops that were its own."""
+        with self._lock:
+            for loop in self._loops:
+                if isinstance(loop, Ticker):
+                    loop.remove(proxy)
+            over = [loop for loop in self._loops if loop.empty and not self._is_shared(loop)]
+            self._loops = [loop for loop in self._loops if loop not in over]
+        for loop in over:
+            loop.close()
+
+    def _is_shared(self, loop: SharedLoop) -> bool:
+        """Whether vehicles that come are served by this loop; else it was left to one whose driver has blocked."""
+        return loop in (self._reactor, self._ticker, self._links)
 
     def status(self) -> list[VehicleStatus]:
         """Return a row for each vehicle, also for those of the file that were not started."""
@@ -255,15 +266,14 @@ class Host:
         """Give all other vehicles of a loop another one."""
         with self._lock:
             new: SharedLoop
+            if not self._is_shared(loop):
+                return  # it is the vehicle's own since an earlier stall
             if isinstance(loop, Reactor) and isinstance(member, SharedLocalServer):
-                new = loop.split(member)
-                self._reactor = new if loop is self._reactor else self._reactor
+                new = self._reactor = loop.split(member)
             elif isinstance(loop, Ticker) and isinstance(member, Proxy):
-                new = loop.split(member)
-                self._ticker = new if loop is self._ticker else self._ticker
+                new = self._ticker = loop.split(member)
             elif isinstance(loop, LinkThread):
-                new = loop.split(member)
-                self._links = new if loop is self._links else self._links
+                new = self._links = loop.split(member)
             else:
                 return
             self._loops.append(new)
@@ -290,10 +300,11 @@ class Host:
         """End a vehicle whose driver does not work, on a thread of its own."""
 
         def end() -> None:
-            if vehicle.proxy is not None:
-                self._untick(vehicle.proxy)
+            proxy = vehicle.proxy
             if vehicle.fail(reason):
                 self.announce(f"failed {vehicle.settings.name}: {reason}")
+            if proxy is not None:
+                self._forget(proxy)
 
         threading.Thread(target=end, name="skyloop-host-fail", daemon=True).start()
 
