@@ -71,7 +71,7 @@ from skyloop.proxy.sessions import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
-_LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: asked for anew, they leave a take-off that is under way alone
+_LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
 _PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: what may be different with the next repeat
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
@@ -294,10 +294,15 @@ class CommandHandler:
             self._observe_ownership(now_ns)
         state = self._observe_intent(session, now_ns)
         intent, new = intents.receive(command, state, now_ns)
-        if kind is Idle or (new and kind not in _LEAVE_A_TAKEOFF):
-            intent.withdrew = self._withdraw_takeoff(now_ns) and kind is Land
+        if kind not in _LEAVE_A_TAKEOFF:
+            if self._withdraw_takeoff(now_ns):
+                intent.withdrew = kind is Land
+                if kind is Hover:  # it stands, and stays so
+                    intent.end(Fate.COMPLETED if new else Fate.WITHDRAWN)
             state = self._executor.state
         if kind is Idle:
+            if type(intents.newest.action) is Takeoff:
+                intents.newest.end(Fate.WITHDRAWN)
             self._tell(session, intents.newest)
             return _NOTHING, self._count_applied(command)
         if intent.over:

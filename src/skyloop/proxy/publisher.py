@@ -163,7 +163,7 @@ class VehiclePublisher:
     def tell(self, outcome: Outcome) -> None:
         """Show what became of an intent in feedback from now on; where it ended, at the next tick at the latest."""
         before, self._outcome = self._outcome, outcome
-        if outcome.failed and (outcome.fate, outcome.reason) != (before.fate, before.reason):
+        if outcome.over and (outcome.fate, outcome.reason) != (before.fate, before.reason):
             self._published_ns = -KEEP_ALIVE_NS
 
     @property

@@ -32,6 +32,7 @@ TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the groun
 #: A landing that withdrew a take-off is done when the vehicle stood for so long: an arming may have been on its way.
 SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
+_SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: nobody needs to be told that repeats of it do nothing
 _LANDINGS: Final = (Land, ReturnToStart)
 #: Tried again by repeats where the driver fails or the link is lost: nothing is safer.
 INSISTENT: Final = (Hover, Land, ResetEmergency)
@@ -60,7 +61,7 @@ class Intent:
         """End it, unless it is over already. ``text`` and ``reason``: what its repeats are answered with."""
         if self.fate is Fate.UNDER_WAY:
             self.fate = fate
-            if fate is not Fate.COMPLETED:
+            if fate not in _SILENT:
                 self.reason = reason or Refusal.NOT_FRESH
                 self.text = text or f"{ENDINGS[fate]}: send a new command"
 
