@@ -180,9 +180,12 @@ class CommandSchedule:
         if done_in is None:
             if feedback.state is FlightState.EMERGENCY:
                 self.clear(Fate.EMERGENCY)
-        elif outcome is None or kind is EmergencyStop:  # a proxy of an earlier version, or anybody's to press
-            if feedback.state in done_in and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]:
-                self.action = _IDLE
+        elif (
+            (outcome is None or kind is EmergencyStop)  # a proxy of an earlier version, or anybody's to press
+            and feedback.state in done_in
+            and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
+        ):
+            self.action = _IDLE
         if feedback.failsafe is not self._failsafe:
             self._failsafe = feedback.failsafe
             if feedback.failsafe is not Failsafe.NONE:

@@ -49,7 +49,7 @@ _OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
 cancelled: Final[ContextVar[Callable[[], bool]]] = ContextVar("cancelled", default=lambda: False)
 
 
-class _GivenUp(Exception):
+class _GivenUpError(Exception):
     """The caller waits no longer; nobody sees this."""
 
 
@@ -189,7 +189,7 @@ class ActionWait:
         if self._closed():
             return ClosedError(f"this drone was closed while {name} was under way")
         if cancelled.get()():
-            return _GivenUp()
+            return _GivenUpError()
         status = self._commands.status
         if status.state in ("queued", "preempted"):
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
