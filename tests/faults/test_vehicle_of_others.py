@@ -299,7 +299,7 @@ def test_a_vehicle_that_is_disarmed_in_its_take_off_stays_disarmed(kind: Kind, w
             killing = threading.Thread(target=kill)
             killing.start()
             if wait:
-                with pytest.raises(RefusedError, match="landed or disarmed|which was not chosen here"):
+                with pytest.raises(RefusedError, match=r"landed or disarmed|which was not chosen here"):
                     drone.takeoff(timeout_s=WAIT_S)
             else:
                 drone.takeoff(wait=False)

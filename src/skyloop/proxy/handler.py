@@ -419,6 +419,8 @@ class CommandHandler:
     def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
         """End, or complete, what a holder asked for by what the vehicle does; return the flight state."""
         state, intent = self._executor.state, session.intents.newest
+        if state is not intent.state:
+            self._observe_ownership(now_ns)  # a landing may be others': then that is what ended it
         if not intent.over:
             intent.observe(state, now_ns)
             if intent.over:
