@@ -291,9 +291,9 @@ class Drone:
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover.
 
-        While this waits, a take-off for which the vehicle is not ready yet is commanded again, twice a second. Whatever
-        ends the call otherwise than by a take-off, a time-out and Ctrl-C included, ends the take-off: the vehicle hovers
-        if it is in the air, else it stays on the ground. Without ``wait`` a take-off that is refused is over.
+        While this waits, a take-off for which the vehicle is not ready yet is commanded again, twice a second. A call
+        that fails, a time-out and Ctrl-C included, ends the take-off: the vehicle hovers if it is in the air, else it
+        stays on the ground. Without ``wait`` a take-off that is refused is over.
 
         Args:
             wait: Wait until the vehicle hovers or flies; else only send the command.
@@ -301,8 +301,8 @@ class Drone:
 
         Raises:
             NoAnswerError: If the vehicle does not hover in time; names its state and, if known, the reason.
-            RefusedError: If the proxy refuses to take off in the present state, or the vehicle lands or disarms, or others
-                land it, before it hovers.
+            RefusedError: If the proxy refuses to take off in the present state, or the vehicle lands or disarms before
+                it hovers, whoever made it.
             UnsupportedError: If the vehicle can't take off.
             LinkError: Without ``wait``, if the link is down; the vehicle does not take off later either.
             AuthorityError: If the authority is not held, or another application takes it over meanwhile.
