@@ -12,9 +12,11 @@ import pytest
 
 import skyloop.client
 from skyloop import aio
+from skyloop.aio.bridge import in_thread
 from skyloop.client.drone import open_drone
+from skyloop.client.swarm import in_parallel
 from skyloop.errors import ClosedError, NoAnswerError, UsageError
-from skyloop.messages import Encoding, EventKind, FlightState, Hover, Land, Takeoff
+from skyloop.messages import AnyAction, Encoding, EventKind, FlightState, Hover, Idle, Land, Takeoff
 from skyloop.transport.base import results
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
 from tests.client.test_results import Sender
@@ -366,5 +368,37 @@ def test_clocks_poses_and_own_events_are_the_drones(proxy: ScriptedProxy) -> Non
             drone.emit(EventKind.VEHICLE_MESSAGE, "seen")
             assert any(event.text == "seen" for event in drone.recent_events())
         assert drone.closed
+
+    run(fly())
+
+
+@pytest.mark.parametrize(("state", "instead"), [(FlightState.LANDED, Idle()), (FlightState.TAKING_OFF, Hover())])
+def test_a_cancelled_take_off_is_not_carried_out(proxy: ScriptedProxy, state: FlightState, instead: AnyAction) -> None:
+    """Cancelling takeoff() left it climbing."""
+    proxy.state = state
+
+    async def fly() -> None:
+        drone = await aio.connect("me", on_exit="hover")
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.3):
+                await drone.takeoff(timeout_s=WAIT_S)
+        after = len(proxy.commands)
+        await asyncio.to_thread(proxy.until, lambda: proxy.actions()[after:].count(instead) >= 3)
+        assert Takeoff() not in proxy.actions()[-2:]
+        await drone.close()
+
+    run(fly())
+
+
+def test_a_cancelled_flight_of_a_swarm_is_not_carried_out(proxy: ScriptedProxy) -> None:
+    async def fly() -> None:
+        drone = await aio.connect("me", on_exit="hover")
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.3):
+                await in_thread(lambda: in_parallel({"left": lambda: drone.sync.takeoff(timeout_s=WAIT_S)}))
+        after = len(proxy.commands)
+        await asyncio.to_thread(proxy.until, lambda: proxy.actions()[after:].count(Idle()) >= 3)
+        assert Takeoff() not in proxy.actions()[-2:]
+        await drone.close()
 
     run(fly())

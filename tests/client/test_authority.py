@@ -218,3 +218,22 @@ def test_the_oldest_ended_session_is_forgotten() -> None:
     assert (7, 1) in ended
     assert (7, EndedSessions.MOST) in ended
     assert (8, 1) not in ended
+
+
+@pytest.mark.parametrize(
+    ("reason", "state", "wanted"), [("expired", "none", False), ("silent", "none", True), ("gone", "none", True)]
+)
+def test_feedback_that_overtakes_the_loss_does_not_make_it_a_takeover(
+    held: AuthorityTracker, reason: str, state: str, wanted: bool
+) -> None:
+    """It was shown as "preempted" for ever, and asked for nothing any more."""
+    assert held.feedback(owned(9, 6, "other"), NOW)
+    assert held.status.state == "preempted"
+    assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason=reason, by="other"), LATER)
+    assert (held.status.state, held.wanted) == (state, wanted)
+
+
+def test_a_loss_of_an_older_lease_changes_no_takeover(held: AuthorityTracker) -> None:
+    assert held.feedback(owned(9, 6, "other"), NOW)
+    assert not held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=4, reason="silent"), LATER)
+    assert held.status.state == "preempted"

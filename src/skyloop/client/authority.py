@@ -237,11 +237,9 @@ class AuthorityTracker:
             return self._set(replace(self.status, position=position, expected_wait_s=expected))
         if event.kind is EventKind.AUTHORITY_DECLINED and ours:
             self.declined = event.text
-        overtaken = self.status.state == "preempted" and _whole(data.get("lease")) == self._lease
-        if ours and overtaken and event.kind is EventKind.AUTHORITY_LOST:
-            # Feedback that named the next holder came first: it was not pre-empted, and is not in the queue.
-            return self.given_back() if data.get("reason") == "expired" else self._lost(None)
-        if not ours or not self.held or _whole(data.get("lease")) < self.status.lease:
+        lease = _whole(data.get("lease"))
+        late = self.status.state == "preempted" and lease == self._lease  # feedback told of the next holder before
+        if not ours or not (late or (self.held and lease >= self.status.lease)):
             return False
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
             return self._lost(str(data.get("by", "")) or None)

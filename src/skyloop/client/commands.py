@@ -25,8 +25,10 @@ from skyloop.messages import (
     EmergencyStop,
     Event,
     EventKind,
+    Fate,
     Feedback,
     Land,
+    Outcome,
     Position,
     Refusal,
     Refused,
@@ -36,8 +38,10 @@ from skyloop.messages import (
     Role,
     encode,
 )
+from skyloop.messages.command import SET_POINTS
 from skyloop.messages.config import MAX_REASON
 from skyloop.messages.earth import is_on_earth
+from skyloop.messages.intent import ENDINGS
 
 _OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
 ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
@@ -46,6 +50,7 @@ ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for th
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 _ACTIONS: Final = frozenset(ACTION_NAMES)
+_REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: so ended, the next set-point is most likely refused, too
 
 
 class CommandSender:
@@ -92,6 +97,8 @@ class CommandSender:
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
+        self._told: Outcome | None = None  # the newest outcome of ours
+        self._first_set_point = 0  # number of the first in the present row of set-points; 0: the newest is none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
         self.sends = ChannelCounter()  #: commands sent; ``dropped``: not handed to the transport
 
@@ -106,9 +113,9 @@ class CommandSender:
         return self._authority.app_id
 
     @property
-    def seq(self) -> int:
-        """Number of the last command sent on this connection."""
-        return self._seq
+    def intent(self) -> int:
+        """Number of the newest intent."""
+        return self._schedule.intent
 
     @property
     def open_ns(self) -> int:
@@ -146,7 +153,7 @@ class CommandSender:
             absent = known_ns < self._clock()
             self._present_until_ns = until_ns
             if absent:
-                self._schedule.clear()  # set-points from before the absence are not repeated
+                self._schedule.clear(Fate.WITHDRAWN)  # set-points from before the absence are not repeated
         if absent:
             self._connection.poke()
 
@@ -157,6 +164,16 @@ class CommandSender:
     # The application's side ------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, now: bool = False) -> bool:
+        """Make ``action`` the newest set-point; see :meth:`ask`, and False also while set-points are refused."""
+        intent, sent = self.ask(action, now=now)
+        if not isinstance(action, SET_POINTS):
+            self._first_set_point = 0
+            return sent
+        told = self._told
+        self._first_set_point = self._first_set_point or intent
+        return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
+
+    def ask(self, action: AnyAction, *, now: bool = False) -> tuple[int, bool]:
         """Make ``action`` the newest set-point.
 
         Args:
@@ -164,7 +181,8 @@ class CommandSender:
             now: Raise if it can't be sent now. A landing is then kept for when it can, anything else is dropped.
 
         Returns:
-            False if it can't be sent now, because the link is down or the authority is still awaited.
+            The number of the intent; and False if it can't be sent now, because the link is down or the authority is
+            still awaited.
 
         Raises:
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
@@ -184,35 +202,39 @@ class CommandSender:
                 raise self._not_ours(action)
             if stop and self._role is Role.OBSERVER:
                 raise self._not_ours(action)
-            self._schedule.ask(action, now_ns)
+            intent = self._schedule.ask(action, now_ns)
             if not may_send or not self._connection.connected:
                 if now:
                     if type(action) is not Land:  # what was refused now must not be carried out later
-                        self._schedule.clear()
+                        self._schedule.clear(Fate.WITHDRAWN)
                     raise self._not_now(action)
-                return False
+                return intent, False
             if self._schedule.due_ns <= now_ns:
-                return self._send_next(now_ns)
+                return intent, self._send_next(now_ns)
         self._connection.poke()  # the last one was sent just before: the supervisor's thread sends this one
-        return True
+        return intent, True
 
-    def drop(self, action: AnyAction) -> None:
-        """Clear the set-point if it is still ``action``."""
+    def outcome(self, intent: int) -> Outcome | None:
+        """Return what ended an intent; None while it is under way, as far as is known."""
         with self._lock:
-            if self._schedule.action is action:
-                self._schedule.clear()
+            if intent != self._schedule.intent:
+                return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
+            return self._schedule.over
 
-    def is_newest(self, action: AnyAction) -> bool:
-        """Return whether ``action`` is the last that the application asked for, and the authority is held."""
-        return self._authority.held and self._schedule.asked is action
+    def give_up(self, intent: int, *, flies: bool) -> None:
+        """Hover, or want nothing, instead of an intent that its caller no longer waits for; leave a newer one alone.
 
-    def lapsed(self, action: AnyAction) -> bool:
-        """Return whether ``action`` is the newest but was ended, and could be sent again now.
+        It is no new intent, so a vehicle that others took meanwhile stays theirs.
 
-        A failsafe, a lost link or a lost lease ends it.
+        Args:
+            intent: Number of the intent.
+            flies: Whether the vehicle is in the air.
         """
         with self._lock:
-            return self.is_newest(action) and self._schedule.action is not action and self._connection.connected
+            schedule = self._schedule
+            if schedule.intent == intent or (not flies and isinstance(schedule.action, SET_POINTS)):
+                schedule.give_up(self._clock(), flies=flies)
+        self._connection.poke()
 
     def request(self, request: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
         """Request the authority and wait for it; see :meth:`skyloop.client.drone.Drone.request_authority`.
@@ -271,7 +293,7 @@ class CommandSender:
         """
         with self._lock:
             known = self._authority.wanted or self.status.state != "none"
-            self._schedule.clear()
+            self._schedule.clear(Fate.AUTHORITY)
             changed = self._authority.given_back()
         if known and self._connection.connected:
             if wait:
@@ -297,7 +319,8 @@ class CommandSender:
     def disconnected(self) -> None:
         """Clear the set-point and the authority: nothing old is sent on the next connection."""
         with self._lock:
-            self._schedule.clear()
+            self._schedule.clear(Fate.LINK)
+            self._told = None
             changed = self._authority.disconnected()
         if changed:
             self._notify()
@@ -307,7 +330,9 @@ class CommandSender:
         with self._lock:
             before = self.status
             changed = self._authority.feedback(sample, now_ns)
-            self._schedule.observe(sample, now_ns)
+            self._schedule.observe(sample, now_ns, self.app_id)
+            if sample.outcome is not None and sample.outcome.app_id == self.app_id:
+                self._told = sample.outcome
         if changed:
             self._moved(before, now_ns)
 
@@ -405,7 +430,7 @@ class CommandSender:
             if status.state == "held":
                 self._schedule.resume(now_ns)
             elif before.state == "held":
-                self._schedule.clear()
+                self._schedule.clear(Fate.AUTHORITY)
         if status.state == "held" and status.lease != before.lease:
             self._granted(status.lease)
         self._notify()

@@ -157,7 +157,7 @@ class DroneCore:
         )
         self.supervisor = ConnectionSupervisor(
             connection,
-            Receiver(app, state, connection, self.commands, restorer, keep_warm or _let_be),
+            Receiver(state, connection, self.commands, restorer, keep_warm or _let_be),
             dial,
             Hello(app, self.role),
             policy=policy,
@@ -316,8 +316,20 @@ class DroneCore:
 
         Args:
             action: The action.
-            now: See :meth:`CommandSender.command`.
+            now: See :meth:`CommandSender.ask`.
         """
+        self._check_can_do(action)
+        return self.commands.command(action, now=now)
+
+    def ask(self, action: AnyAction) -> int:
+        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
+
+        ``commands.outcome`` tells what became of it.
+        """
+        self._check_can_do(action)
+        return self.commands.ask(action)[0]
+
+    def _check_can_do(self, action: AnyAction) -> None:
         if self.closed:
             self.check_open()
         welcome = self.state.welcome
@@ -326,7 +338,6 @@ class DroneCore:
             raise UnsupportedError(f"{action.name} is not possible: {why_not}")
         if welcome is not None and type(action) in LATER_ACTIONS:
             _check_knows(welcome.capabilities, action)
-        return self.commands.command(action, now=now)
 
     def complete(self, action: AnyAction, is_done: Callable[[Feedback], bool], wait: bool, timeout_s: float) -> None:
         """Send the command and, if ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`."""
@@ -336,9 +347,7 @@ class DroneCore:
         if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
             self.check_may_wait()
         deadline_s = time.monotonic() + timeout_s
-        waiting = ActionWait(
-            action, is_done, self.command, lambda: self.closed, self.commands, self.state, self.connection
-        )
+        waiting = ActionWait(action, is_done, self.ask, lambda: self.closed, self.commands, self.state, self.connection)
         self.check_may_wait()
         waiting.wait(timeout_s, deadline_s)
 

@@ -79,6 +79,11 @@ class ActionExecutor:
         feedback = self._vehicle.feedback_now if self._vehicle.link_up else None
         return feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
 
+    @property
+    def stands(self) -> bool:
+        """Whether the vehicle stands on the ground by its own word, whatever the software autopilot is about to do."""
+        return self._vehicle.reported_state is FlightState.LANDED
+
     def stop_autopilot(self) -> None:
         """Stop the software autopilot because others steer."""
         if self.autopilot is not None:

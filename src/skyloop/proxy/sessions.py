@@ -7,7 +7,7 @@ from typing import Final
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Role
-from skyloop.proxy.core.command_checks import CommandSequence
+from skyloop.proxy.core.intents import Intents
 from skyloop.proxy.core.limits import Episodes
 from skyloop.transport.base import Peer
 
@@ -68,11 +68,11 @@ class Session:
         "authority_request",
         "ended",
         "episodes",
+        "intents",
         "joined_ns",
         "name",
         "peer",
         "role",
-        "sequence",
     )
 
     def __init__(self, peer: Peer, joined_ns: int) -> None:
@@ -81,7 +81,7 @@ class Session:
         self.app_id = peer.id
         self.name = f"application {peer.id}"  #: until Hello has it
         self.role: Role | None = None
-        self.sequence = CommandSequence()
+        self.intents = Intents()
         self.episodes = Episodes()
         self.answers = Answers()
         self.authority_request = 0  #: number of the newest request for the authority, or of its release
