@@ -27,6 +27,7 @@ from skyloop.messages import (
     Done,
     EmergencyStop,
     Failsafe,
+    Feedback,
     FlightState,
     Hover,
     Idle,
@@ -38,13 +39,14 @@ from skyloop.messages import (
     Role,
     Takeoff,
     Takeover,
+    Velocity,
     encode,
 )
 from skyloop.messages.numbers import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.authority_events import EventContext, authority_event
-from skyloop.proxy.core.command_checks import CommandChecks, Decision
+from skyloop.proxy.core.command_checks import CommandChecks
 from skyloop.proxy.core.failsafe import BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight_events import (
@@ -56,7 +58,9 @@ from skyloop.proxy.core.flight_events import (
     ownership_event,
     refused_event,
     taken_event,
+    thin_zones_event,
 )
+from skyloop.proxy.core.limits import Clamp, Episodes
 from skyloop.proxy.core.ownership import Ownership, Whose
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
@@ -65,6 +69,7 @@ from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.returning import ReturnSupervisor
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import COMMANDS, TransportServer
+from skyloop.zones import Space
 
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
@@ -105,7 +110,7 @@ class CommandHandler:
         self._back = ReturnSupervisor(self.checks, self.ladder, executor, publisher)
         self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
         if executor.autopilot is not None:
-            executor.autopilot.guard = self.checks.guard
+            executor.autopilot.guard = self._guard_step
         self.warm_s = 0.0  #: how often the code is to be run on a dummy while the vehicle is piloted [s]; 0: never
         self._lock = threading.RLock()
         self._executor = executor
@@ -120,6 +125,7 @@ class CommandHandler:
         self._pilot = "none"  # why nobody holds the authority, or "held"
         self._breaks_seen = 0  # of the vehicle's link, when last looked at
         self._enforced = True  # whether the safety box and zones could be, at the last set-point
+        self._episodes = Episodes()  # of limits that touch what the proxy does with nobody in command
         self._stamp()
 
     # From the proxy: what decides takes the lock -----------------------------------------------------------------
@@ -131,16 +137,15 @@ class CommandHandler:
     def configure(self, settings: FlightSettings) -> None:
         """Let new values of the parameters take effect."""
         with self._lock:
-            self.checks.limits = settings.limits
-            self.checks.safety = settings.safety
-            self.checks.space = settings.space
+            self._report_thin_zones(settings.airspace.space)
+            self.checks.airspace.settings = settings.airspace
             self.checks.returns = settings.returns
             self.checks.max_age_ns = settings.max_age_ns
             self.authority.timeout_ns = settings.authority_timeout_ns
             self.authority.ask_ns = settings.authority_ask_ns
             self.ladder.settings = settings.failsafe
             self.warm_s = settings.warm_s
-            self._executor.guarded = settings.safety is not None
+            self._executor.guarded = settings.airspace.space.walled
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
 
@@ -212,6 +217,7 @@ class CommandHandler:
         """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace."""
         with self._lock:
             self._observe_link(now_ns)
+            self.checks.airspace.observe(self._vehicle.feedback_now)
             effects = self.authority.update(now_ns)
             if effects:
                 self._apply_authority(effects, now_ns)
@@ -290,7 +296,9 @@ class CommandHandler:
         applied: AnyAction = _NOTHING
         if decision.action is not None:
             if decision.clamps or (decision.enforced is not None and decision.enforced is not self._enforced):
-                self._report_limits(session, decision, now_ns)
+                self._report_limits(session, decision.clamps, decision.enforced, now_ns)
+                if decision.clamps:
+                    self._counts["commands.clamped"] += 1
             try:
                 applied = self._executor.execute(decision.action, now_ns, new=decision.new)
             except RefusedError as error:
@@ -342,14 +350,29 @@ class CommandHandler:
         self._delays_ns.append(applied_ns - command.sent_ns)
         return applied_ns
 
-    def _report_limits(self, session: Session, decision: Decision, now_ns: int) -> None:
-        if decision.enforced is not None and decision.enforced is not self._enforced:
-            self._enforced = decision.enforced
-            self._events.publish_draft(enforcement_event(decision.enforced))
-        if decision.clamps:
-            self._counts["commands.clamped"] += 1
-            for clamp in session.episodes.begun(decision.clamps, now_ns):
-                self._events.publish_draft(clamped_event(session.name, clamp))
+    def _report_limits(
+        self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
+    ) -> None:
+        """Publish what began to be in the way of a command of this application, or of what the proxy does itself."""
+        if enforced is not None and enforced is not self._enforced:
+            self._enforced = enforced
+            self._events.publish_draft(enforcement_event(enforced))
+        episodes, name = (self._episodes, "the proxy") if session is None else (session.episodes, session.name)
+        for clamp in episodes.begun(clamps, now_ns):
+            self._events.publish_draft(clamped_event(name, clamp))
+
+    def _report_thin_zones(self, space: Space) -> None:
+        if space.thin and space != self.checks.airspace.settings.space:
+            self._events.publish_draft(thin_zones_event(space))
+
+    def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
+        """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
+        allowed, clamps, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
+        if clamps or (enforced is not None and enforced is not self._enforced):
+            holder = self.authority.holder
+            self._report_limits(None if holder is None else self._sessions.get(holder.app_id), clamps, enforced, now_ns)
+        assert isinstance(allowed, Velocity)
+        return allowed
 
     def _refuse_role(self, session: Session, command: Command) -> AnyAction:
         if session.role is Role.OBSERVER:

@@ -9,6 +9,7 @@ from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
 from skyloop.proxy.core.limits import Clamp
 from skyloop.proxy.core.ownership import Changed, Whose
+from skyloop.zones import THINNEST_M, ZONES, Space
 
 _ENFORCED: Final = "enforced: its position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
@@ -32,6 +33,13 @@ def enforcement_event(enforced: bool) -> EventDraft:
     text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
     severity = Severity.INFO if enforced else Severity.WARNING
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
+
+
+def thin_zones_event(space: Space) -> EventDraft:
+    """Some zones are kept clear of as if they were thicker than they are written."""
+    thin = "; ".join(str(zone) for zone in space.thin)
+    text = f"no-fly zones thinner than {THINNEST_M:g} m are kept clear of as if they were so thick: {thin} ({ZONES})"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "thin_zones"})
 
 
 def emergency_event(name: str) -> EventDraft:
