@@ -15,9 +15,11 @@ from skyloop.messages import (
     Feedback,
     FlightState,
     Hover,
+    Idle,
     Position,
     Refusal,
     SetParameter,
+    Severity,
     Velocity,
 )
 from skyloop.proxy.core.airspace import Airspace, AirspaceSettings, Verdict
@@ -355,8 +357,7 @@ def test_with_walls_the_proxy_checks_each_step_of_the_way() -> None:
         write(bench, pilot, "safety.box.x_high", 3.0)
         pilot.command(Position(2.9, 0.0, 1.0))
         assert Position not in map(type, bench.driver.told)
-        bench.driver.report(position_m=(2.5, 0.0, 1.0), velocity_m_s=(2.0, 0.0, 0.0))
-        bench.tick()
+        bench.move((2.5, 0.0, 1.0), velocity_m_s=(2.0, 0.0, 0.0))
         told = bench.driver.told[-1]
         assert isinstance(told, Velocity)
         assert told.forward < 0.2, "as slow as any velocity so near to the wall: the way alone allows 0.36 m/s"
@@ -364,6 +365,44 @@ def test_with_walls_the_proxy_checks_each_step_of_the_way() -> None:
         pilot.command(Position(2.9, 0.0, 1.0), repeat=True)
         assert bench.driver.told[-1] == Hover(), "the place is outside by now"
         assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
+
+
+@pytest.mark.parametrize("actions", [ALL, SOFTWARE], ids=["native", "software"])
+def test_a_position_that_jumps_is_told_and_the_vehicle_hovers(actions: frozenset[str]) -> None:
+    """An autopilot's estimate that is reset, or motion capture that takes one drone for another: nobody noticed."""
+    with Bench(actions) as bench:
+        pilot = placed(bench)
+        bench.move((0.5, 0.0, 1.0))
+        pilot.command(Position(5.0, 0.0, 1.0))
+        bench.move((1.5, 0.0, 1.0))
+        assert pilot.told(EventKind.VEHICLE_MESSAGE) == []
+        bench.driver.told.clear()
+        bench.driver.report(position_m=(1.5, 3.0, 1.0))
+        bench.tick()
+        (event,) = pilot.told(EventKind.VEHICLE_MESSAGE)
+        assert (event.severity, event.data["reason"]) == (Severity.WARNING, "position_jumped")
+        assert event.data["jumped_m"] == pytest.approx(3.0)
+        assert bench.driver.told == [Hover()]
+        bench.run(0.2, lambda: pilot.command(Position(5.0, 0.0, 1.0), repeat=True))
+        assert bench.driver.told == [Hover()], "it does not go on by itself"
+        assert set(pilot.refusals()) == {Refusal.NOT_FRESH}
+        pilot.command(Position(5.0, 0.0, 1.0))
+        assert pilot.applied[-1].applied != Idle(), "a new one is flown"
+
+
+def test_a_vehicle_that_is_carried_or_was_not_seen_for_long_does_not_jump() -> None:
+    with Bench() as bench:
+        pilot = bench.pilot()
+        bench.driver.report(position_m=(0.0, 0.0, 0.0), yaw_rad=0.0)
+        bench.tick()
+        bench.driver.report(position_m=(4.0, 0.0, 0.0))
+        bench.tick()
+        bench.take_off(pilot)
+        bench.driver.report(position_m=None)
+        bench.run(1.5, lambda: pilot.command(Hover(), repeat=True))
+        bench.driver.report(position_m=(8.0, 0.0, 0.0))
+        bench.tick()
+        assert pilot.told(EventKind.VEHICLE_MESSAGE) == []
 
 
 def test_walls_that_are_set_on_the_way_take_over_from_the_vehicle() -> None:

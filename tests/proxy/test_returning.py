@@ -304,8 +304,7 @@ def away(bench: Bench, x: float = 5.0) -> App:
     pilot.command(Takeoff())
     bench.tick()
     assert pilot.last_feedback().start_position_m is None or pilot.last_feedback().start_position_m == (0.0, 0.0, 0.0)
-    bench.driver.report(state=FlightState.HOVERING, position_m=(x, 0.0, 1.0), altitude_m=1.0)
-    bench.tick()
+    bench.move((x, 0.0, 1.0), state=FlightState.HOVERING, altitude_m=1.0)
     bench.driver.told.clear()
     return pilot
 
@@ -313,7 +312,7 @@ def away(bench: Bench, x: float = 5.0) -> App:
 def fly_back(bench: Bench, each: Callable[[], object]) -> None:
     """Put the vehicle where the return wants it, until it lands."""
     for position in ((5.0, 0.0, 2.0), (2.0, 0.0, 2.0), (0.0, 0.0, 2.0)):
-        bench.driver.report(position_m=position, altitude_m=position[2])
+        bench.move(position, altitude_m=position[2])
         bench.run(0.04, each)
 
 

@@ -56,6 +56,7 @@ from skyloop.proxy.core.flight_events import (
     enforcement_event,
     failsafe_event,
     ownership_event,
+    position_jumped_event,
     refused_event,
     taken_event,
     thin_zones_event,
@@ -73,6 +74,7 @@ from skyloop.zones import Space
 
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
+_NOTICED_M_S: Final = 0.05  #: a step of the software autopilot that is shortened by less is not worth telling
 
 
 class CommandHandler:
@@ -217,7 +219,7 @@ class CommandHandler:
         """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace."""
         with self._lock:
             self._observe_link(now_ns)
-            self.checks.airspace.observe(self._vehicle.feedback_now)
+            self._observe_position(now_ns)
             effects = self.authority.update(now_ns)
             if effects:
                 self._apply_authority(effects, now_ns)
@@ -367,7 +369,8 @@ class CommandHandler:
 
     def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
         """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
-        allowed, clamps, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
+        allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
+        clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
         if clamps or (enforced is not None and enforced is not self._enforced):
             holder = self.authority.holder
             self._report_limits(None if holder is None else self._sessions.get(holder.app_id), clamps, enforced, now_ns)
@@ -466,6 +469,19 @@ class CommandHandler:
             self._end_intents()
             self.ladder.hand_over(now_ns)
             self._update_failsafe(now_ns)
+
+    def _observe_position(self, now_ns: int) -> None:
+        """Note where the vehicle is, and hover where that jumped: what was asked for meant another place."""
+        airspace = self.checks.airspace
+        airspace.observe(self._vehicle.feedback_now)
+        if not airspace.jumped_m:
+            return
+        if self._executor.supported and self._executor.airborne and self.ownership.ours:  # nobody flies a recording
+            self._events.publish_draft(position_jumped_event(airspace.jumped_m))
+            self._end_intents()
+            self.ladder.hand_over(now_ns)
+            self._update_failsafe(now_ns)
+        airspace.jumped_m = 0.0
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""

@@ -25,6 +25,8 @@ GRAVITY_M_S2: Final = 9.80665
 STALE_NS: Final = NS_PER_S // 2  #: a vehicle whose feedback is older has no position
 LOST_NS: Final = 2 * NS_PER_S  #: a position that is older is not waited for
 BLIND_M: Final = 0.5  #: between walls a vehicle flies to a place at most so far without a new position
+#: A position that changes by more than this, and more than can have been flown since, has jumped.
+JUMP_M: Final = 1.0
 MARGIN_M: Final = 0.1  #: so far beyond a wall is taken for noise; farther is outside, where only coming back is allowed
 BRAKE_GAIN: Final = 2.0  #: deceleration asked for per speed that is too much [1/s]
 RETURN_M_S: Final = 0.5  #: at most so fast is it led back that is beyond a wall and asks to go farther
@@ -66,6 +68,7 @@ class Airspace:
 
     def __init__(self, settings: AirspaceSettings | None = None) -> None:
         self.settings = settings or AirspaceSettings()
+        self.jumped_m = 0.0  #: how far the position jumped lately; whoever acts on it sets it to 0
         self._way: tuple[Vec3, Space] | None = None  # the place that it was allowed to fly to, and in which space
         self._sinks = self._blocked = False  # down to the ceiling; and something is between
         self._newest: Feedback | None = None
@@ -130,13 +133,18 @@ class Airspace:
         return other
 
     def observe(self, feedback: Feedback | None) -> None:
-        """Note where the vehicle is: on which side of each zone, how old that is, and where the ground is below it."""
+        """Note where the vehicle is: on which side of each zone, how old that is, and where the ground is below it.
+
+        ``jumped_m`` is set where the position changed by more than the vehicle can have flown.
+        """
         before, at = self._newest, None if feedback is None else feedback.position_m
         if feedback is None or at is None or feedback is before:
             return
         if before is None or abs(feedback.captured_ns - before.captured_ns) > NS_PER_S:
             self._sides.clear()
             self._ground.clear()
+        else:
+            self._notice_jump(before, feedback, math.dist(at, before.position_m or at))
         rests = not self._moves and _speed(feedback) <= _AT_REST_M_S
         if before is None or at != before.position_m or rests:
             self._at_ns = feedback.captured_ns
@@ -150,6 +158,14 @@ class Airspace:
             ground.append((feedback.captured_ns, at[2] - feedback.altitude_m))
             while feedback.captured_ns - ground[0][0] > _GROUND_NS:
                 ground.popleft()
+
+    def _notice_jump(self, before: Feedback, feedback: Feedback, moved_m: float) -> None:
+        limits = self.settings.limits
+        fastest = max(math.hypot(limits.speed, limits.climb), _speed(before), _speed(feedback))
+        if moved_m > JUMP_M + fastest * max(0.0, seconds(feedback.captured_ns - self._at_ns)):
+            self.jumped_m = moved_m
+            self._sides.clear()
+            self._ground.clear()
 
     def allowed_speed(self, distance: float, late_s: float) -> float:
         """The greatest speed towards a wall so far away [m/s]; 0 beyond it."""
