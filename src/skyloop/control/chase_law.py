@@ -22,7 +22,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.dead_reckoning import DRAG_PER_S
 from skyloop.control.filters import LowPass
-from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.control.response import Predicted, ResponseSettings, VelocityResponse
 from skyloop.control.target import Motion
 from skyloop.control.target_estimate import TargetEstimator, TargetState
@@ -135,7 +135,7 @@ class ChaseLaw:
                 attitude.
         """
         s = self.settings
-        dt_s = 0.0 if self._last_ns is None else max(0.0, min(0.2, seconds(now_ns - self._last_ns)))
+        dt_s = 0.0 if self._last_ns is None else within(seconds(now_ns - self._last_ns), 0.0, 0.2)
         self._last_ns = now_ns
         own = motion.moved_to(now_ns)
         self._begin = own.position[:2] if self._begin is None else self._begin
@@ -330,7 +330,7 @@ class ChaseLaw:
         The nearest pass counts, by the velocity that it has or that it is about to take up. The less certain it is
         where the other is, who is out of view perhaps, the farther off it stays, and reckons with a stop.
         """
-        uncertain_m = max(0.0, min(_UNCERTAIN_M, other.place_m - _SURE_M))
+        uncertain_m = within(other.place_m - _SURE_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m
         here = own.position[:2] - other.foot[:2]
         moves = (other.velocity, np.zeros(2)) if uncertain_m > 0.0 else (other.velocity,)
@@ -380,8 +380,8 @@ class ChaseLaw:
         if state is not None:
             reach = math.tan(s.steep_rad) * state.range_m
             middle = float(state.middle[2])
-            height = max(middle - reach, min(middle + reach, height))
-        height = max(s.lowest_m, min(s.highest_m, height))
+            height = within(height, middle - reach, middle + reach)
+        height = within(height, s.lowest_m, s.highest_m)
         return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
 
     def _by_attitude(self, own: Motion, wanted: Array, up: float, turn: float) -> Attitude:

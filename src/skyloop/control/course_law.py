@@ -19,7 +19,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.control.detour import Point, Wall, detour
 from skyloop.control.gate_law import Axis, GatePhase
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.control.target import Motion, Odometry
 from skyloop.messages import Feedback, Velocity
 from skyloop.messages.geometry import wrap_angle
@@ -443,5 +443,5 @@ def _nearest(place: Array, wall: Wall) -> Point:
     (x, y), (u, v) = wall.begin, wall.end
     along, aside = u - x, v - y
     share = ((float(place[0]) - x) * along + (float(place[1]) - y) * aside) / max(along**2 + aside**2, 1e-12)
-    share = max(0.0, min(1.0, share))
+    share = within(share, 0.0, 1.0)
     return x + share * along, y + share * aside

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.landing_settings import LandingSettings
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.control.response import Predicted, VelocityResponse
 from skyloop.control.spiral import SpiralSearch
 from skyloop.control.target import Motion, Odometry
@@ -300,7 +300,7 @@ class LandingLaw:
         """Limit a climb [m/s]; towards the ceiling it slows down, as the proxy would do it."""
         most = self.settings.climb_m_s
         room = math.inf if self._altitude is None else max(0.0, self.settings.ceiling_m - self._altitude)
-        return max(-most, min(most, room, up))
+        return within(up, -most, min(most, room))
 
     def _to_search_height(self) -> float:
         if self._altitude is None:

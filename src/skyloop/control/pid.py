@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 from skyloop.control.filters import LowPass, gain
-from skyloop.control.limiting import clamped
+from skyloop.control.limiting import clamped, within
 from skyloop.errors import UsageError
 from skyloop.messages.geometry import wrap_angle
 
@@ -119,8 +119,10 @@ class Pid:
             feed_forward: Is added to the output before the limits.
 
         Returns:
-            The output, within ``low`` and ``high`` and the rate limit.
+            The output, within ``low`` and ``high`` and the rate limit; as before where an argument is not finite.
         """
+        if not all(map(math.isfinite, (set_point, measured, feed_forward, dt_s))):
+            return 0.0 if self._output is None else self._output
         g = self._gains
         error = self._difference(set_point, measured)
         if self._measured is not None and dt_s > 0.0:
@@ -128,7 +130,7 @@ class Pid:
             self._integral += g.i * error * dt_s
         self._measured, self._error, self._dt_s = measured, error, dt_s
         self._unlimited = feed_forward + g.p * error + self._integral - g.d * (self._slope.value or 0.0)
-        limited = max(self._low, min(self._high, self._unlimited))
+        limited = within(self._unlimited, self._low, self._high)
         if self._output is not None and self._rate < math.inf:
             nearer = self._output + clamped(limited - self._output, self._rate * max(0.0, dt_s))
             # The sum is rounded, and may be a last bit beyond the limit that it goes to.
