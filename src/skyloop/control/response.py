@@ -115,6 +115,11 @@ class VelocityResponse:
             self._correct((self._lean + lean) / 2, velocity, seconds(feedback.captured_ns - before_ns))
             self._lean = lean
 
+    def pause(self) -> None:
+        """Forget the set-points that are under way, because others flew the vehicle; and the trim, learnt by them."""
+        self._setpoints.clear()
+        self._trim = np.zeros(2)
+
     def sent(self, velocity: Array, now_ns: int) -> None:
         """Note a velocity set-point (2,) [m/s] that is sent now."""
         self._setpoints.append((now_ns + nanoseconds(self.settings.delay_s), np.asarray(velocity, dtype=np.float64)))
