@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds
+from skyloop.control.airframe import Motion, TiltVelocity
 from skyloop.control.chase_law import ChaseLaw, FollowMode, TargetPhase
 from skyloop.control.chase_settings import ChaseSettings
-from skyloop.control.dead_reckoning import TiltVelocity
-from skyloop.control.target import Motion
 from skyloop.control.target_estimate import TRAITS, TargetEstimator, Traits
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.messages import Attitude, Feedback, FlightState

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from skyloop.clock import nanoseconds
+from skyloop.control.airframe import Motion
 from skyloop.control.chase_law import LOSSES, ChaseLaw, FollowMode, TargetPhase
 from skyloop.control.chase_settings import ChaseSettings
-from skyloop.control.target import Motion
 from skyloop.control.target_estimate import TargetEstimator
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, Value, Velocity

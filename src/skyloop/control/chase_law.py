@@ -4,7 +4,8 @@ Yaw keeps the target in the middle of the image, the distance is kept along the 
 controlled apart from both: the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli ("Vision based GPS-denied
 object tracking and following for unmanned aerial vehicles", SSRR 2013), here on estimated metres, so that gains do not
 depend on the lens or the size, with the target's velocity fed forward. A vehicle that does not report its own velocity
-is flown by its attitude, to the same velocity, against one that comes by dead reckoning (:mod:`.dead_reckoning`).
+is flown by its attitude, to the same velocity, against one that comes by dead reckoning
+(:class:`.airframe.TiltVelocity`).
 """
 
 from __future__ import annotations
@@ -19,12 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.control.airframe import DRAG_PER_S, Motion
 from skyloop.control.chase_settings import ChaseSettings
-from skyloop.control.dead_reckoning import DRAG_PER_S
 from skyloop.control.filters import LowPass
-from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.control.response import Predicted, ResponseSettings, VelocityResponse
-from skyloop.control.target import Motion
 from skyloop.control.target_estimate import TargetEstimator, TargetState
 from skyloop.messages import Attitude, Feedback, Velocity
 from skyloop.messages.geometry import wrap_angle
@@ -131,11 +131,11 @@ class ChaseLaw:
             seen_ns: When it was last in view for certain, or perhaps; None: never.
             others: Who else was seen lately, and is kept clear of.
             candidate: Somebody who may be the lost target, and is looked at.
-            relative: The vehicle does not report its velocity (see :mod:`.dead_reckoning`): the set-point is an
-                attitude.
+            relative: The vehicle does not report its velocity (see :class:`.airframe.TiltVelocity`): the set-point is
+                an attitude.
         """
         s = self.settings
-        dt_s = 0.0 if self._last_ns is None else max(0.0, min(0.2, seconds(now_ns - self._last_ns)))
+        dt_s = 0.0 if self._last_ns is None else within(seconds(now_ns - self._last_ns), 0.0, 0.2)
         self._last_ns = now_ns
         own = motion.moved_to(now_ns)
         self._begin = own.position[:2] if self._begin is None else self._begin
@@ -174,6 +174,11 @@ class ChaseLaw:
     def feedback(self, feedback: Feedback) -> None:
         """Update the model of the vehicle's response with its newest state; a vehicle without velocity has none."""
         self._response.add(feedback)
+
+    def pause(self) -> None:
+        """Restart from the vehicle's own velocity, because others flew it, or its motion was not known."""
+        self._limiter, self._last_ns = None, None
+        self._response.pause()
 
     def _ahead(self, motion: Motion, now_ns: int, predicted: Predicted | None) -> Motion:
         """Return the motion at which a set-point that is sent now finds the vehicle, with all that is under way."""
@@ -330,7 +335,7 @@ class ChaseLaw:
         The nearest pass counts, by the velocity that it has or that it is about to take up. The less certain it is
         where the other is, who is out of view perhaps, the farther off it stays, and reckons with a stop.
         """
-        uncertain_m = max(0.0, min(_UNCERTAIN_M, other.place_m - _SURE_M))
+        uncertain_m = within(other.place_m - _SURE_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m
         here = own.position[:2] - other.foot[:2]
         moves = (other.velocity, np.zeros(2)) if uncertain_m > 0.0 else (other.velocity,)
@@ -380,8 +385,8 @@ class ChaseLaw:
         if state is not None:
             reach = math.tan(s.steep_rad) * state.range_m
             middle = float(state.middle[2])
-            height = max(middle - reach, min(middle + reach, height))
-        height = max(s.lowest_m, min(s.highest_m, height))
+            height = within(height, middle - reach, middle + reach)
+        height = within(height, s.lowest_m, s.highest_m)
         return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
 
     def _by_attitude(self, own: Motion, wanted: Array, up: float, turn: float) -> Attitude:
