@@ -26,7 +26,7 @@ from skyloop.control.filters import LowPass
 from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.control.response import Predicted, ResponseSettings, VelocityResponse
 from skyloop.control.target_estimate import TargetEstimator, TargetState
-from skyloop.messages import Attitude, Feedback, Velocity
+from skyloop.messages import Attitude, Feedback, Vector, Velocity
 from skyloop.messages.geometry import wrap_angle
 
 Array = NDArray[np.float64]
@@ -97,7 +97,9 @@ class ChaseLaw:
         self.off_m: float | None = None
         self.held_by = ""
         self._heading: float | None = None  # in which the target moved when it last did
-        self._begin: Array | None = None
+        self._out = np.zeros(2)  # where it is, from where it began
+        self._was_at: Array | None = None  # in odometry axes, at the last step
+        self._begin: Array | None = None  # in world axes; None: its position was not known yet
         self._height: float | None = None
         self._since_ns: int | None = None  # when the search began
         self._direction = 1.0
@@ -120,6 +122,7 @@ class ChaseLaw:
         *,
         candidate: TargetState | None = None,
         relative: bool = False,
+        position: Vector | None = None,
     ) -> Velocity | Attitude:
         """Compute the set-point for now.
 
@@ -133,12 +136,13 @@ class ChaseLaw:
             candidate: Somebody who may be the lost target, and is looked at.
             relative: The vehicle does not report its velocity (see :class:`.airframe.TiltVelocity`): the set-point is
                 an attitude.
+            position: Where it is now, world axes [m]; None: not known, and the leash is by the velocity, added up.
         """
         s = self.settings
         dt_s = 0.0 if self._last_ns is None else within(seconds(now_ns - self._last_ns), 0.0, 0.2)
         self._last_ns = now_ns
         own = motion.moved_to(now_ns)
-        self._begin = own.position[:2] if self._begin is None else self._begin
+        self._note_way(own, position)
         if self._height is None and altitude_m is not None:
             self._height = altitude_m
         if self._since_ns is None:
@@ -169,6 +173,7 @@ class ChaseLaw:
             horizontal = _not_towards(horizontal, state.foot[:2] - ahead.position[:2])
         for other in others:
             horizontal = horizontal + self._clear_of(other, ahead, horizontal)
+        horizontal = self._leashed(self._out + ahead.position[:2] - own.position[:2], horizontal)
         return self._steer(shortened(horizontal, s.speed_m_s), turn, state, now)
 
     def feedback(self, feedback: Feedback) -> None:
@@ -289,7 +294,7 @@ class ChaseLaw:
         else:
             wanted = wanted + aside * self._round(state, sight, across)
         wanted = wanted + self._evading(own, state)
-        return self._leashed(own, self._kept_off(wanted, state, sight, across))
+        return self._kept_off(wanted, state, sight, across)
 
     def _soon(self, state: TargetState, at_ns: int) -> Array:
         """Return the target's velocity as it will be when the vehicle has taken it up, (2,) [m/s]."""
@@ -359,12 +364,21 @@ class ChaseLaw:
         allowed = _stoppable(gap, self.settings) if gap > 0.0 else 2.0 * gap
         return wanted if closing <= allowed else wanted - sight * (closing - allowed)
 
-    def _leashed(self, own: Motion, wanted: Array) -> Array:
-        """Take away what would lead farther out than the leash."""
+    def _note_way(self, own: Motion, position: Vector | None) -> None:
+        """Note how far it is from where it began: the velocity drifts, the position does not."""
+        here = own.position[:2]
+        self._out = self._out + (np.zeros(2) if self._was_at is None else here - self._was_at)
+        self._was_at = here
+        if position is not None:
+            known = np.array(position[:2])
+            self._begin = known - self._out if self._begin is None else self._begin
+            self._out = known - self._begin
+
+    def _leashed(self, out: Array, wanted: Array) -> Array:
+        """Take away what would lead farther out than the leash; ``out``, (2,) [m]: where it is from where it began."""
         leash = self.settings.leash_m
-        if leash is None or self._begin is None:
+        if leash is None:
             return wanted
-        out = own.position[:2] - self._begin
         length = float(np.hypot(*out))
         if length < 0.1:
             return wanted

@@ -247,6 +247,7 @@ class TargetFollower(AirframeLaw):
             () if finder is None else finder.others(now_ns),
             candidate=None if finder is None else finder.candidate(now_ns),
             relative=self._relative,
+            position=self.airframe.position_m(now_ns),
         )
 
     @property
