@@ -35,6 +35,7 @@ HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
 TAKEOFF_M: Final = 1.0  #: a take-off leads at least so high
 
+_FAST_M_S: Final = 10.0  # what a vehicle that does not report its velocity may fly
 _BLIND_S: Final = 0.1  # what a vehicle does in less is within the reaction time
 _OLD_S: Final = 1.0  # a position may stay the same for longer where the vehicle stands still after all
 _AT_REST_M_S: Final = 0.05  # a slower vehicle may report the same position again and again
@@ -161,7 +162,8 @@ class Airspace:
 
     def _notice_jump(self, before: Feedback, feedback: Feedback, moved_m: float) -> None:
         limits = self.settings.limits
-        fastest = max(math.hypot(limits.speed, limits.climb), _speed(before), _speed(feedback))
+        reported = _FAST_M_S if feedback.velocity_m_s is None else max(_speed(before), _speed(feedback))
+        fastest = max(math.hypot(limits.speed, limits.climb), reported)
         if moved_m > JUMP_M + fastest * max(0.0, seconds(feedback.captured_ns - self._at_ns)):
             self.jumped_m = moved_m
             self._sides.clear()
