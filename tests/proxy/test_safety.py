@@ -270,6 +270,22 @@ def test_a_hover_above_a_lowered_ceiling_does_not_sink_into_a_zone() -> None:
     assert last.action == Hover(), "it stays above it"
 
 
+def test_a_ceiling_is_not_lowered_into_a_zone_below_the_vehicle(bench: Bench) -> None:
+    """A vehicle with a ceiling of its own sank to it by itself, 0.96 m deep into a zone, whatever was commanded."""
+    pilot = bench.airborne()
+    pilot.ask(SetParameter(ZONES, "people: box -1.5 -1.5 0 1.5 1.5 1.8", pilot.lease))
+    bench.driver.report(position_m=(0.0, 0.0, 2.4), yaw_rad=0.0, altitude_m=2.4)
+    refused = pilot.ask(SetParameter("limits.altitude", 1.0, pilot.lease))
+    assert isinstance(refused, Refused)
+    assert "limits.altitude can't be 1 m now: the vehicle would have to sink to 1 m, and" in refused.message
+    assert "people: box" in refused.message
+    assert bench.proxy.handler.checks.airspace.settings.limits.altitude == 5.0
+    for altitude, place in ((2.0, (0.0, 0.0, 2.4)), (1.0, (0.0, 3.0, 2.4))):
+        bench.driver.report(position_m=place)
+        pilot.ask(SetParameter("limits.altitude", altitude, pilot.lease))
+        assert bench.proxy.handler.checks.airspace.settings.limits.altitude == altitude
+
+
 def test_no_take_off_in_a_zone_or_into_one() -> None:
     over, around = Box((-1.0, -1.0, 0.5), (1.0, 1.0, 2.0)), Box((3.0, -1.0, -1.0), (5.0, 1.0, 2.0))
     airspace = walled(None, over, around)

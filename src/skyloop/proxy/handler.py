@@ -151,6 +151,12 @@ class CommandHandler:
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
 
+    def problem_with_ceiling(self, altitude: float) -> str:
+        """Return why ``limits.altitude`` must not be lowered to this height [m] now, for a person; empty if it may."""
+        with self._lock:
+            flies = self._executor.airborne
+            return self.checks.airspace.ceiling_problem(altitude, self._vehicle.feedback_now) if flies else ""
+
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and carry it out, on the thread that received it."""
         with self._lock:

@@ -126,6 +126,16 @@ class Airspace:
         ground, space = self._ground_below(feedback), self.settings.space
         return self._too_high(action.z, ground) or space.problem_at(action.place) or _too_low(action.z, ground)
 
+    def ceiling_problem(self, altitude: float, feedback: Feedback | None) -> str:
+        """Return why ``limits.altitude`` must not be so low now: some vehicles sink to it by themselves."""
+        self.observe(feedback)
+        if feedback is None or feedback.position_m is None or (ground := self._ground_below(feedback)) is None:
+            return ""
+        x, y, z = at = feedback.position_m
+        below, zones = (x, y, ground + altitude), Space(zones=self.settings.space.zones)
+        problem = "" if below[2] >= z else zones.problem_at(below) or zones.problem_between(at, below)
+        return f"the vehicle would have to sink to {altitude:g} m, and {problem}" if problem else ""
+
     def apart(self) -> Airspace:
         """Return one that has seen the same, to try something without a trace."""
         other = Airspace(self.settings)
