@@ -294,6 +294,7 @@ def test_no_take_off_in_a_zone_or_into_one() -> None:
         assert (verdict.action, verdict.refusal) == (None, Refusal.OUT_OF_RANGE)
         assert "no-fly zone" in verdict.why
     assert airspace.judge(Takeoff(), at(2.0, 0.0, 0.0), NOW, new=True).action == Takeoff()
+    assert airspace.judge(Takeoff(), at(4.0, 0.0, 1.95), NOW, new=True).action == Takeoff(), "it stands on it"
     assert airspace.judge(Takeoff(), None, NOW, new=True).action == Takeoff(), "a vehicle may not know its position"
 
 

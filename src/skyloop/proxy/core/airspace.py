@@ -34,6 +34,7 @@ RETURN_M_S: Final = 0.5  #: at most so fast is it led back that is beyond a wall
 HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
 TAKEOFF_M: Final = 1.0  #: a take-off leads at least so high
+LIFTED_M: Final = 0.3  #: a zone that ends lower is left by it: a vehicle may stand on a table that is one
 
 _FAST_M_S: Final = 10.0  # what a vehicle that does not report its velocity may fly
 _BLIND_S: Final = 0.1  # what a vehicle does in less is within the reaction time
@@ -344,8 +345,8 @@ class Airspace:
         """Refuse to take off in a no-fly zone, or into one."""
         if feedback is None or feedback.position_m is None or not self._young(feedback, now_ns):
             return Verdict(action)
-        x, y, z = at = feedback.position_m
-        zones, top = Space(zones=self.settings.space.zones), (x, y, z + TAKEOFF_M)
+        x, y, z = feedback.position_m
+        zones, at, top = Space(zones=self.settings.space.zones), (x, y, z + LIFTED_M), (x, y, z + TAKEOFF_M)
         problem = zones.problem_at(at) or zones.problem_between(at, top)
         return _out_of_range(f"it would take off into it: {problem}") if problem else Verdict(action)
 
