@@ -44,7 +44,7 @@ def test_vehicles_come_and_go(served: Hosting) -> None:
     assert (row.name, row.condition, row.process) == ("alpha", "running", "shared")
     proxy = served.shared("alpha").proxy
     assert proxy is not None
-    assert proxy.handler.checks.limits.speed == 0.5
+    assert proxy.handler.checks.airspace.settings.limits.speed == 0.5
     assert [row.name for row in ask("host", Status()).vehicles] == ["alpha"]
     served.vehicle("bravo").fail = {"open"}
     answer = ask("host", Add(tuple(map(served.settings, ("alpha", "bravo")))))

@@ -245,8 +245,10 @@ def test_presets_are_in_force_from_the_beginning(hosting: Hosting) -> None:
     hosting.host.add(VehicleSettings("alpha", "fake://alpha", presets=presets))
     proxy = hosting.shared("alpha").proxy
     assert proxy is not None
-    wait_until(lambda: proxy.handler.checks.limits.tilt == 0.2, "the vehicle's own parameter was written")
-    assert proxy.handler.checks.limits.speed == 0.5
+    wait_until(
+        lambda: proxy.handler.checks.airspace.settings.limits.tilt == 0.2, "the vehicle's own parameter was written"
+    )
+    assert proxy.handler.checks.airspace.settings.limits.speed == 0.5
     pilot = hosting.airborne("alpha")
     pilot.command(Velocity(2.0, 0.0, 0.0, 0.0))
     flown = driver.told[-1]

@@ -3,6 +3,7 @@ that stands still. A Ping's answer shows that everything sent before it was deal
 
 from __future__ import annotations
 
+import math
 import queue
 import time
 from collections.abc import Callable, Iterable
@@ -337,6 +338,15 @@ class Bench:
             app.command(Takeoff())
         self.driver.report(state=FlightState.HOVERING)
         self.driver.told.clear()
+
+    def move(self, position_m: tuple[float, float, float], **more: Any) -> None:
+        """Report the vehicle at another place, and before that on the way there: its position does not jump."""
+        start = self.driver.now.position_m or position_m
+        steps = math.ceil(math.dist(start, position_m) / 0.9)
+        for step in range(1, steps + 1):
+            between = [a + step / steps * (b - a) for a, b in zip(start, position_m, strict=True)]
+            self.driver.report(position_m=tuple(between), **more)
+            self.tick()
 
     def run(self, seconds: float, each: Callable[[], object] = lambda: None) -> None:
         """Let time pass in steps of 20 ms, the proxy's tick after each, then ``each``."""

@@ -29,6 +29,7 @@ class Fate(StrEnum):
     FAILSAFE = "failsafe"
     OTHERS = "others"
     SLEPT = "slept"
+    JUMPED = "jumped"
 
 
 #: The one list of what ends an intent, in words for people; ``docs/proxy.md`` has it, too.
@@ -45,6 +46,7 @@ ENDINGS: Final[dict[Fate, str]] = {
     Fate.FAILSAFE: "a failsafe took over",
     Fate.OTHERS: "somebody else took the vehicle",
     Fate.SLEPT: "the proxy's computer slept",
+    Fate.JUMPED: "the vehicle's position jumped",
 }
 
 

@@ -30,6 +30,7 @@ from skyloop.messages import (
     EmergencyStop,
     Failsafe,
     Fate,
+    Feedback,
     FlightState,
     Hover,
     Idle,
@@ -42,6 +43,7 @@ from skyloop.messages import (
     Role,
     Takeoff,
     Takeover,
+    Velocity,
     encode,
 )
 from skyloop.messages.command import SET_POINTS
@@ -49,7 +51,7 @@ from skyloop.messages.numbers import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.authority_events import EventContext, authority_event
-from skyloop.proxy.core.command_checks import CommandChecks, Decision
+from skyloop.proxy.core.command_checks import CommandChecks
 from skyloop.proxy.core.failsafe import BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import Whose
@@ -60,11 +62,14 @@ from skyloop.proxy.core.flight_events import (
     enforcement_event,
     failsafe_event,
     ownership_event,
+    position_jumped_event,
     refused_event,
     slept_event,
     taken_event,
+    thin_zones_event,
 )
 from skyloop.proxy.core.intents import INSISTENT, TAKEOFF_NS, Intent
+from skyloop.proxy.core.limits import Clamp, Episodes
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.parameters import FlightSettings
@@ -72,6 +77,7 @@ from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.returning import ReturnSupervisor
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import COMMANDS, TransportServer
+from skyloop.zones import Space
 
 _LAND: Final = Land()
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
@@ -80,6 +86,7 @@ _PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: what ma
 _NOTHING: Final = Idle()
 #: So much more sleep of the computer than was known is one: shorter ones are not told from a delay.
 SLEEP_NS: Final = NS_PER_S // 4
+_NOTICED_M_S: Final = 0.05  #: a step of the software autopilot that is shortened by less is not worth telling
 
 
 class CommandHandler:
@@ -117,7 +124,7 @@ class CommandHandler:
         self._back = ReturnSupervisor(self.checks, self.ladder, executor, publisher)
         self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
         if executor.autopilot is not None:
-            executor.autopilot.guard = self.checks.guard
+            executor.autopilot.guard = self._guard_step
         self.warm_s = 0.0  #: how often the code is to be run on a dummy while the vehicle is piloted [s]; 0: never
         self._lock = threading.RLock()
         self._executor = executor
@@ -136,6 +143,7 @@ class CommandHandler:
         self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
         self._rising: Intent | None = None  # a take-off that the vehicle was told of, and does not show yet
         self._enforced = True  # whether the safety box and zones could be, at the last set-point
+        self._episodes = Episodes()  # of limits that touch what the proxy does with nobody in command
         self._stamp()
 
     # From the proxy: what decides takes the lock -----------------------------------------------------------------
@@ -147,16 +155,15 @@ class CommandHandler:
     def configure(self, settings: FlightSettings) -> None:
         """Let new values of the parameters take effect."""
         with self._lock:
-            self.checks.limits = settings.limits
-            self.checks.safety = settings.safety
-            self.checks.space = settings.space
+            self._report_thin_zones(settings.airspace.space)
+            self.checks.airspace.settings = settings.airspace
             self.checks.returns = settings.returns
             self.checks.max_age_ns = settings.max_age_ns
             self.authority.timeout_ns = settings.authority_timeout_ns
             self.authority.ask_ns = settings.authority_ask_ns
             self.ladder.settings = settings.failsafe
             self.warm_s = settings.warm_s
-            self._executor.guarded = settings.safety is not None
+            self._executor.guarded = settings.airspace.space.walled
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
 
@@ -168,6 +175,12 @@ class CommandHandler:
         if command.sent_ns >= self._awake_ns:
             return command
         return msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
+
+    def problem_with_ceiling(self, altitude: float) -> str:
+        """Return why ``limits.altitude`` must not be lowered to this height [m] now, for a person; empty if it may."""
+        with self._lock:
+            flies = self._executor.airborne
+            return self.checks.airspace.ceiling_problem(altitude, self._vehicle.feedback_now) if flies else ""
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and carry it out, on the thread that received it."""
@@ -238,6 +251,7 @@ class CommandHandler:
         with self._lock:
             self._observe_sleep(now_ns)
             self._observe_link(now_ns)
+            self._observe_position(now_ns)
             effects = self.authority.update(now_ns)
             if effects:
                 self._apply_authority(effects, now_ns)
@@ -347,7 +361,9 @@ class CommandHandler:
         applied: AnyAction = _NOTHING
         if decision.action is not None:
             if decision.clamps or (decision.enforced is not None and decision.enforced is not self._enforced):
-                self._report_limits(session, decision, now_ns)
+                self._report_limits(session, decision.clamps, decision.enforced, now_ns)
+                if decision.clamps:
+                    self._counts["commands.clamped"] += 1
             try:
                 applied = self._executor.execute(decision.action, now_ns, new=new)
             except RefusedError as error:
@@ -400,14 +416,30 @@ class CommandHandler:
         self._delays_ns.append(applied_ns - command.sent_ns)
         return applied_ns
 
-    def _report_limits(self, session: Session, decision: Decision, now_ns: int) -> None:
-        if decision.enforced is not None and decision.enforced is not self._enforced:
-            self._enforced = decision.enforced
-            self._events.publish_draft(enforcement_event(decision.enforced))
-        if decision.clamps:
-            self._counts["commands.clamped"] += 1
-            for clamp in session.episodes.begun(decision.clamps, now_ns):
-                self._events.publish_draft(clamped_event(session.name, clamp))
+    def _report_limits(
+        self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
+    ) -> None:
+        """Publish what began to be in the way of a command of this application, or of what the proxy does itself."""
+        if enforced is not None and enforced is not self._enforced:
+            self._enforced = enforced
+            self._events.publish_draft(enforcement_event(enforced))
+        episodes, name = (self._episodes, "the proxy") if session is None else (session.episodes, session.name)
+        for clamp in episodes.begun(clamps, now_ns):
+            self._events.publish_draft(clamped_event(name, clamp))
+
+    def _report_thin_zones(self, space: Space) -> None:
+        if space.thin and space != self.checks.airspace.settings.space:
+            self._events.publish_draft(thin_zones_event(space))
+
+    def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
+        """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
+        allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
+        clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
+        if clamps or (enforced is not None and enforced is not self._enforced):
+            holder = self.authority.holder
+            self._report_limits(None if holder is None else self._sessions.get(holder.app_id), clamps, enforced, now_ns)
+        assert isinstance(allowed, Velocity)
+        return allowed
 
     def _refuse_role(self, session: Session, command: Command) -> AnyAction:
         if session.role is Role.OBSERVER:
@@ -565,6 +597,17 @@ class CommandHandler:
         self._end_intents(fate, now_ns)
         self.ladder.hand_over(now_ns)
         self._update_failsafe(now_ns)
+
+    def _observe_position(self, now_ns: int) -> None:
+        """Note where the vehicle is, and hover where that jumped: what was asked for meant another place."""
+        airspace = self.checks.airspace
+        airspace.observe(self._vehicle.feedback_now)
+        if not airspace.jumped_m:
+            return
+        if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
+            self._events.publish_draft(position_jumped_event(airspace.jumped_m))
+            self._start_over(Fate.JUMPED, now_ns)
+        airspace.jumped_m = 0.0
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""

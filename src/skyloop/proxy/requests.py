@@ -273,6 +273,10 @@ class ParameterRequests:
         if not self._handler.holds(session, request.lease):
             code = Refusal.FOREIGN_LEASE if request.lease else Refusal.NO_AUTHORITY
             return Refused(code, "writing a parameter needs the authority: request it, and name its lease")
+        if request.name == "limits.altitude" and isinstance(request.value, int | float):
+            problem = self._handler.problem_with_ceiling(float(request.value))
+            if problem:
+                return Refused(Refusal.OUT_OF_RANGE, f"{request.name} can't be {request.value:g} m now: {problem}")
         parameter = self._parameters.set(request.name, request.value)
         self._handler.configure(self._parameters.flight_settings())
         unit = f" {parameter.unit}" if parameter.unit else ""

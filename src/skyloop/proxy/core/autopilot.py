@@ -92,7 +92,7 @@ class Autopilot:
         self.flight = flight or Flight(native)
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
-        #: On the way to a place: the velocity that is allowed instead of the wanted one, by the newest feedback.
+        #: The velocity that is allowed instead of the wanted one, by the newest feedback; not asked while it lands.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._takes_velocity = "velocity" in native
         self._target: Velocity | Position = Velocity()
@@ -148,6 +148,8 @@ class Autopilot:
             if mode is not Mode.LAND:
                 return None  # else the descent stays in force, which keeps the vehicle on the ground
         wanted = self._wanted(mode, now_ns, known, reported)
+        if known is not None and self.mode not in (Mode.LAND, Mode.OFF):
+            wanted = self.guard(wanted, known, now_ns)
         dt = PERIOD_S if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
         self._stepped_ns = now_ns
         if self._takes_velocity:
@@ -163,7 +165,7 @@ class Autopilot:
         if mode is Mode.HOVER:
             return self._hold(known)
         if isinstance(self._target, Position):
-            return self._go(self._target, known, now_ns)
+            return self._go(self._target, known)
         return self._target
 
     def _rise(self, now_ns: int, known: Feedback | None, lifted: bool) -> Velocity:
@@ -209,7 +211,7 @@ class Autopilot:
         forward, left = _shorten(cos * east + sin * north, cos * north - sin * east, POSITION_SPEED)
         return Velocity(forward, left, up)
 
-    def _go(self, target: Position, known: Feedback | None, now_ns: int) -> Velocity:
+    def _go(self, target: Position, known: Feedback | None) -> Velocity:
         """Straight towards a place, and slower near it; a speed of zero while position or yaw are not known."""
         if known is None or known.position_m is None or known.yaw_rad is None:
             return Velocity()
@@ -222,13 +224,12 @@ class Autopilot:
         share = speed / away if away > 1e-9 else 0.0
         cos, sin = math.cos(known.yaw_rad), math.sin(known.yaw_rad)
         turn = wrap_angle((self._hold_yaw if target.yaw is None else target.yaw) - known.yaw_rad)
-        wanted = Velocity(
+        return Velocity(
             forward=share * (cos * east + sin * north),
             left=share * (cos * north - sin * east),
             up=share * up,
             yaw_rate=_bound(TURN_GAIN * turn, TURN_RATE if target.turn_rate is None else target.turn_rate),
         )
-        return self.guard(wanted, known, now_ns)
 
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
         """Roll and pitch [rad] that bring the velocity to the wanted one; level while the velocity is not known."""

@@ -9,6 +9,7 @@ from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
 from skyloop.proxy.core.flight import Changed, Whose
 from skyloop.proxy.core.limits import Clamp
+from skyloop.zones import THINNEST_M, ZONES, Space
 
 _ENFORCED: Final = "enforced: its position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
@@ -32,6 +33,20 @@ def enforcement_event(enforced: bool) -> EventDraft:
     text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
     severity = Severity.INFO if enforced else Severity.WARNING
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
+
+
+def thin_zones_event(space: Space) -> EventDraft:
+    """Some zones are kept clear of as if they were thicker than they are written."""
+    thin = "; ".join(str(zone) for zone in space.thin)
+    text = f"no-fly zones thinner than {THINNEST_M:g} m are kept clear of as if they were so thick: {thin} ({ZONES})"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "thin_zones"})
+
+
+def position_jumped_event(jumped_m: float) -> EventDraft:
+    """The position changed by more than the vehicle can have flown."""
+    text = f"the vehicle's position jumped by {jumped_m:.1f} m: it hovers, until something new is commanded"
+    data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
 def emergency_event(name: str) -> EventDraft:
