@@ -21,10 +21,10 @@ SETTLE_NS: Final = nanoseconds(0.5)  #: what the vehicle reports until then may 
 class MotorStop:
     """One emergency stop, from the press until it is reset or given up.
 
-    While it is :attr:`active` the driver sends and obeys nothing else, and reports ``EMERGENCY``. It is sent at once,
-    whether or not the vehicle is heard, and again every 0.1 s until the vehicle shows it. One that the vehicle has not
-    shown 10 s after the last press is over: it is not sent minutes later, the vehicle is reported as what it does, and
-    may be landed. Not thread-safe.
+    While it is :attr:`active` the driver sends and obeys nothing else. It is sent at once, whether or not the vehicle
+    is heard, and again every 0.1 s until the vehicle shows it. One that the vehicle has not shown 10 s after the last
+    press is over: it is not sent minutes later, the vehicle is reported as what it does, and may be landed. Not
+    thread-safe.
 
     Args:
         give_up: Called with the event to publish when the stop ends without a reset.

@@ -207,6 +207,7 @@ class TelloSession(VehicleSession):
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
         if isinstance(action, EmergencyStop):
+            self._flips.clear()
             self.due_ns = now_ns
         elif self.setpoints.intent != before:
             self.due_ns = min(self.due_ns, max(now_ns, self._rc_ns + HURRY_NS))

@@ -227,7 +227,7 @@ class SetpointController:
         if phase is shown:
             self._decide(Decision.STAY, now_ns)
         elif phase is FlightState.LANDED:
-            self._stick = LEVEL
+            self._stick, self.left_alone = LEVEL, False
             self._steering = self._decision is not Decision.STAY
 
     def on_answer(self, motion: str, reply: str, now_ns: int) -> None:
