@@ -11,7 +11,7 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DriverError
-from skyloop.messages import Severity
+from skyloop.messages import FlightState, Severity
 
 PACE_NS: Final = nanoseconds(0.1)  #: between two repeats
 GIVE_UP_NS: Final = nanoseconds(10.0)  #: a stop that is not shown so long after the last press is over
@@ -22,30 +22,38 @@ class MotorStop:
     """One emergency stop, from the press until it is reset or given up.
 
     While it is :attr:`active` the driver sends and obeys nothing else. It is sent at once, whether or not the vehicle
-    is heard, and again every 0.1 s until the vehicle shows it. One that the vehicle has not shown 10 s after the last
-    press is over: it is not sent minutes later, the vehicle is reported as what it does, and may be landed. Not
-    thread-safe.
+    is heard, and again every 0.1 s until the vehicle shows it; until then the vehicle is reported as what it does. A
+    stop that the vehicle has not shown 10 s after the last press is over: it is not sent minutes later, and the vehicle
+    may be landed. Not thread-safe.
 
     Args:
         give_up: Called with the event to publish when the stop ends without a reset.
     """
 
     def __init__(self, give_up: Callable[[VehicleEvent], None]) -> None:
-        self.shown = False  #: whether the vehicle showed it, when last heard
         self._give_up = give_up
         self._pressed_ns: int | None = None
         self._sent_ns: int | None = None
-        self._was_shown = False
+        self._shown = self._was_shown = False
 
     @property
     def active(self) -> bool:
         """Whether it was pressed, and neither reset nor given up since."""
         return self._pressed_ns is not None
 
+    @property
+    def shown(self) -> bool:
+        """Whether it is active, and the vehicle showed its motors off when last heard."""
+        return self.active and self._shown
+
+    def told(self, state: FlightState) -> FlightState:
+        """Return the flight state to report of a vehicle that is in ``state``: what still flies is no emergency."""
+        return FlightState.EMERGENCY if self.shown or (self.active and state is FlightState.LANDED) else state
+
     def press(self, now_ns: int) -> None:
         """Stop the motors. A further press begins the time anew."""
         if self._pressed_ns is None:
-            self._sent_ns, self.shown, self._was_shown = None, False, False
+            self._sent_ns, self._shown, self._was_shown = None, False, False
         self._pressed_ns = now_ns
 
     def settled(self, seen_ns: int) -> bool:
@@ -62,9 +70,9 @@ class MotorStop:
         if self._pressed_ns is None:
             return False
         if shown is not None:
-            self.shown = shown
+            self._shown = shown
             self._was_shown |= shown
-        if self.shown:
+        if self._shown:
             return False
         if now_ns - self._pressed_ns >= GIVE_UP_NS:
             self._end_unshown()

@@ -13,8 +13,8 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.drivers.msp.firmware import Setup
 from skyloop.drivers.motor_stop import MotorStop
+from skyloop.drivers.msp.firmware import Setup
 from skyloop.drivers.msp.motion import Motion
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DriverError
@@ -139,11 +139,10 @@ class SetpointController:
 
     def flight_state(self) -> FlightState:
         """Return the flight state for feedback."""
-        if self.stop.active:
-            return FlightState.EMERGENCY
         if self.report.armed is None:
             return FlightState.UNKNOWN
-        return FlightState.FLYING if self.phase is Phase.FLYING and self.report.armed else FlightState.LANDED
+        flies = self.phase is Phase.FLYING and self.report.armed
+        return self.stop.told(FlightState.FLYING if flies else FlightState.LANDED)
 
     @property
     def full_tilt(self) -> float:

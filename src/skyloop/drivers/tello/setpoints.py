@@ -129,11 +129,8 @@ class SetpointController:
 
     def flight_state(self) -> FlightState:
         """Return the flight state for feedback."""
-        if self.stop.active:
-            return FlightState.EMERGENCY
-        if self.watch.in_air and self._stick != LEVEL:
-            return FlightState.FLYING
-        return self.watch.phase
+        steered = self.watch.in_air and self._stick != LEVEL
+        return self.stop.told(FlightState.FLYING if steered else self.watch.phase)
 
     # What is decided -------------------------------------------------------------------------------------------
 
