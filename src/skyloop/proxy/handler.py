@@ -320,6 +320,7 @@ class CommandHandler:
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
+        self.checks.receive(command, session.sequence, session.app_id, now_ns)  # the holder's is a sign of life, too
         session.sequence.note(command)
         if session.role is not Role.PILOT:
             return self._refuse_role(session, command), now_ns

@@ -109,6 +109,8 @@ class Autopilot:
         """The flight state, given what the driver ``reported``: the vehicle's own state where it has one."""
         if reported is FlightState.EMERGENCY or (self.mode is Mode.LAND and reported is FlightState.LANDED):
             return reported
+        if self._state is FlightState.EMERGENCY and reported.airborne:
+            return reported  # the stop was given up, and it flies
         if self._owns_state or self.mode in (Mode.TAKEOFF, Mode.LAND):
             return self._state
         if reported is FlightState.FLYING and self.mode is Mode.HOVER:
