@@ -100,6 +100,9 @@ def test_authority_and_emergency(proxy: ScriptedProxy) -> None:
             await drone.release_authority()
             assert (await drone.request_authority(2)).priority == 2
             assert drone.emergency_stop()
+            assert not drone.reset_emergency(), "the stop has not shown yet"
+            proxy.state = FlightState.EMERGENCY
+            await drone.wait("emergency", WAIT_S)
             assert drone.reset_emergency()
             await drone.land(wait=False)
 

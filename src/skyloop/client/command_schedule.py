@@ -50,9 +50,10 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(20.0),
     Land: nanoseconds(60.0),
-    EmergencyStop: nanoseconds(2.0),
+    EmergencyStop: nanoseconds(10.0),  # the driver gives it up then, too
     ResetEmergency: nanoseconds(2.0),
 }
+_UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that could not be sent for so long is not sent later
 
 
 class Unsent(NamedTuple):
@@ -101,6 +102,7 @@ class CommandSchedule:
         self._sent_intent = 0
         self._due_ns = 0
         self._failsafe = Failsafe.NONE
+        self._in_emergency = False
 
     def ask(self, action: AnyAction, now_ns: int) -> None:
         """Make ``action`` the set-point of the application."""
@@ -112,6 +114,28 @@ class CommandSchedule:
             self._due_ns = now_ns
         else:
             self._due_ns = max(now_ns, self.open_ns)
+
+    @property
+    def stopping(self) -> bool:
+        """Whether an emergency stop is under way, which nothing but another may replace; see :meth:`may_ask`."""
+        return isinstance(self.action, EmergencyStop)
+
+    def may_ask(self, action: AnyAction) -> bool:
+        """Return whether the application may command this now.
+
+        An emergency stop is repeated until the vehicle shows it, or for 10 s: nothing else of this application is sent
+        meanwhile, or one lost packet would end it while sticks are held. ``Idle`` withdraws one that was never sent, and
+        what is in an emergency may be reset.
+        """
+        if not self.stopping or isinstance(action, EmergencyStop):
+            return True
+        if isinstance(action, ResetEmergency):
+            return self._in_emergency
+        return isinstance(action, Idle) and not self._is_sent
+
+    @property
+    def _is_sent(self) -> bool:
+        return self.intent == self._sent_intent
 
     @property
     def open_ns(self) -> int:
@@ -131,7 +155,7 @@ class CommandSchedule:
             self.action = _HOVER
         elif self._expired(now_ns):
             self.action = _IDLE
-        if self.intent != self._sent_intent:
+        if not self._is_sent:
             self._sent_intent, self._new_sent_ns = self.intent, now_ns
             self._due_ns = now_ns + self._first_ns
             return self.action
@@ -161,6 +185,7 @@ class CommandSchedule:
 
     def observe(self, feedback: Feedback, now_ns: int) -> None:
         """Update from the vehicle's state: end an action that is done, or a set-point that a failsafe overruled."""
+        self._in_emergency = feedback.state is FlightState.EMERGENCY
         kind = type(self.action)
         done_in = _DONE_IN.get(kind)
         if done_in is None:
@@ -200,6 +225,8 @@ class CommandSchedule:
 
     def _expired(self, now_ns: int) -> bool:
         longest_ns = _AT_MOST_NS.get(type(self.action))
+        if self.stopping and not self._is_sent:
+            longest_ns = _UNSENT_STOP_NS
         return longest_ns is not None and now_ns - self._asked_ns > longest_ns
 
 

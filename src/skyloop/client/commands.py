@@ -19,6 +19,7 @@ from skyloop.messages import (
     AnswerTakeover,
     AnyAction,
     AnyReply,
+    Attitude,
     AuthorityGranted,
     AuthorityQueued,
     Command,
@@ -26,14 +27,18 @@ from skyloop.messages import (
     Event,
     EventKind,
     Feedback,
+    Hover,
+    Idle,
     Land,
     Position,
     Refusal,
     Refused,
     ReleaseAuthority,
     RequestAuthority,
+    ResetEmergency,
     ReturnToStart,
     Role,
+    Velocity,
     encode,
 )
 from skyloop.messages.config import MAX_REASON
@@ -46,6 +51,8 @@ ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for th
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 _ACTIONS: Final = frozenset(ACTION_NAMES)
+#: What a program sends again and again: that one of them is not sent is no error.
+_STREAMED: Final = (Idle, Hover, Velocity, Attitude, ResetEmergency)
 
 
 class CommandSender:
@@ -120,6 +127,11 @@ class CommandSender:
         """Whether the newest set-point keeps, or brings, the vehicle in the air."""
         return self._schedule.wants_flight
 
+    @property
+    def stopping(self) -> bool:
+        """Whether an emergency stop is under way: it is repeated, and nothing else is sent."""
+        return self._schedule.stopping
+
     def flown_by_person(self) -> None:
         """Require a person's presence from now on; see :meth:`present_until`.
 
@@ -164,9 +176,11 @@ class CommandSender:
             now: Raise if it can't be sent now. A landing is then kept for when it can, anything else is dropped.
 
         Returns:
-            False if it can't be sent now, because the link is down or the authority is still awaited.
+            False if it can't be sent now, because the link is down or the authority is still awaited, or because an
+            emergency stop of this application has not shown yet.
 
         Raises:
+            RefusedError: If such a stop keeps back what is to be done once, or what is to be sent ``now``.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
                 with ``now`` also while the authority is still awaited.
             LinkError: With ``now`` while the link is down.
@@ -184,6 +198,11 @@ class CommandSender:
                 raise self._not_ours(action)
             if stop and self._role is Role.OBSERVER:
                 raise self._not_ours(action)
+            if not self._schedule.may_ask(action):
+                if now or not isinstance(action, _STREAMED):
+                    text = f"{action.name} was not sent: the emergency stop of this application has not shown yet"
+                    raise RefusedError(text, code=Refusal.WRONG_STATE)
+                return False
             self._schedule.ask(action, now_ns)
             if not may_send or not self._connection.connected:
                 if now:
@@ -329,6 +348,7 @@ class CommandSender:
             When to call again at the latest [ns].
         """
         last_request, stalled, due_ns = None, False, now_ns + _LATER_NS
+        unshown = False
         with self._lock:
             authority, present = self._authority, self.is_present(now_ns)
             asks = self._ask_now or (authority.status.state == "none" and not authority.pending)
@@ -336,15 +356,20 @@ class CommandSender:
                 self._ask_now = False
                 last_request = authority.last_request
                 authority.asked(last_request)
-            if (authority.held and present) or isinstance(self._schedule.action, EmergencyStop):
+            stopping = self._schedule.stopping
+            if (authority.held and present) or stopping:
                 if self._schedule.due_ns <= now_ns:
                     stalled = self._decay(now_ns)
+                    unshown = stopping and not self._schedule.stopping
                 due_ns = self._schedule.due_ns
         if last_request is not None:
             self._connection.ask(last_request, self._answered, ANSWER_S)
         if stalled:
             text = "the application made no call for too long: its set-point decayed to hover"
             self._emit(EventKind.FAILSAFE, text, step="hover", reason="stalled")
+        if unshown:
+            text = "the emergency stop is no longer sent: the vehicle has not shown it, and may fly"
+            self._emit(EventKind.VEHICLE_MESSAGE, text, reason="stop_given_up")
         return due_ns
 
     # Inside ----------------------------------------------------------------------------------------------------
