@@ -14,7 +14,7 @@ import skyloop.client
 from skyloop import aio
 from skyloop.client.drone import open_drone
 from skyloop.errors import ClosedError, NoAnswerError, UsageError
-from skyloop.messages import Encoding, EventKind, FlightState, Hover, Land, Takeoff
+from skyloop.messages import Encoding, EventKind, FlightState, Hover, Land, ResetEmergency, Takeoff
 from skyloop.transport.base import results
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
 from tests.client.test_results import Sender
@@ -100,10 +100,9 @@ def test_authority_and_emergency(proxy: ScriptedProxy) -> None:
             await drone.release_authority()
             assert (await drone.request_authority(2)).priority == 2
             assert drone.emergency_stop()
-            assert not drone.reset_emergency(), "the stop has not shown yet"
-            proxy.state = FlightState.EMERGENCY
-            await drone.wait("emergency", WAIT_S)
             assert drone.reset_emergency()
+            proxy.state = FlightState.EMERGENCY
+            await drone.wait(lambda _: ResetEmergency() in proxy.actions(), WAIT_S)
             await drone.land(wait=False)
 
     run(fly())

@@ -16,6 +16,7 @@ from skyloop.drivers.motor_stop import GIVE_UP_NS
 from skyloop.errors import RefusedError, UnsupportedError
 from skyloop.messages import (
     ACTION_NAMES,
+    AnyAction,
     Attitude,
     Capabilities,
     Command,
@@ -100,7 +101,6 @@ def test_what_a_stop_keeps_back_is_told(proxy: ScriptedProxy, drone: Drone) -> N
     assert drone.emergency_stop()
     for stream in (drone.hover, drone.idle, lambda: drone.velocity(forward=0.1), lambda: drone.attitude(roll=0.1)):
         assert stream() is False
-    assert drone.reset_emergency() is False
     for once in (drone.takeoff, drone.land, lambda: drone.go_to(x=0.0, y=0.0, z=1.0), lambda: drone.land(wait=False)):
         with pytest.raises(RefusedError, match="emergency stop of this application has not shown") as error:
             once()
@@ -109,7 +109,8 @@ def test_what_a_stop_keeps_back_is_told(proxy: ScriptedProxy, drone: Drone) -> N
     assert set(proxy.actions()) <= {EmergencyStop(), Idle()}
     proxy.state = FlightState.EMERGENCY
     drone.wait("emergency", WAIT_S)
-    proxy.until(lambda: drone.reset_emergency())
+    proxy.until(lambda: not drone._core.commands.stopping)
+    assert drone.hover()
 
 
 def test_leaving_waits_for_the_stop_to_show() -> None:
@@ -156,14 +157,27 @@ def test_nothing_may_be_asked_for_until_it_shows_and_then_everything() -> None:
     clock, schedule = ManualClock(), CommandSchedule()
     schedule.ask(EmergencyStop(), clock())
     assert schedule.next(clock()) == EmergencyStop()
-    others = [Idle(), Hover(), Land(), Takeoff(), STICKS, Attitude(), ResetEmergency()]
+    others = [Idle(), Hover(), Land(), Takeoff(), STICKS, Attitude()]
     assert not any(schedule.may_ask(action) for action in others)
     assert schedule.may_ask(EmergencyStop())
-    schedule.observe(feedback(FlightState.EMERGENCY), clock())
-    assert [action for action in others if schedule.may_ask(action)] == [ResetEmergency()], "it may be from before"
     clock.advance(1.0)
     schedule.observe(feedback(FlightState.EMERGENCY), clock())
     assert all(schedule.may_ask(action) for action in others)
+
+
+@pytest.mark.parametrize(("after_s", "then"), [(1.0, ResetEmergency()), (2.5, Idle())])
+def test_a_reset_is_sent_once_the_stop_has_shown_if_that_is_soon(after_s: float, then: AnyAction) -> None:
+    clock, schedule = ManualClock(), CommandSchedule()
+    schedule.ask(EmergencyStop(), clock())
+    assert schedule.next(clock()) == EmergencyStop()
+    schedule.ask(ResetEmergency(), clock())
+    assert schedule.stopping
+    clock.advance(after_s)
+    schedule.observe(feedback(FlightState.FLYING), clock())
+    assert schedule.next(clock()) == EmergencyStop()
+    schedule.observe(feedback(FlightState.EMERGENCY), clock())
+    clock.advance(0.05)
+    assert schedule.next(clock()) == then
 
 
 def test_it_is_given_up_when_the_driver_gives_it_up() -> None:

@@ -102,10 +102,14 @@ class CommandSchedule:
         self._sent_intent = 0
         self._due_ns = 0
         self._failsafe = Failsafe.NONE
-        self._in_emergency = False
+        self._reset_asked_ns: int | None = None  # while a stop was under way
 
     def ask(self, action: AnyAction, now_ns: int) -> None:
-        """Make ``action`` the set-point of the application."""
+        """Make ``action`` the set-point of the application. Ask :meth:`may_ask` before."""
+        resets = isinstance(action, ResetEmergency)
+        self._reset_asked_ns = now_ns if resets and self.stopping else None
+        if self._reset_asked_ns is not None:
+            return
         stops = type(action) is Hover and type(self.action) is not Hover
         self.action = self.asked = action
         self.intent += 1
@@ -124,13 +128,11 @@ class CommandSchedule:
         """Return whether the application may command this now.
 
         An emergency stop is repeated until the vehicle shows it, or for 10 s: nothing else of this application is sent
-        meanwhile, or one lost packet would end it while sticks are held. ``Idle`` withdraws one that was never sent, and
-        what is in an emergency may be reset.
+        meanwhile, or one lost packet would end it while sticks are held. ``Idle`` withdraws one that was never sent. A
+        reset is sent once the stop has shown, if that is soon.
         """
-        if not self.stopping or isinstance(action, EmergencyStop):
+        if not self.stopping or isinstance(action, EmergencyStop | ResetEmergency):
             return True
-        if isinstance(action, ResetEmergency):
-            return self._in_emergency
         return isinstance(action, Idle) and not self._is_sent
 
     @property
@@ -185,7 +187,6 @@ class CommandSchedule:
 
     def observe(self, feedback: Feedback, now_ns: int) -> None:
         """Update from the vehicle's state: end an action that is done, or a set-point that a failsafe overruled."""
-        self._in_emergency = feedback.state is FlightState.EMERGENCY
         kind = type(self.action)
         done_in = _DONE_IN.get(kind)
         if done_in is None:
@@ -193,7 +194,9 @@ class CommandSchedule:
         else:
             over = feedback.state in done_in and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
         if over:
-            self.action = _IDLE
+            self.action, reset_ns = _IDLE, self._reset_asked_ns
+            if reset_ns is not None and now_ns - reset_ns <= _AT_MOST_NS[ResetEmergency]:
+                self.ask(ResetEmergency(), now_ns)
         if feedback.failsafe is not self._failsafe:
             self._failsafe = feedback.failsafe
             if feedback.failsafe is not Failsafe.NONE:

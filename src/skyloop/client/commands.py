@@ -35,7 +35,6 @@ from skyloop.messages import (
     Refused,
     ReleaseAuthority,
     RequestAuthority,
-    ResetEmergency,
     ReturnToStart,
     Role,
     Velocity,
@@ -52,7 +51,7 @@ OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 #: What a program sends again and again: that one of them is not sent is no error.
-_STREAMED: Final = (Idle, Hover, Velocity, Attitude, ResetEmergency)
+_STREAMED: Final = (Idle, Hover, Velocity, Attitude)
 
 
 class CommandSender:

@@ -480,7 +480,10 @@ class Drone:
         return self._core.command(EmergencyStop())
 
     def reset_emergency(self) -> bool:
-        """Leave the emergency state, on the ground."""
+        """Leave the emergency state, on the ground.
+
+        One that is asked for while a stop of this application has not shown is sent once it has, within 2 s.
+        """
         return self._core.command(ResetEmergency())
 
     def send_external_pose(
