@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -99,9 +99,14 @@ def test_a_lost_packet_does_not_end_a_stop_while_sticks_are_held() -> None:
 def test_what_a_stop_keeps_back_is_told(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.state = FlightState.FLYING
     assert drone.emergency_stop()
-    for stream in (drone.hover, drone.idle, lambda: drone.velocity(forward=0.1), lambda: drone.attitude(roll=0.1)):
-        assert stream() is False
-    for once in (drone.takeoff, drone.land, lambda: drone.go_to(x=0.0, y=0.0, z=1.0), lambda: drone.land(wait=False)):
+    assert [drone.hover(), drone.idle(), drone.velocity(forward=0.1), drone.attitude(roll=0.1)] == [False] * 4
+    calls: list[Callable[[], None]] = [
+        drone.takeoff,
+        drone.land,
+        lambda: drone.go_to(x=0.0, y=0.0, z=1.0),
+        lambda: drone.land(wait=False),
+    ]
+    for once in calls:
         with pytest.raises(RefusedError, match="emergency stop of this application has not shown") as error:
             once()
         assert error.value.code == "wrong_state"
@@ -157,7 +162,7 @@ def test_nothing_may_be_asked_for_until_it_shows_and_then_everything() -> None:
     clock, schedule = ManualClock(), CommandSchedule()
     schedule.ask(EmergencyStop(), clock())
     assert schedule.next(clock()) == EmergencyStop()
-    others = [Idle(), Hover(), Land(), Takeoff(), STICKS, Attitude()]
+    others: list[AnyAction] = [Idle(), Hover(), Land(), Takeoff(), STICKS, Attitude()]
     assert not any(schedule.may_ask(action) for action in others)
     assert schedule.may_ask(EmergencyStop())
     clock.advance(1.0)

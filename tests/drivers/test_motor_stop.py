@@ -12,7 +12,6 @@ from skyloop.clock import nanoseconds
 from skyloop.drivers.motor_stop import GIVE_UP_NS, PACE_NS, SETTLE_NS, MotorStop
 from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.errors import DriverError
-from skyloop.messages import FlightState
 
 TICK_NS = nanoseconds(0.02)
 BEGUN_NS = nanoseconds(100.0)
@@ -66,11 +65,14 @@ def test_no_reset_before_it_is_shown() -> None:
     press = Press()
     for shown in (None, False):
         press.run(TICK_NS, shown)
+        assert not press.stop.shown
         with pytest.raises(DriverError, match="has not shown"):
             press.stop.reset()
         assert press.stop.active
     press.run(TICK_NS, shown=True)
+    assert press.stop.shown
     press.stop.reset()
+    assert not press.stop.shown
     press.stop.reset()  # nothing to reset is no error
 
 
@@ -96,16 +98,6 @@ def test_a_further_press_begins_the_time_anew_and_keeps_the_pace() -> None:
     assert {after - before for before, after in pairwise(press.sent)} == {PACE_NS}
     press.run(GIVE_UP_NS + TICK_NS)
     assert not press.stop.active
-
-
-def test_only_what_does_not_fly_is_told_as_an_emergency() -> None:
-    press, states = Press(), list(FlightState)
-    known = FlightState.LANDED, FlightState.EMERGENCY
-    assert [press.stop.told(state) is FlightState.EMERGENCY for state in states] == [state in known for state in states]
-    press.run(TICK_NS, shown=True)
-    assert {press.stop.told(state) for state in states} == {FlightState.EMERGENCY}
-    press.stop.reset()
-    assert [press.stop.told(state) for state in states] == states
 
 
 def test_what_was_seen_about_the_time_of_the_press_may_be_from_before() -> None:

@@ -11,7 +11,7 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DriverError
-from skyloop.messages import FlightState, Severity
+from skyloop.messages import Severity
 
 PACE_NS: Final = nanoseconds(0.1)  #: between two repeats
 GIVE_UP_NS: Final = nanoseconds(10.0)  #: a stop that is not shown so long after the last press is over
@@ -43,12 +43,8 @@ class MotorStop:
 
     @property
     def shown(self) -> bool:
-        """Whether it is active, and the vehicle showed its motors off when last heard."""
+        """Whether it is active, and the vehicle showed its motors off when last heard: report ``EMERGENCY``."""
         return self.active and self._shown
-
-    def told(self, state: FlightState) -> FlightState:
-        """Return the flight state to report of a vehicle that is in ``state``: what still flies is no emergency."""
-        return FlightState.EMERGENCY if self.shown or (self.active and state is FlightState.LANDED) else state
 
     def press(self, now_ns: int) -> None:
         """Stop the motors. A further press begins the time anew."""

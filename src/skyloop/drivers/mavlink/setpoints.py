@@ -266,9 +266,8 @@ class SetpointController:
         """Return the flight state, as far as it is known."""
         if vehicle is None:
             return FlightState.UNKNOWN
-        return self.stop.told(self._state(vehicle))
-
-    def _state(self, vehicle: VehicleState) -> FlightState:
+        if self.stop.shown:
+            return FlightState.EMERGENCY
         if self._arms_until_ns is not None and not vehicle.airborne:
             return FlightState.LANDING  # it is armed, or may be any moment
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None and self._takeoff.started:

@@ -139,10 +139,11 @@ class SetpointController:
 
     def flight_state(self) -> FlightState:
         """Return the flight state for feedback."""
+        if self.stop.shown:
+            return FlightState.EMERGENCY
         if self.report.armed is None:
             return FlightState.UNKNOWN
-        flies = self.phase is Phase.FLYING and self.report.armed
-        return self.stop.told(FlightState.FLYING if flies else FlightState.LANDED)
+        return FlightState.FLYING if self.phase is Phase.FLYING and self.report.armed else FlightState.LANDED
 
     @property
     def full_tilt(self) -> float:

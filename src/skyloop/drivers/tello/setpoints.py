@@ -129,8 +129,11 @@ class SetpointController:
 
     def flight_state(self) -> FlightState:
         """Return the flight state for feedback."""
-        steered = self.watch.in_air and self._stick != LEVEL
-        return self.stop.told(FlightState.FLYING if steered else self.watch.phase)
+        if self.stop.shown:
+            return FlightState.EMERGENCY
+        if self.watch.in_air and self._stick != LEVEL:
+            return FlightState.FLYING
+        return self.watch.phase
 
     # What is decided -------------------------------------------------------------------------------------------
 
