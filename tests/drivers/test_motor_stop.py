@@ -100,6 +100,19 @@ def test_a_further_press_begins_the_time_anew_and_keeps_the_pace() -> None:
     assert not press.stop.active
 
 
+def test_the_repeats_of_one_press_neither_make_it_longer_nor_put_off_what_shows_it() -> None:
+    """The library repeats it 32 times a second until it shows."""
+    press = Press()
+    while press.now_ns < BEGUN_NS + nanoseconds(8.0):
+        press.run(nanoseconds(0.04))
+        press.stop.press(press.now_ns)
+    assert press.stop.settled(BEGUN_NS + SETTLE_NS)
+    press.run(nanoseconds(2.1))
+    assert not press.stop.active
+    press.stop.press(press.now_ns)
+    assert press.stop.step(None, press.now_ns), "one that was given up can be pressed again at once"
+
+
 def test_what_was_seen_about_the_time_of_the_press_may_be_from_before() -> None:
     stop = Press().stop
     assert [stop.settled(BEGUN_NS + span_ns) for span_ns in (-1, 0, SETTLE_NS - 1, SETTLE_NS)] == [False] * 3 + [True]

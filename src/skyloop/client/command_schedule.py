@@ -50,7 +50,7 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(20.0),
     Land: nanoseconds(60.0),
-    EmergencyStop: nanoseconds(10.0),  # the driver gives it up then, too
+    EmergencyStop: nanoseconds(8.0),  # the driver goes on for 10 s: a late repeat must not press it again
     ResetEmergency: nanoseconds(2.0),
 }
 _UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that could not be sent for so long is not sent later
@@ -127,7 +127,7 @@ class CommandSchedule:
     def may_ask(self, action: AnyAction) -> bool:
         """Return whether the application may command this now.
 
-        An emergency stop is repeated until the vehicle shows it, or for 10 s: nothing else of this application is sent
+        An emergency stop is repeated until the vehicle shows it, or for 8 s: nothing else of this application is sent
         meanwhile, or one lost packet would end it while sticks are held. ``Idle`` withdraws one that was never sent. A
         reset is sent once the stop has shown, if that is soon.
         """

@@ -464,7 +464,7 @@ class Drone:
         """Cut the motors at once: the vehicle falls.
 
         Needs no authority, only ``access="pilot"``. It is sent at once and repeated until the vehicle shows it
-        (``FlightState.EMERGENCY``), or for 10 s: then it is given up, with an event (``vehicle_message``, reason
+        (``FlightState.EMERGENCY``), or for 8 s: then it is given up, with an event (``vehicle_message``, reason
         ``stop_given_up``). Nothing else of this connection is sent meanwhile: :meth:`velocity`, :meth:`hover` and the
         like return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over
         several connections has to silence the others itself. A stop that could not be sent for 2 s is not sent later.

@@ -14,7 +14,8 @@ from skyloop.errors import DriverError
 from skyloop.messages import Severity
 
 PACE_NS: Final = nanoseconds(0.1)  #: between two repeats
-GIVE_UP_NS: Final = nanoseconds(10.0)  #: a stop that is not shown so long after the last press is over
+GIVE_UP_NS: Final = nanoseconds(10.0)  #: a stop that is not shown so long after the press is over
+AGAIN_NS: Final = nanoseconds(0.3)  #: after such a pause it is pressed again; before, the library repeats a press
 SETTLE_NS: Final = nanoseconds(0.5)  #: what the vehicle reports until then may be from before the stop
 
 
@@ -23,8 +24,8 @@ class MotorStop:
 
     While it is :attr:`active` the driver sends and obeys nothing else. It is sent at once, whether or not the vehicle
     is heard, and again every 0.1 s until the vehicle shows it; until then the vehicle is reported as what it does. A
-    stop that the vehicle has not shown 10 s after the last press is over: it is not sent minutes later, and the vehicle
-    may be landed. Not thread-safe.
+    stop that the vehicle has not shown 10 s after the press is over: it is not sent minutes later, and the vehicle may
+    be landed. Not thread-safe.
 
     Args:
         give_up: Called with the event to publish when the stop ends without a reset.
@@ -32,14 +33,16 @@ class MotorStop:
 
     def __init__(self, give_up: Callable[[VehicleEvent], None]) -> None:
         self._give_up = give_up
-        self._pressed_ns: int | None = None
+        self._begun_ns: int | None = None  # the first press
+        self._pressed_ns = 0  # the newest that was no repeat
+        self._heard_ns = 0  # the newest, repeats included
         self._sent_ns: int | None = None
         self._shown = self._was_shown = False
 
     @property
     def active(self) -> bool:
         """Whether it was pressed, and neither reset nor given up since."""
-        return self._pressed_ns is not None
+        return self._begun_ns is not None
 
     @property
     def shown(self) -> bool:
@@ -47,14 +50,17 @@ class MotorStop:
         return self.active and self._shown
 
     def press(self, now_ns: int) -> None:
-        """Stop the motors. A further press begins the time anew."""
-        if self._pressed_ns is None:
-            self._sent_ns, self._shown, self._was_shown = None, False, False
-        self._pressed_ns = now_ns
+        """Stop the motors, now or on. A further press begins the time anew."""
+        if self._begun_ns is None:
+            self._begun_ns, self._sent_ns, self._shown, self._was_shown = now_ns, None, False, False
+            self._pressed_ns = now_ns
+        elif now_ns - self._heard_ns >= AGAIN_NS:
+            self._pressed_ns = now_ns
+        self._heard_ns = now_ns
 
     def settled(self, seen_ns: int) -> bool:
         """Return whether what was seen at ``seen_ns`` is surely from after the press."""
-        return self._pressed_ns is not None and seen_ns - self._pressed_ns >= SETTLE_NS
+        return self._begun_ns is not None and seen_ns - self._begun_ns >= SETTLE_NS
 
     def step(self, shown: bool | None, now_ns: int) -> bool:
         """Go on with an active stop; return whether to send it now. Call it at each tick, heard or not.
@@ -63,7 +69,7 @@ class MotorStop:
             shown: Whether the vehicle shows that its motors are off; None: nothing new is known.
             now_ns: The present time.
         """
-        if self._pressed_ns is None:
+        if self._begun_ns is None:
             return False
         if shown is not None:
             self._shown = shown
@@ -86,10 +92,10 @@ class MotorStop:
         """
         if self.active and not self.shown:
             raise DriverError("the motors still run, or are still armed: the stop has not shown yet")
-        self._pressed_ns = None
+        self._begun_ns = None
 
     def _end_unshown(self) -> None:
-        self._pressed_ns = None
+        self._begun_ns = None
         if self._was_shown:
             text = "the emergency stop is over without a reset: the vehicle's motors were started again, not from here"
         else:

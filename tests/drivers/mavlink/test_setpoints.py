@@ -742,6 +742,18 @@ def test_a_stop_that_the_vehicle_never_shows_is_given_up_and_it_can_be_landed(au
 
 
 @AUTOPILOTS
+def test_a_stop_shows_while_it_is_repeated(autopilot: int) -> None:
+    """As the library does, until it shows: the repeats must not put that off."""
+    bench = steering(autopilot)
+    bench.apply(EmergencyStop())
+    bench.vehicle.armed, bench.vehicle.landed = False, Landed.ON_GROUND
+    for _ in range(40):
+        bench.go_on(0.04)
+        bench.apply(EmergencyStop(), new=False)
+    assert bench.state() is FlightState.EMERGENCY
+
+
+@AUTOPILOTS
 def test_a_stopped_vehicle_that_others_arm_again_is_told_as_it_flies(autopilot: int) -> None:
     bench = steering(autopilot)
     bench.apply(EmergencyStop())

@@ -212,6 +212,19 @@ def test_a_drone_whose_stop_was_given_up_can_be_landed_and_the_reset_is_allowed(
     rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
 
 
+def test_a_stop_shows_while_it_is_repeated() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+
+    def repeated() -> bool:
+        rig.do(EmergencyStop())
+        return rig.state is FlightState.EMERGENCY
+
+    rig.until(repeated, 4.0)
+
+
 def test_an_answer_alone_does_not_end_a_stop() -> None:
     """An "ok" does not say what it answers: it may be that of a landing before."""
     rig = Rig()
