@@ -97,7 +97,7 @@ class MotorStop:
     def _end_unshown(self) -> None:
         self._begun_ns = None
         if self._was_shown:
-            text = "the emergency stop is over without a reset: the vehicle's motors were started again, not from here"
+            text = "the emergency stop is over: the vehicle was reset, or its motors were started again, not from here"
         else:
             text = (
                 f"the emergency stop is given up: the vehicle has not shown it for {seconds(GIVE_UP_NS):g} s, and may "

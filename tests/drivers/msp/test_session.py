@@ -315,6 +315,18 @@ def test_a_stop_is_sent_at_once_though_the_flight_controller_is_behind() -> None
     assert not bench.board.armed
 
 
+def test_a_stop_of_what_is_just_being_found_in_flight_is_not_undone_by_taking_it_over() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.reconnect()
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.until(lambda: not bench.board.armed, 3.0)
+    bench.run(1.0)
+    assert not bench.board.armed
+    assert bench.session.setpoints.phase is Phase.STANDING
+    assert bench.feedback.state is FlightState.EMERGENCY
+
+
 def test_a_stop_pressed_in_a_long_loss_does_not_disarm_what_flies_when_the_link_is_back() -> None:
     """Its failsafe has it in the air for minutes: the stop was given up long before, and it is flown on."""
     bench = Bench(BoardSettings(failsafe=FailsafeConfig(1.5, 60.0, 1322, 10.0, 0)))

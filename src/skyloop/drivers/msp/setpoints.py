@@ -271,7 +271,7 @@ class SetpointController:
             throttle: That it was sent last, 0 to 1.
             now_ns: The present time.
         """
-        if throttle > IDLE:
+        if throttle > IDLE and not self.stop.active:
             self.hover = self.throttle = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
             self._enter(Phase.FLYING, now_ns)
 
