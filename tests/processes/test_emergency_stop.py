@@ -26,7 +26,7 @@ def test_a_stop_with_sticks_held_is_shown_reset_and_flown_again(
     proxy(address_of(kind, start))
     ended = threading.Event()
     with skyloop.connect("alpha") as drone:
-        eventually(lambda: (drone.feedback().native or {}).get("mavlink.ready", True), "it may be armed", 30.0)
+        eventually(lambda: bool((drone.feedback().native or {}).get("mavlink.ready", True)), "it may be armed", 30.0)
         drone.takeoff()
 
         def hold() -> None:
