@@ -156,7 +156,7 @@ class CommandSchedule:
         if self._decays(now_ns):
             self.action = _HOVER
         elif self._expired(now_ns):
-            self.action = _IDLE
+            self.action, self.owed = _IDLE, None
         if not self._is_sent:
             self._sent_intent, self._new_sent_ns = self.intent, now_ns
             self._due_ns = now_ns + self._first_ns
@@ -170,8 +170,7 @@ class CommandSchedule:
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
         """Note that there was no room for what :meth:`next` returned: set-points follow anyway, a landing may not."""
-        stops = self.owed is not None and type(self.owed.action) is EmergencyStop
-        if not _is_periodic(action) and not stops:
+        if not _is_periodic(action):
             self.owed = Unsent(action, self.intent, now_ns)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
@@ -179,7 +178,7 @@ class CommandSchedule:
         owed = self.owed
         if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > self._keep_ns:
             return None
-        return owed if _is_periodic(action) or type(owed.action) is EmergencyStop else None
+        return owed if _is_periodic(action) else None
 
     def decayed(self, before: AnyAction) -> bool:
         """Return whether the set-point ``before`` has decayed to hover because the application made no call."""
@@ -206,8 +205,7 @@ class CommandSchedule:
         """Drop the set-point, after a lost authority or a failsafe. An emergency stop stays."""
         if not isinstance(self.action, EmergencyStop):
             self.action = _IDLE
-        if self.owed is not None and type(self.owed.action) is not EmergencyStop:
-            self.owed = None
+        self.owed = None
 
     def resume(self, now_ns: int) -> None:
         """Start to send (again): drop a set-point that is too old."""
