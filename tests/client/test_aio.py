@@ -16,7 +16,7 @@ from skyloop.aio.bridge import in_thread
 from skyloop.client.drone import open_drone
 from skyloop.client.swarm import in_parallel
 from skyloop.errors import ClosedError, NoAnswerError, UsageError
-from skyloop.messages import AnyAction, Encoding, EventKind, FlightState, Hover, Idle, Land, Takeoff
+from skyloop.messages import AnyAction, Encoding, EventKind, FlightState, Hover, Idle, Land, ResetEmergency, Takeoff
 from skyloop.transport.base import results
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
 from tests.client.test_results import Sender
@@ -103,6 +103,8 @@ def test_authority_and_emergency(proxy: ScriptedProxy) -> None:
             assert (await drone.request_authority(2)).priority == 2
             assert drone.emergency_stop()
             assert drone.reset_emergency()
+            proxy.state = FlightState.EMERGENCY
+            await drone.wait(lambda _: ResetEmergency() in proxy.actions(), WAIT_S)
             await drone.land(wait=False)
 
     run(fly())

@@ -35,6 +35,7 @@ from skyloop.errors import (
 from skyloop.messages import (
     AnyAction,
     Capabilities,
+    EmergencyStop,
     EventKind,
     Feedback,
     FlightState,
@@ -56,6 +57,7 @@ Access = Literal["pilot", "observe"]
 OnExit = Literal["land", "hover"]
 LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
+STOP_S: Final = 2.0  #: how long closing waits for an emergency stop to show
 DOWN: Final = frozenset({FlightState.LANDED})
 _ENDED: Final = EndedSessions()  #: of all drones of this process
 LANDING_S: Final = 20.0  #: how long a landing is waited for
@@ -218,6 +220,7 @@ class DroneCore:
         """
         if self.closed:
             return
+        self._finish_stop()
         self.closed = True
         try:
             if self.connection.connected:
@@ -253,6 +256,7 @@ class DroneCore:
         """
         problem = None
         try:
+            self._finish_stop()
             if not self.closed and self._flies():
                 if self._on_exit == "land":
                     self.complete(Land(), lambda feedback: feedback.state in DOWN, True, LANDING_S)
@@ -295,6 +299,11 @@ class DroneCore:
             words += [f"the vehicle's link is {link.vehicle.value}", link.reason, link.remedy]
         return NoAnswerError(": ".join(filter(None, words)))
 
+    def _finish_stop(self) -> None:
+        """Wait, for 2 s at most, until an emergency stop has shown: it would end with the connection."""
+        if self.connection.connected and not self.connection.receiving:
+            self.state.notifier.wait_for(lambda: not self.commands.stopping, STOP_S)
+
     def _known(self) -> bool:
         """Whether feedback has come and the link's state was judged."""
         return self.state.newest is not None and self.state.status.application is not LinkState.CONNECTING
@@ -336,6 +345,8 @@ class DroneCore:
         if welcome is not None and not welcome.capabilities.actions:
             why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
             raise UnsupportedError(f"{action.name} is not possible: {why_not}")
+        if type(action) is EmergencyStop and welcome is not None and action.name not in welcome.capabilities.actions:
+            raise UnsupportedError("emergency_stop is not possible: the vehicle cannot stop its motors")
         if welcome is not None and type(action) in LATER_ACTIONS:
             _check_knows(welcome.capabilities, action)
 

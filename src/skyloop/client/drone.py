@@ -469,17 +469,27 @@ class Drone:
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
 
-        Needs no authority, only ``access="pilot"``.
+        Needs no authority, only ``access="pilot"``. It is sent at once and repeated until the vehicle shows it
+        (``FlightState.EMERGENCY``), or for 8 s: then it is given up, with an event (``vehicle_message``, reason
+        ``stop_given_up``). Nothing else of this connection is sent meanwhile: :meth:`velocity`, :meth:`hover` and the
+        like return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over
+        several connections has to silence the others itself. A stop that could not be sent for 2 s is not sent later.
+
+        Returns:
+            False if it can't be sent now, because the link is down.
 
         Raises:
             AuthorityError: If this application only observes.
-            UnsupportedError: If the vehicle takes no commands.
+            UnsupportedError: If the vehicle can't stop its motors, or takes no commands.
             ClosedError: If the drone was closed.
         """
         return self._core.command(EmergencyStop())
 
     def reset_emergency(self) -> bool:
-        """Leave the emergency state, on the ground."""
+        """Leave the emergency state, on the ground.
+
+        One that is asked for while a stop of this application has not shown is sent once it has, within 2 s.
+        """
         return self._core.command(ResetEmergency())
 
     def send_external_pose(

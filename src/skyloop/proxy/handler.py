@@ -394,6 +394,7 @@ class CommandHandler:
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
+        in_time = command.seq > session.intents.seq and now_ns - command.sent_ns <= self.checks.max_age_ns
         session.intents.stop(command)
         if session.role is not Role.PILOT:
             return self._refuse_role(session, command), now_ns
@@ -405,6 +406,8 @@ class CommandHandler:
         except Exception as error:  # noqa: BLE001  it is reported, and the repeats try again
             why = self._vehicle.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
+        if in_time and self.holds(session, command.lease):
+            self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent meanwhile
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))

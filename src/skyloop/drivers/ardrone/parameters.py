@@ -430,7 +430,7 @@ class Commands:
         condition = self._condition()
         if on_ground and condition.flying:
             raise _refused(f"{message[0]} is for a drone that stands level on the ground: land first")
-        if not on_ground and (not condition.flying or condition.emergency):
+        if not on_ground and (not condition.flying or condition.emergency or self._setpoints.stop.active):
             raise _refused(f"{message[0]} is for a drone in the air: take off first")
         self._send(message, times)
 
