@@ -28,7 +28,6 @@ def test_nothing_says_that_it_has_landed_until_it_stands() -> None:
         states: list[str] = []
         drone.on_feedback(lambda feedback: states.append(feedback.state.value))
         drone.takeoff()
-        driver.set_parameter("sim.link", False)
 
         def land() -> None:
             with suppress(SkyloopError):
@@ -36,6 +35,8 @@ def test_nothing_says_that_it_has_landed_until_it_stands() -> None:
 
         landing = threading.Thread(target=land)
         landing.start()
+        drone.wait("landing")
+        driver.set_parameter("sim.link", False)
         deadline = time.monotonic() + OUT_S
         while time.monotonic() < deadline:
             states.clear()

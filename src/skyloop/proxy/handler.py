@@ -256,7 +256,7 @@ class CommandHandler:
         """The proxy ends now: leave what flies hovering, as far as the vehicle can by itself."""
         with self._lock:
             self.ladder.order_landing()
-            self._observe_flight(now_ns)
+            self._observe_ownership(now_ns)
             self._call_off(now_ns)
             executor = self._executor
             if self.flight.ours and executor.airborne and executor.state is not FlightState.LANDING:
@@ -295,7 +295,7 @@ class CommandHandler:
         """Return what was applied, and when: the time of receipt for a command that was refused."""
         # Each call of a function costs microseconds on a machine that was idle, and a command comes when it was: an
         # ordinary command is received, decided and executed here; what went wrong is put into words elsewhere.
-        vehicle, checks, flight = self._vehicle, self.checks, self.flight
+        vehicle, checks, ownership = self._vehicle, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
         refusal = checks.receive(command, session.sequence, session.app_id, now_ns)
@@ -308,8 +308,8 @@ class CommandHandler:
         if kind is Idle:
             return _NOTHING, self._count_applied(command)
         state = self._executor.state
-        if not flight.ours:
-            self._observe_flight(now_ns)
+        if not ownership.ours:
+            self._observe_ownership(now_ns)
         decision = checks.decide(command, session.sequence, state, vehicle.link_state, vehicle.feedback_now, now_ns)
         if decision.refusal is not None:
             if decision.action is not None:
@@ -324,13 +324,13 @@ class CommandHandler:
             except RefusedError as error:
                 return self._refuse(session, command, Refusal.WRONG_STATE, str(error)), now_ns
             except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
-                if kind is Takeoff and flight.ours:
-                    flight.claim(now_ns)  # it may be trying
+                if kind is Takeoff and ownership.ours:
+                    ownership.claim(now_ns)  # it may be trying
                 why = vehicle.driver_refused("apply", error)
                 return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
             if decision.takes_off:
-                flight.claim(now_ns)
-            if not flight.ours or kind is Takeoff:
+                ownership.claim(now_ns)
+            if not ownership.ours or kind is Takeoff:
                 self._take_vehicle(session, applied, decision.new)
         if kind is not ReturnToStart and decision.action is not None:
             checks.back = None
@@ -499,7 +499,7 @@ class CommandHandler:
             self._events.publish_draft(taken_event(session.name, applied.name, others))
         self.on_ownership(True)
 
-    def _observe_flight(self, now_ns: int) -> None:
+    def _observe_ownership(self, now_ns: int) -> None:
         """Observe whose flight it is by now, and act on a change."""
         executor = self._executor
         changed = executor.observe(now_ns)
@@ -518,7 +518,7 @@ class CommandHandler:
     # Failsafe ----------------------------------------------------------------------------------------------------
 
     def _update_failsafe(self, now_ns: int) -> None:
-        self._observe_flight(now_ns)
+        self._observe_ownership(now_ns)
         feedback = self._vehicle.feedback_now
         state = self._executor.state
         inputs = FailsafeInputs(

@@ -140,7 +140,7 @@ class CommandChecks:
     Args:
         authority: who holds the lease; :meth:`receive` notes when its holder's last command came.
         ladder: the failsafe ladder.
-        flight: whose flight it is.
+        ownership: whose the flight is.
         supported: the actions that the vehicle or the software autopilot can do.
         why_not: why others are not supported, for people; may be empty.
     """
@@ -149,7 +149,7 @@ class CommandChecks:
         self,
         authority: Authority,
         ladder: FailsafeLadder,
-        flight: Flight,
+        ownership: Flight,
         *,
         supported: frozenset[type[Action]],
         why_not: str,
@@ -163,7 +163,7 @@ class CommandChecks:
         self.max_age_ns = 0
         self._authority = authority
         self._ladder = ladder
-        self._flight = flight
+        self._ownership = ownership
         self._supported = supported
         self._why_not = why_not
         self._ceiling = Ceiling()
@@ -288,8 +288,8 @@ class CommandChecks:
         if kind not in self._supported:
             why = self._why_not or "neither the vehicle nor the software autopilot can do it"
             return Refusal.UNSUPPORTED, f"{command.action.name} is not possible: {why}"
-        if self._flight.whose is Whose.OTHERS:
-            others = self._flight.others
+        if self._ownership.whose is Whose.OTHERS:
+            others = self._ownership.others
             if kind in SET_POINTS:
                 return Refusal.WRONG_STATE, f"{others}: hover, take off or land first to take it over"
             if not new and kind in _TAKING:
