@@ -94,7 +94,7 @@ class CommandChecks:
     Args:
         authority: who holds the lease; :meth:`receive` notes when its holder's last command came.
         ladder: the failsafe ladder.
-        flight: whose flight it is.
+        flight: whose it is.
         supported: the actions that the vehicle or the software autopilot can do.
         why_not: why others are not supported, for people; may be empty.
     """
