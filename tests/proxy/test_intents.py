@@ -493,3 +493,24 @@ def test_a_driver_that_refuses_at_once_says_why_to_a_repeat(bench: Bench, monkey
     monkeypatch.undo()
     pilot.command(Takeoff(), repeat=True)
     assert bench.driver.told == []
+
+
+def test_a_software_take_off_that_the_vehicle_refuses_is_over() -> None:
+    """One that was disarmed before it rose: the software autopilot armed it again, 50 times a second."""
+    with Bench(actions={"attitude"}) as bench:
+        bench.driver.answers = False
+        bench.driver.report(altitude_m=0.0)
+        pilot = bench.pilot()
+        pilot.command(Takeoff())
+        bench.run(0.1, lambda: pilot.command(Takeoff(), repeat=True))
+        assert pilot.last_feedback().state is S.TAKING_OFF
+        bench.driver.refuses = "the flight controller disarmed before it had taken off"
+        bench.run(0.1, lambda: pilot.command(Takeoff(), repeat=True))
+        assert pilot.last_feedback().state is S.LANDED
+        bench.driver.refuses = ""
+        bench.driver.told.clear()
+        bench.run(2.0, lambda: pilot.command(Takeoff(), repeat=True))
+        assert not [told for told in bench.driver.told if isinstance(told, Attitude) and told.climb > 0]
+        outcome = pilot.last_feedback().outcome
+        assert outcome is not None
+        assert outcome.fate is Fate.LANDED
