@@ -426,6 +426,15 @@ def test_a_landing_that_a_driver_fails_at_once_is_tried_again(bench: Bench) -> N
     assert bench.driver.told == [Land()]
 
 
+def test_a_reset_that_comes_before_the_emergency_is_known_is_done_when_it_is(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(ResetEmergency())
+    assert pilot.refusals() == [Refusal.WRONG_STATE]
+    bench.driver.report(state=S.EMERGENCY)
+    pilot.command(ResetEmergency(), repeat=True)
+    assert bench.driver.told == [ResetEmergency()]
+
+
 def test_a_landing_wanted_while_others_land_does_not_take_the_vehicle_by_a_repeat(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.left = "LAND"

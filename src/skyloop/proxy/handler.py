@@ -60,7 +60,7 @@ from skyloop.proxy.core.flight_events import (
     refused_event,
     taken_event,
 )
-from skyloop.proxy.core.intents import INSISTENT, TAKEOFF_NS, Intent
+from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
 from skyloop.proxy.core.ownership import Ownership, Whose
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
@@ -72,7 +72,6 @@ from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
-_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: what may be different with the next repeat
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
 
@@ -400,8 +399,7 @@ class CommandHandler:
         self, session: Session, command: Command, intent: Intent, reason: Refusal, why: str, now_ns: int
     ) -> AnyAction:
         """Refuse what the holder asked for, which is over with it: its repeats get the same answer."""
-        if type(command.action) not in INSISTENT or reason not in _PASSING:
-            intent.end(Fate.REFUSED, why, reason)
+        intent.refuse(reason, why)
         self._tell(session, intent)
         if type(command.action) is Takeoff:
             self._withdraw_takeoff(now_ns)

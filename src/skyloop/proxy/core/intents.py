@@ -34,8 +34,7 @@ SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
 _SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: nobody needs to be told that repeats of it do nothing
 _LANDINGS: Final = (Land, ReturnToStart)
-#: Tried again by repeats where the driver fails or the link is lost: nothing is safer.
-INSISTENT: Final = (Hover, Land, ResetEmergency)
+_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: what may be different with the next repeat
 
 
 @dataclass(slots=True)
@@ -65,6 +64,16 @@ class Intent:
                 self.reason = reason or Refusal.NOT_FRESH
                 self.text = text or f"{ENDINGS[fate]}: send a new command"
 
+    def refuse(self, reason: Refusal, why: str) -> None:
+        """End it because it was refused.
+
+        A hover and a landing go on where only the driver failed or the link is lost, as nothing is safer; a reset does
+        in any case, as the emergency may not be known yet.
+        """
+        kind = type(self.action)
+        if not (kind is ResetEmergency or (kind in (Hover, Land) and reason in _PASSING)):
+            self.end(Fate.REFUSED, why, reason)
+
     def observe(self, state: FlightState, now_ns: int) -> None:
         """End or complete it by what the vehicle does."""
         before, self.state = self.state, state
@@ -83,7 +92,7 @@ class Intent:
             if before is not state and kind not in _LANDINGS:
                 self.end(Fate.LANDED)
         elif state is FlightState.EMERGENCY:
-            if before is not state:
+            if before is not state and kind is not ResetEmergency:
                 self.end(Fate.EMERGENCY)
         elif kind is Takeoff and state in _UP and (self.begun or before.airborne):
             self.end(Fate.COMPLETED)
