@@ -522,4 +522,5 @@ def test_a_software_take_off_that_the_vehicle_refuses_is_over() -> None:
         assert not [told for told in bench.driver.told if isinstance(told, Attitude) and told.climb > 0]
         outcome = pilot.last_feedback().outcome
         assert outcome is not None
-        assert outcome.fate is Fate.LANDED
+        assert outcome.fate is Fate.REFUSED
+        assert "disarmed before it had taken off" in outcome.text

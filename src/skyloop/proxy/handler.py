@@ -232,6 +232,10 @@ class CommandHandler:
             steered = self._executor.step(now_ns)
             if steered is not None:
                 self._echo_own(steered, now_ns)
+            why, self._executor.gave_up = self._executor.gave_up, ""
+            if why and session is not None:
+                session.intents.newest.end(Fate.REFUSED, why, Refusal.WRONG_STATE)
+                self._tell(session, session.intents.newest)
 
     def order_landing(self, now_ns: int) -> bool:
         """Land because the proxy is about to end. Returns whether there is anything to land."""
