@@ -354,6 +354,29 @@ def test_a_take_off_that_shows_is_not_broken_off_by_a_lost_lease(bench: Bench) -
     assert bench.driver.told == [Takeoff()]
 
 
+def test_an_order_that_shows_whose_the_flight_is_takes_it_at_once(bench: Bench) -> None:
+    pilot = bench.pilot()
+    bench.driver.report(state=S.FLYING)  # by others, and nothing has looked since
+    pilot.command(Hover())
+    assert bench.driver.told == [Hover()]
+
+
+def test_a_hover_that_withdraws_a_take_off_is_told_to_be_done(bench: Bench) -> None:
+    pilot = pending(bench)
+    pilot.command(Hover())
+    bench.driver.report()
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.intent, outcome.fate) == (pilot.intent, Fate.COMPLETED)
+
+
+def test_after_a_stop_of_the_motors_nothing_else_is_sent(bench: Bench) -> None:
+    pilot = pending(bench)
+    pilot.command(EmergencyStop())
+    repeats(bench, pilot, Takeoff())
+    assert bench.driver.told == [Takeoff(), EmergencyStop()]
+
+
 def test_nothing_is_withdrawn_from_a_vehicle_that_others_took(bench: Bench) -> None:
     pilot = pending(bench)
     bench.driver.left = "STABILIZE"

@@ -285,7 +285,10 @@ class CommandHandler:
         vehicle, checks, ownership = self._vehicle, self.checks, self.ownership
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
+        if not ownership.ours:
+            self._observe_ownership(now_ns)
         intents = session.intents
+        state = self._observe_intent(session, now_ns)  # what ends intents before this one came does not end this one
         refusal = checks.receive(command, intents, session.app_id, now_ns)
         if refusal is not None:
             if session.role is not Role.PILOT:
@@ -293,9 +296,6 @@ class CommandHandler:
             return self._refuse(session, command, refusal, checks.explain(refusal, command, intents, now_ns)), now_ns
         action = command.action
         kind = type(action)
-        if not ownership.ours:
-            self._observe_ownership(now_ns)
-        state = self._observe_intent(session, now_ns)
         intent, new = intents.receive(command, state, now_ns)
         if kind not in _LEAVE_A_TAKEOFF:
             if self._withdraw_takeoff(now_ns):
@@ -309,12 +309,13 @@ class CommandHandler:
             self._tell(session, intents.newest)
             return _NOTHING, self._count_applied(command)
         if intent.over:
+            self._tell(session, intents.newest)
             if intent.reason is None:  # it was done
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
         intent.action = action  # a set-point may have decayed to hover
-        vehicle_now = vehicle.feedback_now
-        decision = checks.decide(action, intent, state, vehicle.link_state, vehicle_now, now_ns, new=new)
+        known = vehicle.feedback_now
+        decision = checks.decide(action, intent, state, vehicle.link_state, known, now_ns, new=new)
         if decision.refusal is not None:
             if decision.action is not None:
                 self._stop_instead(decision.action, now_ns)
@@ -364,6 +365,7 @@ class CommandHandler:
         except Exception as error:  # noqa: BLE001  it is reported, and the repeats try again
             why = self._vehicle.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
+        self._rising = None  # nothing but the stop is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
