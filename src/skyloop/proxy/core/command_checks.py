@@ -84,7 +84,6 @@ class Decision(NamedTuple):
     action: AnyAction | None = None  #: what the vehicle must do; None: nothing new. Of a refused one: instead of it
     refusal: Refusal | None = None
     why: str = ""  #: of the refusal, for a person
-    new: bool = False  #: the application newly asked for it; else the library repeats it
     takes_off: bool = False
     clamps: tuple[Clamp, ...] = ()  #: the limits that shortened it
     enforced: bool | None = None  #: whether the safety box and zones could be; None: there are none, or no set-point
@@ -167,25 +166,25 @@ class CommandChecks:
             self.back = None
         problem = self._problem(action, policy, state, link, new)
         if problem is not None:
-            return Decision(None, *problem, new)
+            return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
         if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND:
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
-            return Decision(None, Refusal.WRONG_STATE, explain_state(action, state), new)
+            return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
         clamps: tuple[Clamp, ...] = ()
         enforced = None
         if type(action) is Position and policy is not StatePolicy.HOVER:
             place = decide_place(action, self.limits, self.space, feedback, now_ns, new=not intent.begun)
             if policy is StatePolicy.HOLD:  # judged all the same: who waits for a take-off learns it now
-                return Decision(None, place.refusal, place.why, new)
+                return Decision(None, place.refusal, place.why)
             if place.action is None:  # what was flown before is not wanted any more either
                 instead = _HOVER_ACTION if Hover in self._supported else None
-                return Decision(instead, place.refusal, place.why, new)  # without a refusal: until it is known again
+                return Decision(instead, place.refusal, place.why)  # without a refusal: until it is known again
             action, clamps = place.action, place.clamps
             enforced = None if self.safety is None else True
         elif policy is StatePolicy.HOLD:
-            return Decision(new=new)
+            return Decision()
         elif policy is StatePolicy.HOVER or kind is Hover:
             action, clamps = self._hover_below_ceiling(state, feedback)
         elif type(action) is ReturnToStart:
@@ -193,7 +192,7 @@ class CommandChecks:
                 self.begin_return(action)
             back = self.step_return(feedback, now_ns)
             if back.action is None:
-                return Decision(_HOVER_ACTION, back.refusal, back.why, new)
+                return Decision(_HOVER_ACTION, back.refusal, back.why)
             action, clamps = back.action, back.clamps
             enforced = None if self.safety is None else True
         elif is_set_point:
@@ -202,7 +201,7 @@ class CommandChecks:
                 action, walls, enforced = self.safety.clamp(action, feedback, now_ns)
                 clamps += walls
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
-        return Decision(action, None, "", new, takes_off, clamps, enforced)
+        return Decision(action, None, "", takes_off, clamps, enforced)
 
     def begin_return(self, action: ReturnToStart) -> None:
         """Begin a flight back to the start, in place of another one."""
