@@ -423,9 +423,9 @@ class CommandHandler:
     def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
         """End, or complete, what a holder asked for by what the vehicle does; return the flight state."""
         state, intent = self._executor.state, session.intents.newest
-        if state is not intent.state:
-            self._observe_ownership(now_ns)  # a landing may be others': then that is what ended it
         if not intent.over:
+            if state is not intent.state:
+                self._observe_ownership(now_ns)  # a landing may be others': then that is what ended it
             intent.observe(state, now_ns)
             if intent.over:
                 self._tell(session, intent)
@@ -436,7 +436,7 @@ class CommandHandler:
             self._rising = None  # it has left the ground
         elif rising is not None and now_ns - rising.asked_ns >= TAKEOFF_NS:
             self._withdraw_takeoff(now_ns)  # a set-point took its place meanwhile
-        return self._executor.state
+        return state if rising is None else self._executor.state
 
     def _withdraw_takeoff(self, now_ns: int) -> bool:
         """Make the vehicle forget a take-off that it has not begun to show; return whether there was one."""
@@ -448,7 +448,7 @@ class CommandHandler:
 
     def _tell(self, session: Session, intent: Intent) -> None:
         """Let feedback tell what became of an intent: soon where it ended."""
-        self._vehicle.tell(intent.outcome(session.app_id, session.name))
+        self._vehicle.tell(intent, session.app_id, session.name)
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
         """Publish what the proxy itself made the vehicle do."""

@@ -59,10 +59,10 @@ class Intent:
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
         """End it, unless it is over already. ``text`` and ``reason``: what its repeats are answered with."""
         if self.fate is Fate.UNDER_WAY:
-            self.fate = fate
             if fate not in _SILENT:
                 self.reason = reason or Refusal.NOT_FRESH
                 self.text = text or f"{ENDINGS[fate]}: send a new command"
+            self.fate = fate  # last, as other threads read it
 
     def refuse(self, reason: Refusal, why: str) -> None:
         """End it because it was refused.
@@ -101,8 +101,14 @@ class Intent:
 
     def outcome(self, app_id: int, name: str) -> Outcome:
         """What feedback tells of it; ``name``: of the application."""
-        text = f"{name}: {self.action.name} refused: {self.text}"[:MAX_OUTCOME_TEXT] if self.text else ""
-        return Outcome(app_id, max(0, self.number), self.fate, self.reason, text)
+        fate = self.fate  # first, as another thread may end it now
+        if fate is Fate.UNDER_WAY or not self.text:
+            return Outcome(app_id, max(0, self.number), fate)
+        text = f"{name}: {self.action.name} refused: {self.text}"[:MAX_OUTCOME_TEXT]
+        return Outcome(app_id, self.number, fate, self.reason, text)
+
+
+NO_INTENT: Final = Intent(-1, Idle(), 0, FlightState.UNKNOWN, Fate.COMPLETED)
 
 
 class Intents:
@@ -112,7 +118,7 @@ class Intents:
 
     def __init__(self) -> None:
         self.seq = -1  #: of the newest command received
-        self.newest = Intent(-1, Idle(), 0, FlightState.UNKNOWN, Fate.COMPLETED)
+        self.newest = NO_INTENT
         self._received = 0  # the highest number, refused commands included
         self._floor = -1  # intents up to this one are from before something that ended them,
         self._ended = Fate.AUTHORITY  # which was this
