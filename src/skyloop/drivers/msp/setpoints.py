@@ -254,6 +254,7 @@ class SetpointController:
                 where = "in flight" if flew else "before it had taken off"
                 why = f": {explained(report.hindrances)}" if report.hindrances else ""
                 text = f"the flight controller disarmed {where}{why}"
+                self._refused = text, now_ns  # whoever did it: a take-off that goes on must not arm it again
                 self._events.append(message(text, "disarmed", Severity.WARNING, flags=", ".join(report.hindrances)))
         elif self._override and before.overridden and not report.overridden:
             self._enter(Phase.STANDING, now_ns)
