@@ -109,6 +109,18 @@ class VehicleSession(ABC):
         trouble = self._trouble(error)
         self._unreachable, self._remedy = trouble.reason, trouble.remedy
 
+    def broken(self, error: OSError, now_ns: int) -> None:
+        """Handle that nothing can be sent any more on an open connection: the vehicle is lost, whatever it still sends.
+
+        Args:
+            error: Of the connection, which is opened again.
+            now_ns: The present time.
+        """
+        self.failed(error)
+        self.due_ns = now_ns
+        if self._received_ns is not None:
+            self._lose(f"the connection failed: {self._unreachable}", now_ns)
+
     def drain(self) -> list[SinkCallback]:
         """Return the callbacks for the sink that are pending since the last call, in order."""
         for event in self._new_events():

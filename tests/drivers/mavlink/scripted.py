@@ -94,7 +94,7 @@ class Bench:
             publish(self.sink)
 
     def tick(self) -> None:
-        for frame, _ in self.session.poll(self.clock()):
+        for frame, *_ in self.session.poll(self.clock()):
             self.frames.append(frame)
             self.said += self._ears.decode(frame, whole=True)
         self.deliver()

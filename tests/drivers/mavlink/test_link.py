@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import socket
 import threading
+import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -20,12 +21,14 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import DriverError, UnsupportedError, UsageError
 from skyloop.host.links import LinkThread
-from skyloop.messages import FlightState, Land, LinkState, Takeoff, Velocity
+from skyloop.messages import EmergencyStop, FlightState, Land, LinkState, Takeoff, Velocity
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
 from skyloop.wire.mavlink.codec import Codec
 from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import Landed
+from tests.drivers.mavlink.scripted import ARDUPILOT, Vehicle
 
 PATIENCE_S = 15.0
 
@@ -140,6 +143,43 @@ def test_a_serial_port() -> None:
             for end in ends:
                 end.join(5.0)
     os.close(master)
+
+
+def test_a_serial_port_that_is_no_longer_read_is_lost_and_stops_nobody() -> None:
+    """The vehicle goes on sending, and reads nothing: commands return, the link is lost, closing is done at once."""
+    pytest.importorskip("serial")
+    far, near = os.openpty()
+    tty.setraw(near)
+    vehicle, ending = Vehicle(ARDUPILOT), threading.Event()
+    vehicle.mode, vehicle.armed, vehicle.landed, vehicle.place = "GUIDED", True, Landed.IN_AIR, (0.0, 0.0, -2.0)
+
+    def send() -> None:
+        while not ending.wait(0.02):
+            vehicle.boot_ms += 20
+            frames = [vehicle.codec.encode(each) for each in (vehicle.heartbeat(), *vehicle.telemetry())]
+            os.write(far, b"".join(frames))
+
+    sending = threading.Thread(target=send)
+    sending.start()
+    try:
+        with opened(f"mavlink://serial:{os.ttyname(near)}:10000000?parameters=no") as (driver, sink):
+            up(sink)
+            assert sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.HOVERING, PATIENCE_S)
+            os.set_blocking(near, False)
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(near, bytes(64))
+            driver.apply(Velocity(forward=0.3))
+            driver.apply(EmergencyStop())
+            assert sink.wait(lambda: any(state is LinkState.LOST for state, _ in sink.links), PATIENCE_S)
+            assert any("no longer reads" in reason for _, reason in sink.links)
+            driver.apply(EmergencyStop())
+            driver.close()
+    finally:
+        ending.set()
+        sending.join(5.0)
+        os.close(near)
+        os.close(far)
 
 
 def _into(descriptor: int) -> Callable[[bytes], object]:

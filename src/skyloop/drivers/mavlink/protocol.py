@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple
 
 from skyloop.clock import nanoseconds
+from skyloop.drivers.byte_stream import Rank
 from skyloop.drivers.link_reasons import LinkTrouble, serial_trouble, trouble_of
 from skyloop.drivers.mavlink.autopilots import AutopilotProfile, profile_of
 from skyloop.drivers.mavlink.microservices import (
@@ -42,7 +43,32 @@ OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
 _MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that say it
 
-Packet: TypeAlias = tuple[bytes, Peer]
+#: Commands that the vehicle's safety rests on: sent before all else, whatever is under way.
+_URGENT: Final = frozenset(
+    {m.MAV_CMD_COMPONENT_ARM_DISARM, m.MAV_CMD_DO_SET_MODE, m.MAV_CMD_NAV_TAKEOFF, m.MAV_CMD_NAV_LAND}
+)
+_SETPOINTS: Final = frozenset({"SET_POSITION_TARGET_LOCAL_NED", "SET_ATTITUDE_TARGET", "HEARTBEAT"})
+_POSES: Final = frozenset({"ODOMETRY", "VISION_POSITION_ESTIMATE"})
+
+
+class Packet(NamedTuple):
+    """One frame to be sent."""
+
+    data: bytes
+    peer: Peer  #: the receiver of a datagram; None: the one in the address
+    rank: Rank = Rank.SETPOINT
+
+
+def rank_of(message: Message) -> Rank:
+    """Return how important a message to the vehicle is on a slow line."""
+    kind = message.get_type()
+    if kind == "COMMAND_LONG" and message.command in _URGENT:
+        return Rank.COMMAND
+    if kind in _SETPOINTS:
+        return Rank.SETPOINT
+    return Rank.POSE if kind in _POSES else Rank.QUERY
+
+
 _ASK_VERSION: Final = VehicleCommand(m.MAV_CMD_REQUEST_MESSAGE, (float(m.MAVLINK_MSG_ID_AUTOPILOT_VERSION),))
 
 
@@ -71,6 +97,7 @@ class MavlinkSession(VehicleSession):
         self.setpoints: SetpointController | None = None  #: None until then, and for what can't be flown
         self.version: Message | None = None  #: its AUTOPILOT_VERSION
         self.limits = options.limits  #: the driver's own
+        self.dropped = 0  #: packets that the connection did not send, for want of room
         self._axes = WorldAxes(options.world_origin)
         self._extra = extra
         self._selector = VehicleSelector(options.system, options.peer)
@@ -230,6 +257,7 @@ class MavlinkSession(VehicleSession):
         vehicle = self.vehicle_state(now_ns)
         native: dict[str, Value] = dict(self._extra())
         native["link.frames"], native["link.damaged"] = self.codec.frames, self.codec.damaged
+        native["link.dropped"] = self.dropped
         if vehicle is not None:
             native["mavlink.mode"], native["mavlink.armed"] = vehicle.mode, vehicle.armed
             if vehicle.ready is not None:
@@ -257,7 +285,9 @@ class MavlinkSession(VehicleSession):
             vehicle = self.vehicle_state(now_ns)
             out += self._fly(vehicle, now_ns)
             self._check_health(vehicle, now_ns)
-        packets += [(self._encoded(message), peer) for message in out if self._axes.sent(message)]
+        packets += [
+            Packet(self._encoded(message), peer, rank_of(message)) for message in out if self._axes.sent(message)
+        ]
         self.due_ns = self._next_ns(now_ns)
         return packets
 
@@ -289,7 +319,7 @@ class MavlinkSession(VehicleSession):
             return []
         self._heartbeat_ns = now_ns
         versions = (1, 2) if self._old and self.options.key is None else (2,)
-        return [(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
+        return [Packet(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
 
     def _encoded(self, message: Message) -> bytes:
         return self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)

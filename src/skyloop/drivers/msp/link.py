@@ -9,7 +9,7 @@ from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.byte_stream import ByteStream, SerialStream, TcpStream
+from skyloop.drivers.byte_stream import ByteStream, Rank, SerialStream, TcpStream
 from skyloop.drivers.msp.protocol import MspSession
 from skyloop.drivers.vehicle_link import VehicleLink
 from skyloop.drivers.vehicle_session import SinkCallback
@@ -73,13 +73,11 @@ class MspLink(VehicleLink[MspSession]):
         try:
             self._stream.write(data)
         except OSError as error:
-            self.session.failed(error)
             self._broken = True
+            self.session.broken(error, now_ns)
 
     def _renewal_ns(self) -> int | None:
-        if self._stream is None:
-            return RETRY_NS
-        if self._broken:
+        if self._stream is None or self._broken:
             return RETRY_NS
         return None if self.session.is_receiving else SILENT_NS
 
@@ -104,5 +102,5 @@ class MspLink(VehicleLink[MspSession]):
             return
         if self._stopping.is_set():
             with suppress(OSError):
-                stream.write(self.session.last_words(self._clock()))
+                stream.write(self.session.last_words(self._clock()), Rank.COMMAND)
         self._forget(stream)
