@@ -29,8 +29,9 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.wire.mavlink.codec import Codec
+from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import COPTER_NUMBERS
 from skyloop.wire.mavlink.texts import chunks_of
 from tests.drivers.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
 from tests.recordings import recorded
@@ -508,3 +509,134 @@ def test_a_vehicle_at_rest_is_missed_in_time_and_its_mode_seen_at_once(autopilot
         bench.tick()
         bench.hear(message)
         assert bench.session.due_ns <= bench.clock()
+
+
+# What takes the place of a vehicle, and what only looks like it ------------------------------------------------------
+
+
+def parameter(name: str, value: float, index: int = 0, count: int = 1) -> Message:
+    return m.MAVLink_param_value_message(name.encode(), value, 9, count, index)
+
+
+def version_of(serial: int) -> Message:
+    none = [0] * 8
+    return m.MAVLink_autopilot_version_message(0, 0x01110000, 0, 0, 0, none, none, none, 0, 0, serial)
+
+
+def known(bench: Bench, serial: int = 0) -> Bench:
+    """A vehicle whose parameters were read, and that said who it is, if it has a serial number."""
+    bench.found()
+    bench.hear(parameter("MPC_THR_HOVER", 0.7))
+    if serial:
+        bench.hear(version_of(serial))
+    bench.go_on(0.2)
+    assert bench.link() is LinkState.UP
+    return bench
+
+
+def modes_set(bench: Bench) -> set[float]:
+    return {each.param2 for each in bench.heard_of("COMMAND_LONG") if each.command == m.MAV_CMD_DO_SET_MODE}
+
+
+WITH_PARAMETERS = "mavlink://udpin:127.0.0.1:14540"
+
+
+@pytest.mark.parametrize("silent_s", [10.0, 0.0])
+def test_another_autopilot_with_the_same_id_is_never_flown_by_the_first_ones_modes(silent_s: float) -> None:
+    """A PX4, then an ArduCopter on the same port, where PX4's numbers of modes are GUIDED and RTL."""
+    bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
+    bench.go_on(silent_s, silent=True)
+    bench.vehicle = Vehicle(ARDUPILOT)
+    bench.said.clear()
+    bench.flying("LOITER")
+    bench.go_on(1.0)
+    assert "ArduCopter" in bench.session.description
+    assert bench.newest.native["mavlink.mode"] == "LOITER"
+    assert not bench.session.parameters.values, "those of the other one are gone"
+    assert any("another vehicle" in text for text in bench.texts)
+    bench.apply(Hover())
+    bench.go_on(2.0)
+    assert modes_set(bench) == {COPTER_NUMBERS["GUIDED"]}
+    bench.apply(Land())
+    bench.go_on(2.0)
+    assert modes_set(bench) == {COPTER_NUMBERS["LAND"]}
+
+
+def test_what_can_not_be_flown_is_not_flown_in_the_place_of_another() -> None:
+    bench = known(Bench(Vehicle(ARDUPILOT), options(WITH_PARAMETERS)))
+    bench.go_on(3.0, silent=True)
+    bench.vehicle.kind = 1  # a plane
+    bench.found()
+    with pytest.raises(DriverError, match="no multirotor"):
+        bench.apply(Hover())
+
+
+def test_another_airframe_of_the_same_kind_is_read_anew() -> None:
+    """By its serial number; what was learnt of the first one is dropped."""
+    bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
+    bench.go_on(3.0, silent=True)
+    bench.vehicle = Vehicle(PX4)
+    bench.found()
+    assert bench.link() is LinkState.DEGRADED, "which one it is is not known yet"
+    bench.hear(version_of(8))
+    bench.go_on(0.1)
+    assert not bench.session.parameters.values
+    assert bench.heard_of("PARAM_REQUEST_LIST")
+    assert bench.link() is LinkState.DEGRADED
+    bench.hear(parameter("MPC_THR_HOVER", 0.3))
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP
+
+
+def test_the_same_vehicle_is_up_again_without_reading_its_parameters() -> None:
+    bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
+    bench.go_on(3.0, silent=True)
+    bench.found()
+    bench.hear(version_of(7))
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP
+    assert not bench.heard_of("PARAM_REQUEST_LIST")
+    assert bench.session.parameters.values
+
+
+@pytest.mark.parametrize("serial", [0, 7])
+def test_a_vehicle_that_does_not_say_which_it_is_is_read_anew(serial: int) -> None:
+    bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=serial)
+    bench.go_on(3.0, silent=True)
+    bench.hear(bench.vehicle.heartbeat())
+    bench.go_on(2.5)
+    assert bench.heard_of("PARAM_REQUEST_LIST")
+    assert bench.link() is LinkState.DEGRADED
+    bench.hear(parameter("MPC_THR_HOVER", 0.7))
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP
+
+
+def test_a_message_that_arrives_late_is_no_reboot() -> None:
+    """One attitude is 1.5 s late: nothing is lost, no set-point is missing, and it is not taken for the newest."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(1.0)
+    bench.said.clear()
+    for _ in range(3):
+        late = m.MAVLink_attitude_message(bench.vehicle.boot_ms - 1500, 1.5, 0.2, 0.0, 0.0, 0.0, 0.0)
+        bench.hear(late, late)
+        assert bench.newest.roll_rad == pytest.approx(0.1)
+        bench.go_on(1.0)
+    assert bench.link() is LinkState.UP
+    assert all(state is not LinkState.LOST for state, _ in bench.sink.links)
+    sent = bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
+    assert len(sent) >= 70
+    assert all(each.vx == pytest.approx(0.5) for each in sent)
+
+
+def test_a_vehicle_that_no_longer_reads_is_not_up_before_it_has_answered() -> None:
+    """What was sent found no room: its heartbeats alone don't show that commands get through again."""
+    bench = Bench(Vehicle(PX4)).found()
+    bench.session.broken(ConnectionError("the vehicle no longer reads what is sent"), bench.clock())
+    bench.go_on(1.0)
+    assert bench.link() is LinkState.DEGRADED
+    assert (LinkState.LOST, "the connection failed: the vehicle no longer reads what is sent") in bench.sink.links
+    bench.answer(m.MAV_CMD_SET_MESSAGE_INTERVAL)
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP

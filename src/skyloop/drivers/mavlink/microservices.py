@@ -13,7 +13,7 @@ from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.mavlink.options import Peer, PoseMessage
 from skyloop.drivers.mavlink.telemetry import Telemetry
-from skyloop.drivers.vehicle_session import VehicleEvent
+from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
 from skyloop.messages import EventKind, Severity
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.wire.mavlink.axes import angles_of, swap, to_wire, yaw_between
@@ -240,8 +240,7 @@ HURRY_NS: Final = nanoseconds(0.1)  #: between the first few
 FIRST: Final = 5
 KEEP_NS: Final = nanoseconds(10.0)
 PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that would be older than this when it arrives is of another clock
-REBOOT_MS: Final = 1000  #: stamps that go back by more mean that the vehicle was restarted
-_HALF: Final = 1 << 31
+BEHIND_MS: Final = 1000  #: stamps that are behind by more may mean that the vehicle was started anew
 _WRAP: Final = 1 << 32  #: of stamps in ms: 49 days
 
 
@@ -250,13 +249,12 @@ class VehicleClock:
 
     def __init__(self) -> None:
         self.round_trip_s: float | None = None  #: of the best answer lately
-        self.restarted = False  #: its clock was set back; read and cleared by the owner
         self._samples: deque[tuple[int, int, int]] = deque()  # when, round trip, their clock minus ours
         self._offset_ns: int | None = None  # their clock minus ours, of the best sample
         self._asked_ns = 0
         self._asked = 0
         self._live = LiveClock()
-        self._stamp_ms: int | None = None
+        self._watch = RestartWatch(BEHIND_MS, _WRAP)
         self._captured_ns = 0
 
     def poll(self, now_ns: int) -> list[Message]:
@@ -279,6 +277,10 @@ class VehicleClock:
             self.round_trip_s = seconds(best_ns)
         return []
 
+    def on_stamp(self, boot_ms: int, now_ns: int) -> Arrival:
+        """Judge a state by its stamp: new, overtaken by others, or of a vehicle that was started anew."""
+        return self._watch.update(boot_ms, now_ns)
+
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
         """Return when a state was captured: neither after ``now_ns`` nor before the last one.
 
@@ -286,11 +288,6 @@ class VehicleClock:
             boot_ms: The state's stamp, in milliseconds since the vehicle's start, 32 bits.
             now_ns: When it arrived.
         """
-        before, self._stamp_ms = self._stamp_ms, boot_ms
-        if before is not None:
-            step = (boot_ms - before + _HALF) % _WRAP - _HALF
-            if step < -REBOOT_MS and boot_ms < before:
-                self.restarted = True
         live_ns = self._live.captured_ns(boot_ms / 1000.0, now_ns)
         if self._offset_ns is not None:
             synced_ns = boot_ms * 1_000_000 - self._offset_ns

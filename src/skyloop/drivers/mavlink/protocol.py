@@ -23,7 +23,7 @@ from skyloop.drivers.mavlink.parameters import ParameterExchange
 from skyloop.drivers.mavlink.setpoints import SetpointController
 from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
 from skyloop.drivers.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
-from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession
+from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, VehicleEvent, VehicleSession
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Severity, Value
 from skyloop.wire.mavlink.codec import Codec, Message
@@ -37,6 +37,7 @@ DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
 LOST_NS: Final = nanoseconds(2.5)
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle without any data by then is reported as lost
 PARAMETERS_NS: Final = nanoseconds(25.0)  #: the list may take so long, then the link is up without it
+IDENTITY_NS: Final = nanoseconds(2.0)  #: a vehicle that is found again says by then that it is the same
 QUIET_ATTITUDE_S: Final = 0.5  #: without it, other messages make feedback
 VERSION_PACE_S: Final = 1.0
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
@@ -108,6 +109,9 @@ class MavlinkSession(VehicleSession):
         self._heartbeat_ns = -HEARTBEAT_NS
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
+        self._kind: tuple[int, int] | None = None  # autopilot and type, by its heartbeat
+        self._known_as: Message | None = None  # the version told before the link was lost, until it is told again
+        self._heard_by_it = True  # False: nothing shows yet that it reads what is sent
         self._said: tuple[int | None, bool, int] | None = None  # mode, whether it is armed, MAV_STATE, when last looked
         self._unsupported_reason = "no data from it"
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
@@ -199,11 +203,13 @@ class MavlinkSession(VehicleSession):
         self._unreachable = ""
 
     def _on_message(self, message: Message, peer: Peer, now_ns: int) -> None:
+        kind = message.get_type()
+        if kind == "HEARTBEAT" and self._is_another(message, peer):
+            self._lose(f"another autopilot answers as system {message.get_srcSystem()}", now_ns)
         for event in self._selector.on_message(message, peer):
             self._publish_event(event)
         if not self._selector.is_chosen(message, peer):
             return
-        kind = message.get_type()
         if self._received_ns is None:
             if kind != "HEARTBEAT":
                 return
@@ -212,21 +218,31 @@ class MavlinkSession(VehicleSession):
         self._old = message.get_msgbuf()[0] == m.PROTOCOL_MARKER_V1
         if self.autopilot is not None and not self._axes.received(message, self.autopilot.EARTH_RADIUS_M):
             return
+        if kind == "ATTITUDE":
+            arrival = self.clock.on_stamp(message.time_boot_ms, now_ns)
+            if arrival is Arrival.RESTARTED:
+                self.version = None  # it may be another one, and its parameters may be others
+                self.telemetry = Telemetry()
+                self._lose("the vehicle rebooted", now_ns)
+            if arrival is not Arrival.NEW:
+                return
         if kind not in _ANSWERS:
             self.telemetry.on_message(message, now_ns)
         self._dispatch(kind, message, now_ns)
 
+    def _is_another(self, heartbeat: Message, peer: Peer) -> bool:
+        """Return whether the chosen vehicle's place was taken by one with another autopilot."""
+        if self._received_ns is None or self._kind is None or not self._selector.is_chosen(heartbeat, peer):
+            return False
+        return bool(heartbeat.autopilot != self._kind[0])
+
     def _dispatch(self, kind: str, message: Message, now_ns: int) -> None:
         if kind == "ATTITUDE":
-            captured_ns = self.clock.captured_ns(message.time_boot_ms, now_ns)
-            if self.clock.restarted:
-                self.parameters.complete = False
-                self._lose("the vehicle rebooted", now_ns)
-                return
-            self._publish(captured_ns, now_ns)
+            self._publish(self.clock.captured_ns(message.time_boot_ms, now_ns), now_ns)
         elif kind == "COMMAND_ACK":
             if message.target_system in (0, self.options.own_system):
                 self.commands.on_ack(message, now_ns)
+                self._heard_by_it = True
                 self.due_ns = 0
         elif kind == "PARAM_VALUE":
             self.parameters.on_value(message, now_ns)
@@ -241,8 +257,7 @@ class MavlinkSession(VehicleSession):
                 if self.setpoints is not None and event.data["reason"] == "prearm":
                     self.setpoints.on_prearm_reason(event.text)
         elif kind == "AUTOPILOT_VERSION":
-            self.version = message
-            self.parameters.bytewise = bool(message.capabilities & BYTEWISE)
+            self._on_version(message, now_ns)
         elif kind in ("HEARTBEAT", "LOCAL_POSITION_NED", "EXTENDED_SYS_STATE"):
             age_s = self.telemetry.age_s("ATTITUDE", now_ns)
             if age_s is None or age_s > QUIET_ATTITUDE_S:
@@ -328,7 +343,11 @@ class MavlinkSession(VehicleSession):
         for event in self._health.update(self.telemetry, vehicle, now_ns):
             self._publish_event(event)
         exchange = self.parameters
+        if self._known_as is not None and now_ns - self._found_ns > IDENTITY_NS:
+            self._read_again(now_ns)  # it does not say which one it is
         if self.link_state is not LinkState.DEGRADED or self._silent(now_ns):
+            return
+        if self._known_as is not None or not self._heard_by_it:
             return
         waited = now_ns - self._found_ns > PARAMETERS_NS
         if not self.options.parameters or exchange.complete or exchange.given_up or waited:
@@ -374,8 +393,10 @@ class MavlinkSession(VehicleSession):
         self._found_ns, self._unreachable = now_ns, ""
         target = heartbeat.get_srcSystem(), heartbeat.get_srcComponent()
         self.commands.target = self.parameters.target = target
-        if self.autopilot is None:
+        kind = heartbeat.autopilot, heartbeat.type
+        if kind != self._kind:
             self._identify(heartbeat)
+        self._known_as, self.version = self.version, None
         if self.autopilot is not None:
             rates = self.autopilot.message_rates(self.options.rate_hz)
             if self._axes.begin is not None:
@@ -383,18 +404,29 @@ class MavlinkSession(VehicleSession):
             self._intervals = MessageIntervals(rates)
         if self.options.origin is not None:
             self._out.append(_origin(target[0], self.options.origin))
-        if self.options.parameters and not self.parameters.complete:
-            self.parameters.request_all(now_ns)
-        text = "its parameters are being read" if self.options.parameters else ""
+        if self._known_as is None:
+            self._read_again(now_ns)
+        text = "its parameters are being read" if self.parameters.busy else ""
+        if not self._heard_by_it:
+            text = "it has not answered yet, since what was sent did not get through"
         self._set_link_state(LinkState.DEGRADED, text)
 
     def _identify(self, heartbeat: Message) -> None:
-        found = profile_of(heartbeat.autopilot)
+        """Begin with a vehicle of which nothing is known: whatever was known of another one is dropped."""
+        if self._kind is not None:
+            text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: it is set up anew"
+            data: dict[str, Value] = {"reason": "another", "system": heartbeat.get_srcSystem()}
+            self._publish_event(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data))
+        self._kind = heartbeat.autopilot, heartbeat.type
+        self.telemetry, self.parameters, self._health = Telemetry(), ParameterExchange(), HealthMonitor()
+        self.parameters.target = self.commands.target
+        self.version = self._known_as = self.setpoints = None
+        self._axes.forget()
+        self.autopilot = found = profile_of(heartbeat.autopilot)
         self._unsupported_reason = unsupported_reason(heartbeat)
         if self._unsupported_reason:
             text = f"the vehicle answers but can't be flown: {self._unsupported_reason}"
             self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "autopilot"}))
-        self.autopilot = found
         if found is None:
             return
         self.parameters.bytewise = found.BYTEWISE
@@ -407,11 +439,43 @@ class MavlinkSession(VehicleSession):
                 VehicleEvent(EventKind.VEHICLE_MESSAGE, limits_text(self.limits), data={"reason": "limits"})
             )
 
+    def _on_version(self, version: Message, now_ns: int) -> None:
+        """Handle which vehicle it says it is. A found one is the same as before only where it can say so."""
+        before, self._known_as, self.version = self._known_as, None, version
+        if before is not None and not _is_same(before, version):
+            heartbeat = self.telemetry.newest("HEARTBEAT", now_ns)
+            if heartbeat is not None and any(_serial(before)) and any(_serial(version)):
+                self._identify(heartbeat)
+                self.telemetry.on_message(heartbeat, now_ns)
+                self.version = version
+            self._read_again(now_ns)
+        self.parameters.bytewise = bool(version.capabilities & BYTEWISE)
+
+    def _read_again(self, now_ns: int) -> None:
+        """Read the parameters of a vehicle that may be another one than before."""
+        self._known_as = None
+        if self.options.parameters:
+            self.parameters.request_all(now_ns)
+
+    def broken(self, error: OSError, now_ns: int) -> None:
+        """See :meth:`VehicleSession.broken`. The link is not up again before the vehicle has answered something."""
+        super().broken(error, now_ns)
+        self._heard_by_it = False
+
     def limit(self, limits: Mapping[str, float]) -> None:
         """Set the driver's own limits."""
         self.limits = limits
         if self.setpoints is not None:
             self.setpoints.takeoff_m = takeoff_height(limits)
+
+
+def _serial(version: Message) -> tuple[int, ...]:
+    return int(version.uid), *version.uid2
+
+
+def _is_same(one: Message, other: Message) -> bool:
+    """Return whether two ``AUTOPILOT_VERSION`` are of one vehicle; one without a serial number can't tell."""
+    return any(_serial(one)) and _serial(one) == _serial(other)
 
 
 def observed_state(vehicle: VehicleState | None) -> FlightState:
