@@ -10,6 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from contextlib import suppress
 from enum import IntEnum
+from pathlib import Path
 from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
@@ -230,5 +231,5 @@ def line_speed(path: str, baud: int) -> float | None:
         path: Of the device; links are followed.
         baud: Bits a second.
     """
-    device = os.path.basename(os.path.realpath(path))
+    device = Path(path).resolve().name
     return None if re.match(r"ttyACM|(cu|tty)\.usbmodem", device) else baud / _BITS

@@ -18,6 +18,7 @@ from skyloop.drivers.mavlink.setpoints import STEP_NS, Goal
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
 from skyloop.messages import (
+    AnyAction,
     EmergencyStop,
     FlightState,
     Hover,
@@ -640,3 +641,50 @@ def test_a_vehicle_that_no_longer_reads_is_not_up_before_it_has_answered() -> No
     bench.answer(m.MAV_CMD_SET_MESSAGE_INTERVAL)
     bench.go_on(0.1)
     assert bench.link() is LinkState.UP
+
+
+# Nothing comes, and what is sent may arrive --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", ["udpin:127.0.0.1:14540", "udpout:10.0.0.5:14550", "tcp:127.0.0.1:5760"])
+@pytest.mark.parametrize(("action", "mode"), [(Hover(), "BRAKE"), (Land(), "LAND")])
+def test_what_is_asked_of_a_vehicle_that_is_not_heard_is_sent(way: str, action: AnyAction, mode: str) -> None:
+    """It may still hear us: a dead receiver, a full downlink."""
+    bench = Bench(Vehicle(ARDUPILOT), options(f"mavlink://{way}?parameters=no")).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(3.0, silent=True)
+    assert bench.link() is LinkState.LOST
+    bench.said.clear()
+    bench.peers.clear()
+    bench.apply(action)
+    bench.go_on(10.0, silent=True)
+    asked = [each for each in bench.heard_of("COMMAND_LONG") if each.command == m.MAV_CMD_DO_SET_MODE]
+    assert 4 <= len(asked) <= 8, "for some seconds, and not for ever: others may take it over meanwhile"
+    assert {each.param2 for each in asked} == {COPTER_NUMBERS[mode]}
+    assert bench.peers == {PEER}
+
+
+def test_a_vehicle_that_is_not_heard_gets_no_heartbeats_that_keep_its_failsafe_from_acting() -> None:
+    """A failsafe's hover and landing aren't sent blindly, as a safety pilot may have it: its own failsafe is left."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(3.0, silent=True)
+    assert bench.link() is LinkState.LOST
+    bench.said.clear()
+    bench.apply(Hover(), alone=True)
+    bench.go_on(5.0, silent=True)
+    bench.apply(Land(), alone=True)
+    bench.go_on(5.0, silent=True)
+    assert not bench.said, "10 s without a word"
+    bench.go_on(20.0, silent=True)
+    assert 1 <= len(bench.heard_of("HEARTBEAT")) <= 2, "now and then one, for a vehicle that has lost our address"
+    bench.go_on(1.2)
+    assert bench.heard_of("HEARTBEAT")
+
+
+def test_a_vehicle_on_the_ground_that_is_not_heard_is_called_each_second() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    bench.go_on(3.0, silent=True)
+    bench.said.clear()
+    bench.go_on(5.0, silent=True)
+    assert len(bench.heard_of("HEARTBEAT")) >= 4

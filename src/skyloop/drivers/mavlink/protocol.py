@@ -33,6 +33,7 @@ from skyloop.wire.mavlink.parameter_values import BYTEWISE
 TICK_NS: Final = nanoseconds(0.02)
 REST_NS: Final = nanoseconds(0.1)  #: the same while nothing is under way: for silence, heartbeats and requests
 HEARTBEAT_NS: Final = nanoseconds(1.0)
+UNHEARD_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: the autopilots' own failsafes act after 5 or 10 s without one
 DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
 LOST_NS: Final = nanoseconds(2.5)
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle without any data by then is reported as lost
@@ -107,6 +108,8 @@ class MavlinkSession(VehicleSession):
         self._out: list[Message] = []
         self._found_ns = 0
         self._heartbeat_ns = -HEARTBEAT_NS
+        self._peer = options.peer  # the chosen vehicle's, kept while it is lost
+        self._unheard = False  # lost while it was armed: our heartbeats would keep its own failsafe from acting
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
         self._kind: tuple[int, int] | None = None  # autopilot and type, by its heartbeat
@@ -291,8 +294,9 @@ class MavlinkSession(VehicleSession):
     def poll(self, now_ns: int) -> list[Packet]:
         """Return the packets to send now."""
         self._check_silence(now_ns)
-        identity = self.identity
-        peer = identity.peer if identity is not None else self.options.peer
+        if self.identity is not None:
+            self._peer = self.identity.peer
+        peer = self._peer
         packets = self._heartbeats(peer, now_ns)
         out, self._out = self._out, []
         if self._received_ns is not None:
@@ -300,6 +304,8 @@ class MavlinkSession(VehicleSession):
             vehicle = self.vehicle_state(now_ns)
             out += self._fly(vehicle, now_ns)
             self._check_health(vehicle, now_ns)
+        elif self.setpoints is not None and self.setpoints.step_blind(now_ns):
+            out += self.commands.pop_messages()
         packets += [
             Packet(self._encoded(message), peer, rank_of(message)) for message in out if self._axes.sent(message)
         ]
@@ -330,7 +336,7 @@ class MavlinkSession(VehicleSession):
 
         A vehicle that speaks MAVLink 1 gets both versions: some autopilots change over once they receive the new one.
         """
-        if now_ns - self._heartbeat_ns < HEARTBEAT_NS:
+        if now_ns - self._heartbeat_ns < (UNHEARD_HEARTBEAT_NS if self._unheard else HEARTBEAT_NS):
             return []
         self._heartbeat_ns = now_ns
         versions = (1, 2) if self._old and self.options.key is None else (2,)
@@ -378,6 +384,7 @@ class MavlinkSession(VehicleSession):
 
     def _lose(self, reason: str, now_ns: int) -> None:
         self._received_ns = self._said = None
+        self._unheard = self.telemetry.armed()
         self._selector.forget()
         self._axes.forget()
         self.parameters.fail_writes(reason)
@@ -390,7 +397,7 @@ class MavlinkSession(VehicleSession):
         self._set_link_state(LinkState.LOST, reason)
 
     def _find(self, heartbeat: Message, now_ns: int) -> None:
-        self._found_ns, self._unreachable = now_ns, ""
+        self._found_ns, self._unreachable, self._unheard = now_ns, "", False
         target = heartbeat.get_srcSystem(), heartbeat.get_srcComponent()
         self.commands.target = self.parameters.target = target
         kind = heartbeat.autopilot, heartbeat.type

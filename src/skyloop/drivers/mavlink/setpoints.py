@@ -55,6 +55,7 @@ CUT_PACE_S: Final = 0.2
 CUT_FOR_NS: Final = nanoseconds(10.0)  #: a stop is sent for so long at most, while the vehicle reports that it is armed
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
 STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
+BLIND_NS: Final = nanoseconds(3.0)  #: what is asked for while nothing is received is sent for so long
 HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
 
 
@@ -101,6 +102,7 @@ class SetpointController:
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
         self._stepped_ns = 0  # when what is wanted now had its last step; 0: it has not had one
         self._cut_ns = 0
+        self._blind_until_ns = 0
         self._events: list[VehicleEvent] = []
 
     # What is decided ---------------------------------------------------------------------------------------------
@@ -147,6 +149,8 @@ class SetpointController:
         else:
             assert not isinstance(action, ReturnToStart)  # the proxy makes places of it
             action = self._steer(action, vehicle, now_ns)
+        if vehicle is None and new and not alone and isinstance(action, Hover | Land):
+            self._blind_until_ns = now_ns + BLIND_NS
         if self.goal is not Goal.NOTHING and not isinstance(action, Idle):
             self.ownership.take(action, vehicle, alone=alone, new=new)
         return action
@@ -326,6 +330,20 @@ class SetpointController:
         if self.goal is Goal.LAND:
             self._step_land(vehicle, now_ns)
         return []
+
+    def step_blind(self, now_ns: int) -> bool:
+        """Send what an application newly asked for while nothing is received: the vehicle may hear it all the same.
+
+        What a failsafe asks for is not sent so: who flies the vehicle by now can't be seen.
+
+        Returns:
+            Whether a command is under way.
+        """
+        modes = {Goal.HOLD: self._autopilot.HOLD, Goal.LAND: self._autopilot.LAND}
+        if self.stopped or now_ns >= self._blind_until_ns or self.goal not in modes:
+            return False
+        self._ask_for(modes[self.goal], now_ns)
+        return True
 
     def due_ns(self, now_ns: int) -> int | None:
         """Return when :meth:`messages` has something to do next; None: nothing by the time alone."""
