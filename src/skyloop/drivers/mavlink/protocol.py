@@ -192,7 +192,7 @@ class MavlinkSession(VehicleSession):
             now_ns: When it came.
             whole: Whether ``data`` is a datagram; if not, it is a piece of a stream.
         """
-        for message in self.codec.decode(data, whole=whole):
+        for message in self.codec.decode(data, whole=whole, source=peer):
             self._on_message(message, peer, now_ns)
         if self.codec.signed > self._signed:
             first, self._signed = not self._signed, self.codec.signed
