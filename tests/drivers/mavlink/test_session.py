@@ -688,3 +688,105 @@ def test_a_vehicle_on_the_ground_that_is_not_heard_is_called_each_second() -> No
     bench.said.clear()
     bench.go_on(5.0, silent=True)
     assert len(bench.heard_of("HEARTBEAT")) >= 4
+
+
+# Several of one thing, and the same from somewhere else --------------------------------------------------------------
+
+
+def battery(number: int, percent: int, function: int = 0) -> Message:
+    return m.MAVLink_battery_status_message(number, function, 1, 0, [65535] * 10, -1, -1, -1, percent)
+
+
+def test_of_two_batteries_the_first_counts() -> None:
+    """The second may be for a gimbal, or nearly empty: its charge is not that of the flight."""
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.hear(bench.vehicle.heartbeat())
+    told = set()
+    for step in range(40):
+        bench.clock.advance(0.5)
+        bench.hear(bench.vehicle.heartbeat(), battery(1, 5))
+        if step % 20 < 4:
+            bench.hear(battery(0, 80))
+        told.add(bench.newest.battery)
+    assert told == {0.8, None}, "not known, rather than that of the other, while the first is silent"
+
+
+def test_the_charge_is_not_that_of_a_payload() -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.hear(bench.vehicle.heartbeat(), battery(0, 5, function=4), battery(1, 80), bench.vehicle.heartbeat())
+    assert bench.newest.battery == 0.8
+
+
+@pytest.mark.parametrize("facings", [(25, 0), (0, 25), (25, 25)])
+def test_of_two_range_finders_the_one_that_looks_down_counts(facings: tuple[int, int]) -> None:
+    """2.0 m below, and 5.0 m to a wall, or by a second one that looks down as well."""
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    below = facings.index(25)
+    told = set()
+    for _ in range(20):
+        for number, facing in enumerate(facings):
+            distance = 200 if number == below else 500
+            bench.hear(m.MAVLink_distance_sensor_message(0, 10, 3000, distance, 0, number, facing, 0))
+            bench.hear(m.MAVLink_extended_sys_state_message(0, 1), *bench.vehicle.telemetry())
+            told.add(bench.newest.altitude_m)
+        bench.go_on(0.04)
+    assert told - {0.0} == {2.0}
+
+
+def test_a_vehicle_that_goes_on_from_another_port_is_received_again_at_once() -> None:
+    """Its host, or an address translation, gave it a new one in flight."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(1.0)
+    moved = ("127.0.0.1", 33_333)
+    deaf_s = 0.0
+    while bench.session.identity is None or bench.session.identity.peer != moved:
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        bench.hear(*bench.vehicle.telemetry(), peer=moved)
+        bench.tick()
+        deaf_s += 0.02
+    assert deaf_s < 0.5
+    bench.peers.clear()
+    for _ in range(150):
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        bench.hear(bench.vehicle.heartbeat(), *bench.vehicle.telemetry(), peer=moved)
+        bench.tick()
+    assert bench.link() is LinkState.UP
+    assert all(state is not LinkState.LOST for state, _ in bench.sink.links)
+    assert bench.peers == {moved}
+
+
+@pytest.mark.parametrize("other", [("127.0.0.1", 33_333), ("10.0.0.7", 14_580)])
+def test_a_second_vehicle_with_the_same_id_never_steps_in(other: tuple[str, int]) -> None:
+    """Received beside the first one, or from another host: it is another vehicle, and not the first one's new port."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.hear(bench.vehicle.heartbeat(), peer=other)
+    bench.go_on(0.1)
+    for _ in range(100):
+        bench.clock.advance(0.02)
+        bench.hear(*bench.vehicle.telemetry(), peer=other)
+        bench.tick()
+        assert bench.session.identity is None or bench.session.identity.peer == PEER
+
+
+def test_a_request_that_was_lost_is_repeated_while_the_message_flows_too_slowly() -> None:
+    """PX4 sends positions once a second unasked: that is not the rate that was asked for."""
+    bench = Bench(Vehicle(PX4))
+    bench.hear(bench.vehicle.heartbeat())
+    asked = []
+    for step in range(30 * 50):
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        if step % 10 == 0:
+            bench.hear(bench.vehicle.heartbeat())
+        for message in bench.vehicle.telemetry():
+            if message.get_type() != "LOCAL_POSITION_NED" or step % 50 == 0 or len(asked) > 2:
+                bench.hear(message)
+        bench.tick()
+        for each in bench.heard_of("COMMAND_LONG"):
+            if each.command == m.MAV_CMD_SET_MESSAGE_INTERVAL and each.param1 == m.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+                asked.append(step * 0.02)
+    assert len(asked) == 3, "until it flows as asked for"
+    assert asked[2] < 8.0

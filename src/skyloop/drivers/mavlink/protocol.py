@@ -209,7 +209,7 @@ class MavlinkSession(VehicleSession):
         kind = message.get_type()
         if kind == "HEARTBEAT" and self._is_another(message, peer):
             self._lose(f"another autopilot answers as system {message.get_srcSystem()}", now_ns)
-        for event in self._selector.on_message(message, peer):
+        for event in self._selector.on_message(message, peer, now_ns):
             self._publish_event(event)
         if not self._selector.is_chosen(message, peer):
             return

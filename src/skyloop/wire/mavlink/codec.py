@@ -128,7 +128,7 @@ class _Signatures:
         self._streams: dict[tuple[int, int, int], int] = {}  # link, system and component: the newest that was taken
 
     def now(self) -> int:
-        """Return the time for the next signature: that of this host or of a sender that is ahead, and never the last."""
+        """Return the time for the next signature: this host's, or that of a sender who is ahead, and never the last."""
         self._newest = max(self._newest + 1, int((time.time() - _SIGNING_EPOCH_S) * _STEPS_PER_S))
         return self._newest
 
