@@ -80,7 +80,7 @@ class Bench:
         now_ns = self.clock.now_ns
         if self.poses and self._ticks % POSE_TICKS == 0:
             truth = self.simulation.truth(0)
-            self.session.on_pose(ExternalPose(truth.position_m, truth.quaternion, now_ns))
+            self.session.on_pose(ExternalPose(truth.position_m, truth.quaternion, now_ns), now_ns)
         if now_ns >= self.session.due_ns:
             self._exchange(self.session.poll(now_ns))
         for publish in self.session.drain():

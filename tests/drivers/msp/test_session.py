@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import pytest
 
+from skyloop.clock import NS_PER_S
+from skyloop.drivers.base import ExternalPose
 from skyloop.emulators.msp.board import bit
 from skyloop.emulators.msp.settings import BoardSettings
 from skyloop.errors import DriverError
@@ -173,6 +175,21 @@ def test_without_a_measured_climb_nothing_takes_off() -> None:
     bench.run(2.0)
     with pytest.raises(DriverError, match="its climb is not measured"):
         bench.fly(climb=0.5)
+
+
+def test_one_pose_that_is_stamped_ahead_changes_nothing() -> None:
+    """8 s, by a wrong clock, and nothing but poses measures the height: it would be blind, and cut its motors."""
+    bench = Bench(BoardSettings(barometer=False, gps=False))
+    bench.take_off()
+    now_ns, truth = bench.clock.now_ns, bench.simulation.truth(0)
+    with pytest.raises(DriverError, match=r"stamped 8 s ahead"):
+        bench.session.on_pose(ExternalPose((0.0, 0.0, 5.0), truth.quaternion, now_ns + 8 * NS_PER_S), now_ns)
+    bench.session.on_pose(ExternalPose(truth.position_m, truth.quaternion, now_ns + NS_PER_S // 30), now_ns)
+    for _ in range(10):
+        bench.run(1.0)
+        assert bench.session.motion.at(bench.clock.now_ns).precise
+        assert bench.height_m == pytest.approx(truth.position_m[2], abs=0.3)
+    assert not bench.texts("blind")
 
 
 def test_other_firmware_is_not_flown() -> None:

@@ -38,9 +38,9 @@ class MspLink(VehicleLink[MspSession]):
     # From the proxy's threads ------------------------------------------------------------------------------------
 
     def pose(self, pose: ExternalPose) -> None:
-        """Take in a pose from outside. Any thread."""
+        """Take in a pose from outside. Any thread. See :meth:`MspSession.on_pose`."""
         with self.lock:
-            self.session.on_pose(pose)
+            self.session.on_pose(pose, self._clock())
 
     def why_not(self) -> str:
         """Return why a take-off is sure to be refused; empty if it is not. Any thread."""

@@ -99,9 +99,13 @@ class MspSession(VehicleSession):
         self.setpoints.on_motion(self.motion.at(now_ns))
         return self.setpoints.why_not(now_ns)
 
-    def on_pose(self, pose: ExternalPose) -> None:
-        """Take in a pose from outside."""
-        self.motion.on_pose(pose)
+    def on_pose(self, pose: ExternalPose, now_ns: int) -> None:
+        """Take in a pose from outside.
+
+        Raises:
+            DriverError: It is stamped ahead; see :meth:`ExternalPose.bounded`.
+        """
+        self.motion.on_pose(pose.bounded(now_ns))
 
     def close(self) -> None:
         """End the session."""
