@@ -71,7 +71,7 @@ class VehicleLink(ABC, Generic[S]):
         self._stopping = threading.Event()
         self._selector = selectors.DefaultSelector()
         self._awake, self._waker = socket.socketpair()
-        self._lookup = NameLookup(family)
+        self._lookup = NameLookup(family) if serve is None else NameLookup(family, wait_s=0.0)
         self._awake_ns = 0  # when its thread looks again at the latest
         self._opened_ns: int | None = None  # when sockets were opened last, or tried to
         self._close_s = close_s
@@ -214,7 +214,9 @@ class VehicleLink(ABC, Generic[S]):
         now_ns = self._clock()
         with self.lock:
             pace_ns = self._renewal_ns()
-        if pace_ns is None or (self._opened_ns is not None and now_ns - self._opened_ns < pace_ns):
+        if pace_ns is None:
+            return
+        if self._opened_ns is not None and now_ns - self._opened_ns < pace_ns and not self._lookup.answered:
             return
         self._opened_ns = now_ns
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import threading
+import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -16,6 +17,7 @@ import pytest
 
 from skyloop.drivers.base import Driver, ExternalPose, ServedLink
 from skyloop.drivers.mavlink import MavlinkDriver
+from skyloop.drivers.mavlink.link import MavlinkLink
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
@@ -78,6 +80,35 @@ def test_a_thread_that_serves_several_serves_it_too() -> None:
             driver.close()
             thread.close()
     assert not sink.problems
+
+
+def test_a_name_that_does_not_resolve_keeps_no_other_link_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread serves several vehicles; it comes back for the answer once there is one."""
+    released, found = threading.Event(), socket.getaddrinfo("127.0.0.1", None, type=socket.SOCK_STREAM)
+
+    def resolver(*_: object) -> object:
+        released.wait(PATIENCE_S)
+        return found
+
+    given: list[ServedLink] = []
+    driver = MavlinkDriver(parse_uri("mavlink://udpout:drone7.lab:9"))
+    driver.serve_link = given.append
+    driver.open(RecordingSink(watch=set()))
+    (link,) = given
+    assert isinstance(link, MavlinkLink)
+    monkeypatch.setattr("skyloop.drivers.name_lookup.socket.getaddrinfo", resolver)
+    monkeypatch.setattr("skyloop.drivers.name_lookup.WAIT_S", PATIENCE_S)
+    begun_s = time.monotonic()
+    for _ in range(3):
+        link.serve(readable=False)
+    assert time.monotonic() - begun_s < 0.5 * PATIENCE_S, "it never waits for the name"
+    released.set()
+    wait_until(lambda: link.serve(readable=False) is not None and link._connection is not None, "it is opened")
+    monkeypatch.undo()
+    link._stopping.set()
+    assert link.serve(readable=False) is None
+    link.end()
+    driver.close()
 
 
 def test_what_fails_on_a_thread_that_serves_several_is_an_event_and_told_to_the_thread() -> None:
