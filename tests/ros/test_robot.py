@@ -371,7 +371,7 @@ def test_odometry_that_ends_while_images_go_on_is_told_and_ends_the_velocity() -
         rig.clock.advance(0.05)
         rig.session.on_image(image(rig.system()))
         rig.session.tick()
-    assert rig.sink.link_state is LinkState.DEGRADED
+    assert rig.sink.links[-1][0] is LinkState.DEGRADED
     assert "nothing came on /robot/odom for 1." in rig.sink.links[-1][1]
     assert len(rig.sink.links) == 2, "told once"
     assert rig.robot.sent[-1] == Velocity()

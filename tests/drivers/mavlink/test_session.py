@@ -552,7 +552,7 @@ def test_another_autopilot_with_the_same_id_is_never_flown_by_the_first_ones_mod
     bench.flying("LOITER")
     bench.go_on(1.0)
     assert "ArduCopter" in bench.session.description
-    assert bench.newest.native["mavlink.mode"] == "LOITER"
+    assert (bench.newest.native or {})["mavlink.mode"] == "LOITER"
     assert not bench.session.parameters.values, "those of the other one are gone"
     assert any("another vehicle" in text for text in bench.texts)
     bench.apply(Hover())
@@ -775,7 +775,7 @@ def test_a_request_that_was_lost_is_repeated_while_the_message_flows_too_slowly(
     """PX4 sends positions once a second unasked: that is not the rate that was asked for."""
     bench = Bench(Vehicle(PX4))
     bench.hear(bench.vehicle.heartbeat())
-    asked = []
+    asked: list[float] = []
     for step in range(30 * 50):
         bench.clock.advance(0.02)
         bench.vehicle.boot_ms += 20

@@ -70,6 +70,9 @@ class Bench:
         self._parser.reset()
 
     def fly(self, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> None:
+        """Steer it; a climb from the ground is a take-off that somebody asked for."""
+        if climb > 0:
+            self.session.ask_takeoff(self.clock.now_ns)
         self.session.command(Attitude(roll, pitch, climb, yaw_rate), self.clock.now_ns)
 
     def tick(self) -> None:

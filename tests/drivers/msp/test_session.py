@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
 
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
+from skyloop.drivers.msp.setpoints import Phase
 from skyloop.emulators.msp.board import bit
 from skyloop.emulators.msp.settings import BoardSettings
 from skyloop.errors import DriverError
@@ -221,6 +223,34 @@ def test_silence_drops_it_after_the_firmwares_failsafe() -> None:
     assert bench.feedback.state is FlightState.LANDED
     bench.run(3.0)
     assert not bench.board.armed, "it is not armed again by itself"
+
+
+def test_what_is_found_on_the_ground_stays_there() -> None:
+    """The firmware stood still in flight and has disarmed; what hovered it goes on and asks for a climb."""
+    bench = Bench()
+    bench.take_off()
+    bench.cut = True
+    bench.until(lambda: not bench.board.armed, 1.6)
+    bench.cut = False
+    bench.until(lambda: bench.sink.link_state is LinkState.UP, 3.0)
+    for _ in range(300):
+        with suppress(DriverError):
+            bench.session.command(Attitude(climb=0.3), bench.clock.now_ns)
+        bench.tick()
+        assert bench.session.setpoints.phase is Phase.STANDING
+    with pytest.raises(DriverError, match="take off first"):
+        bench.session.command(Attitude(climb=0.3), bench.clock.now_ns)
+    bench.fly(climb=0.7)
+    bench.until(lambda: bench.height_m > 1.0, 20.0)
+
+
+def test_a_take_off_that_was_asked_for_long_ago_does_not_begin_now() -> None:
+    bench = Bench()
+    bench.ready()
+    assert bench.session.ask_takeoff(bench.clock.now_ns) == ""
+    bench.run(1.5)
+    with pytest.raises(DriverError, match="take off first"):
+        bench.session.command(Attitude(climb=0.3), bench.clock.now_ns)
 
 
 def test_a_short_cut_is_flown_through() -> None:

@@ -42,10 +42,10 @@ class MspLink(VehicleLink[MspSession]):
         with self.lock:
             self.session.on_pose(pose, self._clock())
 
-    def why_not(self) -> str:
-        """Return why a take-off is sure to be refused; empty if it is not. Any thread."""
+    def ask_takeoff(self) -> str:
+        """See :meth:`MspSession.ask_takeoff`. Any thread."""
         with self.lock:
-            return self.session.why_not(self._clock())
+            return self.session.ask_takeoff(self._clock())
 
     # On the link's thread ----------------------------------------------------------------------------------------
 

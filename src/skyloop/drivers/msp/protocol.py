@@ -94,10 +94,10 @@ class MspSession(VehicleSession):
         self.due_ns = min(self.due_ns, self._sticks_due_ns)
         return applied
 
-    def why_not(self, now_ns: int) -> str:
-        """Return why a take-off is sure to be refused; empty if it is not."""
+    def ask_takeoff(self, now_ns: int) -> str:
+        """Let the next climb start it; return why a take-off is sure to be refused, empty if it is not."""
         self.setpoints.on_motion(self.motion.at(now_ns))
-        return self.setpoints.why_not(now_ns)
+        return self.setpoints.ask_takeoff(now_ns)
 
     def on_pose(self, pose: ExternalPose, now_ns: int) -> None:
         """Take in a pose from outside.
