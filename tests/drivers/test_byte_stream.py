@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import tty
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -35,10 +36,11 @@ def read_all(far: int) -> int:
 
 
 def fill(stream: SerialStream) -> None:
-    """Leave no room at all, as when the other end hangs."""
-    with suppress(BlockingIOError):
-        while True:
-            os.write(stream.fileno(), b"x")
+    """Leave no room at all, as when the other end hangs. The system may make some more a moment later."""
+    while select.select([], [stream], [], 0.05)[1]:
+        with suppress(BlockingIOError):
+            while True:
+                os.write(stream.fileno(), b"x")
 
 
 def test_a_serial_port_whose_other_end_does_not_read_drops_and_never_waits(line: tuple[int, str]) -> None:

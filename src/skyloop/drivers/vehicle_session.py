@@ -163,6 +163,9 @@ class VehicleSession(ABC):
         trouble = self._trouble(error)
         self._unreachable, self._remedy = trouble.reason, trouble.remedy
 
+    def connected(self) -> None:  # noqa: B027  most connections need nothing
+        """Handle a new connection: nothing of an older one follows."""
+
     def broken(self, error: OSError, now_ns: int) -> None:
         """Handle that nothing can be sent any more on an open connection: the vehicle is lost, whatever it still sends.
 

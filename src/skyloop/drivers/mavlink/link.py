@@ -13,7 +13,7 @@ from skyloop.drivers.base import ServedLink
 from skyloop.drivers.byte_stream import ByteStream, SerialStream, TcpStream
 from skyloop.drivers.mavlink.options import Address, ConnectionKind, Peer
 from skyloop.drivers.mavlink.protocol import MavlinkSession, Packet
-from skyloop.drivers.vehicle_link import VehicleLink
+from skyloop.drivers.vehicle_link import ConnectionLink
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.messages import AnyAction
 from skyloop.wire.mavlink.codec import Message
@@ -181,13 +181,11 @@ def open_connection(address: Address) -> MavlinkConnection:
     return _KINDS[address.kind](address)
 
 
-RETRY_NS: Final = nanoseconds(1.0)  #: between attempts to connect
-SILENT_NS: Final = nanoseconds(8.0)  #: a connected stream on which nothing comes for so long is reopened
 WRITE_S: Final = 0.9  #: a parameter is written and confirmed within this, or it failed
 _CLOSE_S: Final = 3.0
 
 
-class MavlinkLink(VehicleLink[MavlinkSession]):
+class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
     """Keeps the connection and serves the session, on a thread of its own.
 
     Args:
@@ -196,6 +194,8 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
         clock: Monotonic, ns.
         serve: Takes the link to a thread that serves several, if it is one over UDP: to open another may take a while.
     """
+
+    RETRY_NS = nanoseconds(1.0)
 
     def __init__(
         self,
@@ -215,8 +215,7 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
             close_s=_CLOSE_S,
             serve=serve if udp else None,
         )
-        self._connection: MavlinkConnection | None = None
-        self._broken = False  # nothing can be sent any more
+        self._silent_ns = None if udp else nanoseconds(8.0)
 
     # From the proxy's threads ------------------------------------------------------------------------------------
 
@@ -250,15 +249,8 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
 
     # On the link's thread ----------------------------------------------------------------------------------------
 
-    def _receive(self) -> None:
-        connection = self._connection
-        if connection is None:
-            return
-        try:
-            came = connection.receive()
-        except OSError as error:
-            self._on_failure(error)
-            return
+    def _read(self, connection: MavlinkConnection) -> None:
+        came = connection.receive()
         now_ns = self._clock()
         with self.lock:
             for data, peer in came:
@@ -277,29 +269,13 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
             if connection.whole:
                 self.session.failed(error)
             else:
-                self._broken = True
-                self.session.broken(error, now_ns)
+                self._on_broken(error, now_ns)
         self.session.dropped = connection.dropped
 
     # The connection ----------------------------------------------------------------------------------------------
 
-    def _renewal_ns(self) -> int | None:
-        """Return when to reopen the connection: a stream when it breaks, or when nothing comes on it."""
-        connection = self._connection
-        if connection is None:
-            return RETRY_NS
-        if self._broken:
-            return RETRY_NS
-        return None if self.session.is_receiving or connection.whole else SILENT_NS
-
-    def _open_sockets(self) -> None:
-        with self.lock:
-            self._close_sockets()
-        made = open_connection(self._address())
-        with self.lock:
-            self._connection = made
-            self.session.connected()
-        self._watch(made, self._receive)
+    def _connect(self) -> MavlinkConnection:
+        return open_connection(self._address())
 
     def _address(self) -> Address:
         """Return the address with a numeric host.
@@ -311,14 +287,3 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
         if address.kind not in (ConnectionKind.TCP, ConnectionKind.UDP_OUT):
             return address
         return replace(address, place=self._lookup.address(address.place))
-
-    def _on_failure(self, error: OSError) -> None:
-        with self.lock:
-            self.session.failed(error)
-            self._close_sockets()
-
-    def _close_sockets(self) -> None:
-        self._broken = False
-        if self._connection is not None:
-            self._forget(self._connection)
-            self._connection = None
