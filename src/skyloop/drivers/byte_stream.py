@@ -215,7 +215,7 @@ class SerialStream(ByteStream):
 
     def close(self) -> None:
         """Close the port. What nobody reads is thrown away: the system would wait for it, with some ports for 30 s."""
-        with suppress(OSError):  # it may be unplugged
+        with suppress(Exception):  # it may be unplugged, and the error of a terminal is no OSError
             until_s = time.monotonic() + (_DRAIN_S if self._full_ns is None else 0.0)
             while self._port.out_waiting and time.monotonic() < until_s:
                 time.sleep(0.005)

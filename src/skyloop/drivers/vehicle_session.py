@@ -65,7 +65,7 @@ class RestartWatch:
     """Tells a vehicle that was started anew from packets that arrive late, by a number that grows in it. Pure.
 
     Args:
-        tolerance: One that is behind by no more is late, but no sign of a new start.
+        tolerance: One that is behind by no more is taken as it comes.
         wrap: The number begins at 0 again there; 0: never.
     """
 
@@ -81,11 +81,9 @@ class RestartWatch:
     def update(self, number: int, now_ns: int) -> Arrival:
         """Judge a packet that arrived now by its number."""
         step = 0 if self._newest is None else self._step(self._newest, number)
-        if step >= 0:
-            self._newest, self._behind = number, None
+        if step >= -self._tolerance:
+            self._newest, self._behind = number if step >= 0 else self._newest, None
             return Arrival.NEW
-        if -step <= self._tolerance:
-            return Arrival.LATE
         last, count, since_ns = self._behind or (number, 0, now_ns)
         if self._step(last, number) < 0:
             count, since_ns = 0, now_ns

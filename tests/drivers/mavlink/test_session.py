@@ -620,15 +620,35 @@ def test_a_message_that_arrives_late_is_no_reboot() -> None:
     bench.go_on(1.0)
     bench.said.clear()
     for _ in range(3):
-        late = m.MAVLink_attitude_message(bench.vehicle.boot_ms - 1500, 1.5, 0.2, 0.0, 0.0, 0.0, 0.0)
-        bench.hear(late, late)
+        at_ms, before = bench.vehicle.boot_ms - 1500, bench.newest.position_m
+        late = m.MAVLink_attitude_message(at_ms, 1.5, 0.2, 0.0, 0.0, 0.0, 0.0)
+        bench.hear(late, m.MAVLink_local_position_ned_message(at_ms, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0), late)
         assert bench.newest.roll_rad == pytest.approx(0.1)
+        assert bench.newest.position_m == before
         bench.go_on(1.0)
     assert bench.link() is LinkState.UP
     assert all(state is not LinkState.LOST for state, _ in bench.sink.links)
     sent = bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
     assert len(sent) >= 70
     assert all(each.vx == pytest.approx(0.5) for each in sent)
+
+
+def test_a_serial_number_that_one_version_of_the_protocol_lacks_is_no_other_vehicle() -> None:
+    """MAVLink 1 cuts the longer one off: the shorter one tells then, or nothing does."""
+    none = [0] * 8
+
+    def said(serial: int, longer: int) -> Message:
+        uid2 = [longer, *[0] * 17]
+        return m.MAVLink_autopilot_version_message(0, 0, 0, 0, 0, none, none, none, 0, 0, serial, uid2)
+
+    for before, after, reads in (((7, 9), (7, 0), 0), ((7, 9), (8, 9), 0), ((0, 9), (7, 0), 1), ((7, 9), (7, 8), 1)):
+        bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)))
+        bench.hear(said(*before))
+        bench.go_on(3.0, silent=True)
+        bench.found()
+        bench.hear(said(*after))
+        bench.go_on(0.5)
+        assert len(bench.heard_of("PARAM_REQUEST_LIST")) == reads, (before, after)
 
 
 def test_a_vehicle_that_no_longer_reads_is_not_up_before_it_has_answered() -> None:

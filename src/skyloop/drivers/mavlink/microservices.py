@@ -280,7 +280,7 @@ class VehicleClock:
         self._asked_ns = 0
         self._asked = 0
         self._live = LiveClock()
-        self._watch = RestartWatch(BEHIND_MS, _WRAP)
+        self._watches: dict[str, RestartWatch] = {}  # by the message's name
         self._captured_ns = 0
 
     def poll(self, now_ns: int) -> list[Message]:
@@ -303,9 +303,9 @@ class VehicleClock:
             self.round_trip_s = seconds(best_ns)
         return []
 
-    def on_stamp(self, boot_ms: int, now_ns: int) -> Arrival:
-        """Judge a state by its stamp: new, overtaken by others, or of a vehicle that was started anew."""
-        return self._watch.update(boot_ms, now_ns)
+    def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> Arrival:
+        """Judge a message by its stamp: new, overtaken by others of its kind, or of a vehicle that was started anew."""
+        return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
         """Return when a state was captured: neither after ``now_ns`` nor before the last one.

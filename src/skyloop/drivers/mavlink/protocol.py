@@ -43,6 +43,7 @@ QUIET_ATTITUDE_S: Final = 0.5  #: without it, other messages make feedback
 VERSION_PACE_S: Final = 1.0
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
+_STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps show their order
 _MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that say it
 
 #: Commands that the vehicle's safety rests on: sent before all else, whatever is under way.
@@ -221,8 +222,8 @@ class MavlinkSession(VehicleSession):
         self._old = message.get_msgbuf()[0] == m.PROTOCOL_MARKER_V1
         if self.autopilot is not None and not self._axes.received(message, self.autopilot.EARTH_RADIUS_M):
             return
-        if kind == "ATTITUDE":
-            arrival = self.clock.on_stamp(message.time_boot_ms, now_ns)
+        if kind in _STAMPED:
+            arrival = self.clock.on_stamp(kind, message.time_boot_ms, now_ns)
             if arrival is Arrival.RESTARTED:
                 self.version = None  # it may be another one, and its parameters may be others
                 self.telemetry = Telemetry()
@@ -449,12 +450,13 @@ class MavlinkSession(VehicleSession):
     def _on_version(self, version: Message, now_ns: int) -> None:
         """Handle which vehicle it says it is. A found one is the same as before only where it can say so."""
         before, self._known_as, self.version = self._known_as, None, version
-        if before is not None and not _is_same(before, version):
-            heartbeat = self.telemetry.newest("HEARTBEAT", now_ns)
-            if heartbeat is not None and any(_serial(before)) and any(_serial(version)):
-                self._identify(heartbeat)
-                self.telemetry.on_message(heartbeat, now_ns)
-                self.version = version
+        same = True if before is None else _is_same(before, version)
+        heartbeat = self.telemetry.newest("HEARTBEAT", now_ns)
+        if same is False and heartbeat is not None:
+            self._identify(heartbeat)
+            self.telemetry.on_message(heartbeat, now_ns)
+            self.version = version
+        if not same:
             self._read_again(now_ns)
         self.parameters.bytewise = bool(version.capabilities & BYTEWISE)
 
@@ -476,13 +478,11 @@ class MavlinkSession(VehicleSession):
             self.setpoints.takeoff_m = takeoff_height(limits)
 
 
-def _serial(version: Message) -> tuple[int, ...]:
-    return int(version.uid), *version.uid2
-
-
-def _is_same(one: Message, other: Message) -> bool:
-    """Return whether two ``AUTOPILOT_VERSION`` are of one vehicle; one without a serial number can't tell."""
-    return any(_serial(one)) and _serial(one) == _serial(other)
+def _is_same(one: Message, other: Message) -> bool | None:
+    """Return whether two ``AUTOPILOT_VERSION`` are of one vehicle; None: they have no serial number in common."""
+    if any(one.uid2) and any(other.uid2):  # MAVLink 1 has no room for it
+        return list(one.uid2) == list(other.uid2)
+    return bool(one.uid == other.uid) if one.uid and other.uid else None
 
 
 def observed_state(vehicle: VehicleState | None) -> FlightState:
