@@ -10,6 +10,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -269,6 +270,21 @@ def test_two_vehicles_with_one_id_are_told_apart_by_their_addresses() -> None:
         up(sink)
         fly(driver, sink)
         assert host.simulation.truth(0).state is FlightState.LANDED
+
+
+def test_another_vehicle_in_the_place_of_the_first_is_flown_as_what_it_is() -> None:
+    """A PX4, then an ArduCopter with the same system id on the same port, whose numbers of modes mean other things."""
+    ports = Ports.free(Kind.PX4)
+    with opened(f"mavlink://udpin:127.0.0.1:{ports.remote}") as (driver, sink):
+        with firmware(kind=Kind.PX4, ports=ports):
+            up(sink)
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S)
+        with firmware(kind=Kind.ARDUCOPTER, ports=replace(Ports.free(Kind.ARDUCOPTER), remote=ports.remote)):
+            up(sink)
+            assert any("another vehicle answers" in event.text for event in sink.events)
+            assert "mavlink.fs_gcs_enable" in [each.name for each in driver.parameters()]
+            assert "mavlink.nav_dll_act" not in [each.name for each in driver.parameters()]
+            fly(driver, sink)
 
 
 def fly(driver: Driver, sink: RecordingSink) -> None:
