@@ -282,6 +282,7 @@ def test_inav_is_read_and_armed() -> None:
     assert sink.newest is not None
     assert sink.newest.battery == 0.75
     assert sink.newest.yaw_rad == pytest.approx(math.pi / 4)
+    assert session.ask_takeoff(now_ns) == ""
     session.command(Attitude(climb=0.3), now_ns)
     run(0.2)
     assert (sticks[2], sticks[4] >= 1700) == (1000, True), "no throttle, and the arm switch is on"
