@@ -449,7 +449,7 @@ def test_the_end_of_the_block_hovers_if_asked_to(proxy: ScriptedProxy) -> None:
 def test_an_error_in_the_block_comes_out_and_a_landing_that_fails_is_logged(
     proxy: ScriptedProxy, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_landing(*_: object) -> bool:
+    def no_landing(*_: object, **__: object) -> bool:
         raise NoAnswerError("it did not land")
 
     with flown(proxy) as drone:

@@ -61,6 +61,7 @@ class Unsent(NamedTuple):
     action: AnyAction
     intent: int
     since_ns: int
+    automatic: bool = False
 
 
 class CommandSchedule:
@@ -92,6 +93,7 @@ class CommandSchedule:
         self.action: AnyAction = _IDLE
         self.asked: AnyAction = _IDLE  #: what the application commanded last, whether or not it is over
         self.intent = 0
+        self.automatic = False  #: the newest set-point is the library's own, not the application's
         self.owed: Unsent | None = None  #: what was asked for once, and not sent
         self._asked_ns = 0
         # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
@@ -102,11 +104,12 @@ class CommandSchedule:
         self._due_ns = 0
         self._failsafe = Failsafe.NONE
 
-    def ask(self, action: AnyAction, now_ns: int) -> None:
-        """Make ``action`` the set-point of the application."""
+    def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> None:
+        """Make ``action`` the set-point of the application; ``automatic``: it did not ask for that itself."""
         stops = type(action) is Hover and type(self.action) is not Hover
         self.action = self.asked = action
         self.intent += 1
+        self.automatic = automatic
         self._asked_ns = now_ns
         if stops or type(action) in _DONE_IN:  # rare and important: at once
             self._due_ns = now_ns
@@ -128,7 +131,7 @@ class CommandSchedule:
         if now_ns < self._due_ns:
             return None
         if self._decays(now_ns):
-            self.action = _HOVER
+            self.action, self.automatic = _HOVER, True
         elif self._expired(now_ns):
             self.action = _IDLE
         if self.intent != self._sent_intent:
@@ -146,7 +149,7 @@ class CommandSchedule:
         """Note that there was no room for what :meth:`next` returned: set-points follow anyway, a landing may not."""
         stops = self.owed is not None and type(self.owed.action) is EmergencyStop
         if not _is_periodic(action) and not stops:
-            self.owed = Unsent(action, self.intent, now_ns)
+            self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
         """Return :attr:`owed` if it is to be sent before ``action``, which neither repeats nor revokes it."""

@@ -116,6 +116,11 @@ class CommandSender:
         return self._schedule.open_ns
 
     @property
+    def newest(self) -> AnyAction:
+        """What is repeated now; idle where nothing is."""
+        return self._schedule.action
+
+    @property
     def wants_flight(self) -> bool:
         """Whether the newest set-point keeps, or brings, the vehicle in the air."""
         return self._schedule.wants_flight
@@ -156,12 +161,13 @@ class CommandSender:
 
     # The application's side ------------------------------------------------------------------------------------
 
-    def command(self, action: AnyAction, *, now: bool = False) -> bool:
+    def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
         """Make ``action`` the newest set-point.
 
         Args:
             action: The action.
             now: Raise if it can't be sent now. A landing is then kept for when it can, anything else is dropped.
+            automatic: The library asks for it by itself: the proxy takes no vehicle from others for it.
 
         Returns:
             False if it can't be sent now, because the link is down or the authority is still awaited.
@@ -184,7 +190,7 @@ class CommandSender:
                 raise self._not_ours(action)
             if stop and self._role is Role.OBSERVER:
                 raise self._not_ours(action)
-            self._schedule.ask(action, now_ns)
+            self._schedule.ask(action, now_ns, automatic=automatic)
             if not may_send or not self._connection.connected:
                 if now:
                     if type(action) is not Land:  # what was refused now must not be carried out later
@@ -361,20 +367,21 @@ class CommandSender:
         if action is None:
             return False
         first = None if schedule.owed is None else schedule.first(action, now_ns)
-        if first is None or self._transmit(first.action, first.intent):
+        if first is None or self._transmit(first.action, first.intent, first.automatic):
             schedule.owed = None
-            if self._transmit(action, schedule.intent):
+            if self._transmit(action, schedule.intent, schedule.automatic):
                 self.sends.add(0, now_ns, now_ns)
                 return True
         self.sends.dropped += 1
         schedule.not_sent(action, now_ns)
         return False
 
-    def _transmit(self, action: AnyAction, intent: int) -> bool:
+    def _transmit(self, action: AnyAction, intent: int, automatic: bool) -> bool:
         self._seq += 1
         connection = self._connection
         sent_ns = self._clock() + connection.offset_ns
-        return connection.transmit(encode(Command(self._seq, self._authority.status.lease, intent, sent_ns, action)))
+        lease = self._authority.status.lease
+        return connection.transmit(encode(Command(self._seq, lease, intent, sent_ns, action, automatic)))
 
     def _answered(self, answer: AnyReply | LinkError) -> None:
         """Handle the answer to a request for the authority, on the receiving thread."""

@@ -323,7 +323,7 @@ def swarm(
 
     drones, errors = in_parallel({name: join(target) for name, target in chosen.items()})
     if errors and (missing == "raise" or not drones):
-        in_parallel({name: drone._core.leave for name, drone in drones.items()})
+        in_parallel({name: drone._core.end_flight for name, drone in drones.items()})
         raise SwarmError("connecting", errors, len(chosen))
     return Swarm(drones, on_error=on_error, missing=errors)
 

@@ -1075,7 +1075,7 @@ class Drone:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        problem = self._core.leave()
+        problem = self._core.end_flight()
         if problem is not None:
             _log.warning("%s could not be left as it should: %s", self.name, problem)
 

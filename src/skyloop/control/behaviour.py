@@ -88,7 +88,7 @@ class Behaviour(Controller):
             if not self.blind:
                 self.blind = True
                 self.emit("no frames arrive: hovering", Severity.WARNING)
-            self.drone.hover()
+            self.drone._core.let_go("no frames arrive")
 
     def on_frame(self, frame: Frame) -> None:
         """Search the frame, send the law's set-point, and draw what was found."""
@@ -134,7 +134,7 @@ class Behaviour(Controller):
         """
         self.done = True
         self.emit(text, severity)
-        self.drone.hover()
+        self.drone._core.let_go(text)
         self.stop()
 
     def emit(self, text: str, severity: Severity = Severity.INFO) -> None:

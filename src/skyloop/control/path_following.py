@@ -111,7 +111,7 @@ class _PathFlyer(Controller):
 
     def _finish(self) -> None:
         self.done = True
-        self.drone.hover()
+        self.drone._core.let_go("the path is flown")
         self.stop()
 
     def _lose(self) -> None:
@@ -120,7 +120,7 @@ class _PathFlyer(Controller):
             self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is not known: hovering", Severity.WARNING)
         if self._law is not None:
             self._law.pause()
-        self.drone.hover()
+        self.drone._core.let_go("the position is not known")
 
 
 class FollowPath(_PathFlyer):

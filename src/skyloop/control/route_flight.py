@@ -126,8 +126,9 @@ class FlyRoute(Controller):
         for effect in effects:
             if isinstance(effect, Command):
                 self._action = effect.action if isinstance(effect.action, Position) else None
-                if isinstance(effect.action, Land):
-                    self.drone.land(wait=False)
+                if self._action is None:  # it hovers or lands because of how the route goes, not of a person
+                    land = isinstance(effect.action, Land)
+                    self.drone._core.let_go(f"the route is {self.law.state.value}", land=land)
                 else:
                     self.drone.command(effect.action)
             elif isinstance(effect, TakePhoto):

@@ -307,7 +307,7 @@ class CommandHandler:
         if kind is not ReturnToStart and decision.action is not None:
             checks.back = None
         applied_ns = self._count_applied(command)
-        if not self.ladder.idle:
+        if not (self.ladder.idle or (command.automatic and self.ladder.step is Failsafe.LAND)):
             self._apply_failsafe(self.ladder.fresh_command(), now_ns)
         return applied, applied_ns
 

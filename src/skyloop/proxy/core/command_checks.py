@@ -212,6 +212,10 @@ class CommandChecks:
             sequence.acted = command.intent
             if kind is ReturnToStart:
                 self.back = None
+        if command.automatic:
+            new = False  # what the library does by itself is nobody's decision: it takes nothing from others
+            if state is FlightState.LANDING or self._ladder.step is Failsafe.LAND:
+                policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
         problem = self._problem(command, sequence, state, link, new)
         if problem is not None:
             return Decision(None, *problem, new)
@@ -293,10 +297,11 @@ class CommandChecks:
             if kind in SET_POINTS:
                 return Refusal.WRONG_STATE, f"{others}: hover, take off or land first to take it over"
             if not new and kind in _TAKING:
-                return Refusal.WRONG_STATE, f"{others}, and a repeated command does not take it back: send a new one"
+                what = "what the library does by itself" if command.automatic else "a repeated command"
+                return Refusal.WRONG_STATE, f"{others}, and {what} does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
-        if self._ladder.lands_for_battery and kind in SET_POINTS:
+        if self._ladder.lands_for_battery and (kind in SET_POINTS or command.automatic):
             what = "returns to its start" if self._ladder.returning else "lands"
             return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
         if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:
