@@ -65,6 +65,7 @@ UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 DOWN: Final = frozenset({FlightState.LANDED})
 _ENDED: Final = EndedSessions()  #: of all drones of this process
 LANDING_S: Final = 20.0  #: how long a landing is waited for
+STOPPING_S: Final = 2.0  #: how long an emergency stop is repeated
 RETURN_S: Final = 180.0  #: how long a return that the proxy began is waited for
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _SINKING: Final = (*_ENDED_IN, FlightState.LANDING)
@@ -310,6 +311,8 @@ class DroneCore:
             if feedback is not None and feedback.state.airborne and (whose := self._others_hands()):
                 report(f"{whose}: the drone is left to it")
             return None
+        if type(self.commands.newest) is EmergencyStop:  # nothing takes its place until it shows, or is given up
+            self.state.notifier.wait_for(lambda: type(self.commands.newest) is not EmergencyStop, STOPPING_S)
         try:
             if not land:
                 self.let_go(reason)
