@@ -196,6 +196,7 @@ class DroneCore:
         timeout_s: float = 5.0,
         authority: Authority | None = None,
         acquire: bool = True,
+        wait_for_state: bool = True,
     ) -> None:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone if anything fails.
 
@@ -203,6 +204,7 @@ class DroneCore:
             timeout_s: Time for the proxy to answer and to send its first feedback [s].
             authority: How a pilot asks for the authority; None: ``Authority()``.
             acquire: Whether a pilot asks for the authority now; if False it does so when it wants.
+            wait_for_state: Whether to wait for feedback.
 
         Raises:
             NoAnswerError: If no answer or no feedback comes in time.
@@ -214,7 +216,7 @@ class DroneCore:
             deadline = time.monotonic() + timeout_s
             self.supervisor.start(timeout_s)
             left_s = max(0.1, deadline - time.monotonic())
-            if not self.state.notifier.wait_for(self._known, left_s):
+            if wait_for_state and not self.state.notifier.wait_for(self._known, left_s):
                 raise NoAnswerError(f"{self.name} answered, but reported no vehicle state within {timeout_s:g} s")
             if acquire and self.role is Role.PILOT:
                 self.check_open()
