@@ -429,3 +429,18 @@ def test_the_end_of_a_swarm_bars_all_its_drones_before_the_first_lands(
     assert barred == [True]
     assert Land() in proxy.actions()
     assert Land() in other.actions()
+
+
+def test_who_took_it_a_moment_ago_keeps_it_too(proxy: ScriptedProxy, drone: Drone) -> None:
+    """The proxy knows it before feedback has said so, and refuses the landing."""
+
+    def take() -> None:
+        seq = proxy.until_commanded(Land()).seq
+        proxy.event(EventKind.COMMAND_REFUSED, "it is in RTL", "me", seq=seq, reason="wrong_state", app_id=drone.app_id)
+        proxy.more = {"others": "the vehicle is in RTL"}
+
+    steps: list[str] = []
+    taking = background(take)
+    assert drone._core.end_flight(steps.append) is None
+    taking.join(WAIT_S)
+    assert steps == ["landing", "the vehicle is in RTL: the drone is left to it"]

@@ -13,7 +13,7 @@ from skyloop.client.channels import Emit
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.statistics import ChannelCounter
-from skyloop.errors import AuthorityError, Hint, LinkError, NoAnswerError, RefusedError, UsageError
+from skyloop.errors import AuthorityError, ClosedError, Hint, LinkError, NoAnswerError, RefusedError, UsageError
 from skyloop.messages import (
     ACTION_NAMES,
     AnswerTakeover,
@@ -26,6 +26,7 @@ from skyloop.messages import (
     Event,
     EventKind,
     Feedback,
+    Hover,
     Land,
     Position,
     Refusal,
@@ -92,6 +93,7 @@ class CommandSender:
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
+        self.barred = False  #: the end of the flight has begun: only the library's own commands and a stop pass
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
         self.sends = ChannelCounter()  #: commands sent; ``dropped``: not handed to the transport
 
@@ -124,6 +126,11 @@ class CommandSender:
     def wants_flight(self) -> bool:
         """Whether the newest set-point keeps, or brings, the vehicle in the air."""
         return self._schedule.wants_flight
+
+    def bar(self) -> None:
+        """Let no more commands of the application pass but an emergency stop: when this returns, none is on its way."""
+        with self._lock:
+            self.barred = True
 
     def flown_by_person(self) -> None:
         """Require a person's presence from now on; see :meth:`present_until`.
@@ -173,6 +180,7 @@ class CommandSender:
             False if it can't be sent now, because the link is down or the authority is still awaited.
 
         Raises:
+            ClosedError: After :meth:`bar`.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
                 with ``now`` also while the authority is still awaited.
             LinkError: With ``now`` while the link is down.
@@ -180,6 +188,12 @@ class CommandSender:
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
+            if (
+                self.barred
+                and not stop
+                and (not automatic or (type(action) is Hover and type(self._schedule.action) is Land))
+            ):
+                raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
             authority = self._authority
             may_send = authority.held or stop
             if (

@@ -28,6 +28,7 @@ from skyloop.errors import (
     ClosedError,
     LinkError,
     NoAnswerError,
+    RefusedError,
     SkyloopError,
     UnknownNameError,
     UnsupportedError,
@@ -65,6 +66,7 @@ UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 DOWN: Final = frozenset({FlightState.LANDED})
 _ENDED: Final = EndedSessions()  #: of all drones of this process
 LANDING_S: Final = 20.0  #: how long a landing is waited for
+OTHERS_S: Final = 1.0  #: within which feedback says who took a vehicle whose landing was refused
 STOPPING_S: Final = 2.0  #: how long an emergency stop is repeated
 RETURN_S: Final = 180.0  #: how long a return that the proxy began is waited for
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -147,7 +149,6 @@ class DroneCore:
         self.app = app
         self.role = Role.PILOT if access == "pilot" else Role.OBSERVER
         self.closed = False
-        self.ending = False  #: the end of its flight has begun, or it is closed: no more commands of the application
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
         self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
@@ -236,7 +237,7 @@ class DroneCore:
         """
         if self.closed:
             return
-        self.closed = self.ending = True
+        self.closed = True
         try:
             if self.connection.connected:
                 self.commands.release(wait=not self.connection.receiving)
@@ -251,6 +252,11 @@ class DroneCore:
             self.state.wake_all()
             if self._on_close is not None:
                 self._on_close()
+
+    @property
+    def ending(self) -> bool:
+        """Whether the end of the flight has begun, or it is closed."""
+        return self.closed or self.commands.barred
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
         """Hover, or land, because the library finds that it has to: the only place where it does so by itself.
@@ -296,7 +302,7 @@ class DroneCore:
         Returns:
             What went wrong; None if nothing did.
         """
-        self.ending = True
+        self.commands.bar()
         with self._end:
             try:
                 land = self._on_exit == "land"
@@ -326,6 +332,10 @@ class DroneCore:
             else:
                 report("landing")
                 self.complete(Land(), lambda newest: newest.state in _ENDED_IN, True, LANDING_S, automatic=True)
+        except RefusedError as error:
+            if not self.state.notifier.wait_for(lambda: self._others_hands() != "", OTHERS_S):
+                return error
+            report(f"{self._others_hands()}: the drone is left to it")  # who took it a moment ago, too
         except SkyloopError as error:
             return error
         return None
@@ -399,10 +409,8 @@ class DroneCore:
         Raises:
             ClosedError: After :meth:`close`, and from the beginning of :meth:`end_flight` on.
         """
-        if self.ending:
+        if self.closed:
             self.check_open()
-            if not automatic and type(action) is not EmergencyStop:
-                raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
         welcome = self.state.welcome
         if welcome is not None and not welcome.capabilities.actions:
             why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
@@ -622,7 +630,7 @@ class DroneCore:
         text = f"{where} raised {type(error).__name__}: {error}"
         self.state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
         if isinstance(error, SystemExit) and not self.ending:
-            self.ending = True
+            self.commands.bar()
             # No daemon: the interpreter waits for the landing.
             threading.Thread(target=self.end_flight, name="skyloop-end").start()
 

@@ -564,7 +564,7 @@ class Swarm:
             return {}
         self._closed = True
         for drone in self._drones.values():
-            drone._core.ending = True  # of all before the first lands
+            drone._core.commands.bar()  # all before the first lands
         return _problems(self._drones, lambda drone: drone._core.end_flight())
 
     def close(self) -> None:
