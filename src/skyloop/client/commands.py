@@ -26,7 +26,6 @@ from skyloop.messages import (
     Event,
     EventKind,
     Feedback,
-    Hover,
     Land,
     Position,
     Refusal,
@@ -46,6 +45,8 @@ ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for th
 #: time after which a silent one loses the authority.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
+#: What an application asked for and no hover of the library's own may end.
+LANDING: Final = (Land, EmergencyStop)
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 
 
@@ -188,12 +189,10 @@ class CommandSender:
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
-            if (
-                self.barred
-                and not stop
-                and (not automatic or (type(action) is Hover and type(self._schedule.action) is Land))
-            ):
+            if self.barred and not (stop or automatic):
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
+            if automatic and type(action) is not Land and type(self._schedule.action) in LANDING:
+                return False
             authority = self._authority
             may_send = authority.held or stop
             if (

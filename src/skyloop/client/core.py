@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, Protocol, TypedDict
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
 from skyloop.client.channels import Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
-from skyloop.client.commands import CommandSender
+from skyloop.client.commands import LANDING, CommandSender
 from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.logbook import Logbook
@@ -71,7 +71,6 @@ STOPPING_S: Final = 2.0  #: how long an emergency stop is repeated
 RETURN_S: Final = 180.0  #: how long a return that the proxy began is waited for
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _SINKING: Final = (*_ENDED_IN, FlightState.LANDING)
-_STOPPING: Final = (Land, EmergencyStop)  #: what an application asked for and no hover of the library may end
 _log = logging.getLogger("skyloop")
 
 
@@ -272,7 +271,7 @@ class DroneCore:
             Whether something was sent.
         """
         commands, feedback, kind = self.commands, self.state.newest, type(self.commands.newest)
-        if self.closed or kind in _STOPPING or (kind is Hover and not land):
+        if self.closed or kind in LANDING or (kind is Hover and not land):
             return False
         leave = feedback is None or feedback.others or _returns(feedback)
         if land or (kind is Takeoff and feedback is not None and feedback.state is FlightState.LANDED):
