@@ -405,3 +405,30 @@ def test_esc_twice_cuts_the_motors_and_ctrl_c_ends(terminal: Terminal) -> None:
     with skyloop.connect("alpha") as pilot:
         pilot.reset_emergency()
         pilot.wait("landed", timeout_s=30.0)
+
+
+@pytest.mark.process
+def test_l_lands_while_a_stick_key_is_held_and_esc_that_is_held_cuts_nothing(terminal: Terminal) -> None:
+    """The stick's hover came after the landing, which autopilots break off for it."""
+    terminal.until("take off")
+    with skyloop.connect("alpha", access="observe") as drone:
+        terminal.press(b"t")
+        drone.wait("hovering", timeout_s=30.0)
+        for _ in range(6):
+            terminal.press(b"w")
+            time.sleep(0.05)
+        terminal.press(b"\x1b")
+        for _ in range(8):
+            terminal.press(b"\x1b")
+            time.sleep(0.03)
+        terminal.until("Esc is held")
+        for _ in range(4):
+            terminal.press(b"\x1bw")
+            time.sleep(0.03)
+        assert drone.feedback().state.airborne
+        terminal.press(b"w")
+        drone.wait("flying", timeout_s=10.0)
+        terminal.press(b"l")
+        drone.wait("landed", timeout_s=30.0)
+        terminal.press(b"q")
+        assert terminal.wait() == 0

@@ -12,7 +12,7 @@ import pytest
 from skyloop.client import Drone, Swarm
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.control import Controller
-from skyloop.errors import ClosedError, SwarmError
+from skyloop.errors import ClosedError, SkyloopError, SwarmError
 from skyloop.messages import (
     AnyAction,
     Command,
@@ -306,8 +306,13 @@ def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
     proxy.more = {"failsafe": Failsafe.LAND, "return_phase": ReturnPhase.FLYING}
     drone.wait(lambda f: f.return_phase is ReturnPhase.FLYING, WAIT_S)
     steps: list[str] = []
+
+    def report(step: str) -> None:
+        steps.append(step)
+        proxy.notifier.notify()
+
     down = background(lambda: proxy.until(lambda: bool(steps)), lambda: setattr(proxy, "state", LANDED))
-    assert drone._core.end_flight(lambda step: (steps.append(step), proxy.notifier.notify())) is None
+    assert drone._core.end_flight(report) is None
     down.join(WAIT_S)
     assert steps == ["it returns to its start and lands"]
     assert {action.name for action in proxy.actions()} <= {"idle"}
@@ -420,7 +425,12 @@ def test_the_end_of_a_swarm_bars_all_its_drones_before_the_first_lands(
     other, swarm = two
     barred: list[bool] = []
     end = drone._core.end_flight
-    monkeypatch.setattr(drone._core, "end_flight", lambda: (barred.append(swarm["b"]._core.ending), end())[1])
+
+    def watched() -> SkyloopError | None:
+        barred.append(swarm["b"]._core.ending)
+        return end()
+
+    monkeypatch.setattr(drone._core, "end_flight", watched)
     down = landing(proxy), landing(other)
     with swarm:
         pass
