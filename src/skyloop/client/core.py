@@ -232,7 +232,7 @@ class DroneCore:
     def close(self) -> None:
         """Release the authority, then end the connection, all threads and a private proxy. Does not land. Idempotent.
 
-        Threads that wait for this drone get :class:`ClosedError`.
+        A private proxy lands what flies. Threads that wait for this drone get :class:`ClosedError`.
         """
         if self.closed:
             return
