@@ -106,7 +106,8 @@ class Drone:
     end on, commands of other threads raise :class:`ClosedError`, but an emergency stop passes. One that others fly is
     left to them, and one that returns for its battery to its return. ``sys.exit()`` in a callback ends the flight in
     the same way. Ctrl-C, or a notebook's *Stop*, in a call that waits makes the vehicle hover; in :meth:`land` it lands
-    on. A call with ``wait=False`` has nothing to interrupt. A lost proxy is reconnected to for as long as it takes; then everything is restored except old set-points.
+    on. A call with ``wait=False`` has nothing to interrupt. A lost proxy is reconnected to for as long as it takes;
+    then everything is restored except old set-points.
 
     Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
     it is sent at once and repeated at ``rate_hz`` until the next one. Each command but :meth:`takeoff` and :meth:`land`
