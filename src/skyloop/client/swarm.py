@@ -339,8 +339,8 @@ class Swarm:
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
         """Make each action the newest set-point of the drone of its name, all sent together.
 
-        Drones that are set aside are left out. A hover takes no drone from others, as :meth:`hover` says. :attr:`spread`
-        is how far apart the first and the last command left.
+        Drones that are set aside are left out. A hover takes no drone from others, see :meth:`hover`. :attr:`spread` is
+        how far apart the first and the last command left.
 
         Args:
             actions: By name of the drone.
