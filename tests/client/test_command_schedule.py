@@ -16,6 +16,7 @@ from skyloop.messages import (
     AnyAction,
     EmergencyStop,
     Failsafe,
+    Fate,
     Feedback,
     FlightState,
     Hover,
@@ -175,11 +176,11 @@ def test_what_there_was_no_room_for(unsent: AnyAction, then: AnyAction, first: A
 def test_nothing_takes_the_place_of_an_emergency_stop_and_nothing_else_outlives_the_authority() -> None:
     bench = Bench()
     not_sent(bench, Land())
-    bench.commander.clear()
+    bench.commander.clear(Fate.AUTHORITY)
     assert owed(bench) is None
     not_sent(bench, EmergencyStop())
     not_sent(bench, Hover())
-    bench.commander.clear()
+    bench.commander.clear(Fate.AUTHORITY)
     assert owed(bench) == EmergencyStop()
 
 
@@ -198,7 +199,7 @@ def test_every_call_is_a_new_intent_and_repeats_keep_it() -> None:
     assert bench.commander.intent == 1
     bench.ask(FORWARD)
     assert bench.commander.intent == 2
-    bench.commander.clear()
+    bench.commander.clear(Fate.AUTHORITY)
     bench.step(0.1)
     assert bench.commander.intent == 2
 
@@ -282,7 +283,7 @@ def test_an_emergency_ends_the_set_point_and_a_cleared_stop_goes_on() -> None:
     bench.commander.observe(feedback(FlightState.EMERGENCY), bench.clock())
     assert wanted(bench.commander) == Idle()
     bench.ask(EmergencyStop())
-    bench.commander.clear()
+    bench.commander.clear(Fate.AUTHORITY)
     assert wanted(bench.commander) == EmergencyStop()
 
 

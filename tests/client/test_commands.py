@@ -17,6 +17,7 @@ from skyloop.client.core import DroneCore
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
+    AnyAction,
     Attitude,
     Command,
     Done,
@@ -24,11 +25,13 @@ from skyloop.messages import (
     Event,
     EventKind,
     Failsafe,
+    Fate,
     Feedback,
     FlightState,
     Hover,
     Idle,
     Land,
+    Outcome,
     Position,
     Refusal,
     Refused,
@@ -155,12 +158,18 @@ def test_a_landing_that_finds_no_room_is_sent_before_the_next_set_point(proxy: S
     assert actions[actions.index(Velocity(forward=0.2)) - 1] == Land()
 
 
+def refuse(proxy: ScriptedProxy, command: Command, reason: Refusal, text: str, fate: Fate = Fate.REFUSED) -> None:
+    """Feedback tells from now on that this intent is over."""
+    assert proxy.owner is not None
+    proxy.more["outcome"] = Outcome(proxy.owner[0], command.intent, fate, reason, text)
+
+
 def failsafe(proxy: ScriptedProxy, _: Command) -> None:
     proxy.more["failsafe"] = Failsafe.HOVER
 
 
 def not_fresh(proxy: ScriptedProxy, command: Command) -> None:
-    proxy.event(EventKind.COMMAND_REFUSED, "me: ask anew", "me", reason=Refusal.NOT_FRESH.value, seq=command.seq)
+    refuse(proxy, command, Refusal.NOT_FRESH, "me: ask anew", Fate.AUTHORITY)
 
 
 def lost_link(proxy: ScriptedProxy, _: Command) -> None:
@@ -225,7 +234,7 @@ def test_take_off_that_does_not_happen(proxy: ScriptedProxy, drone: Drone) -> No
 
     def vehicle() -> None:
         command = proxy.until_commanded(Takeoff())
-        proxy.event(EventKind.COMMAND_REFUSED, "me: no GPS", "me", reason="vehicle_link_lost", seq=command.seq)
+        refuse(proxy, command, Refusal.VEHICLE_LINK_LOST, "me: no GPS")
 
     thread = threading.Thread(target=vehicle)
     thread.start()
@@ -243,7 +252,7 @@ def test_take_off_that_is_refused_for_good(
     def vehicle() -> None:
         command = proxy.until_commanded(Takeoff())
         proxy.event(EventKind.COMMAND_REFUSED, "somebody: no", "somebody", reason=reason.value, seq=command.seq)
-        proxy.event(EventKind.COMMAND_REFUSED, "me: never", "me", reason=reason.value, seq=command.seq)
+        refuse(proxy, command, reason, "me: never")
 
     thread = threading.Thread(target=vehicle)
     thread.start()
@@ -252,6 +261,127 @@ def test_take_off_that_is_refused_for_good(
     thread.join(WAIT_S)
     after = len(proxy.commands)
     proxy.until(lambda: Idle() in proxy.actions()[after:], "what was refused is asked for no longer")
+
+
+def test_what_was_refused_in_an_earlier_session_concerns_nobody(proxy: ScriptedProxy, drone: Drone) -> None:
+    """After a reconnect it made land(), takeoff() and go_to() raise within a millisecond; so did another's, by name."""
+    proxy.more["outcome"] = Outcome(drone.app_id + 1, 1, Fate.REFUSED, Refusal.WRONG_STATE, "me: never")
+    drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
+    with pytest.raises(NoAnswerError, match=r"within 0\.3 s: the vehicle is landed$"):
+        drone.takeoff(timeout_s=0.3)
+
+
+def test_what_came_of_another_command_does_not_concern_a_take_off(proxy: ScriptedProxy, drone: Drone) -> None:
+    """A controller's velocity, refused on the ground: takeoff() raised its refusal."""
+
+    def vehicle() -> None:
+        proxy.until_commanded(Takeoff())
+        drone.velocity(forward=0.1)
+        refuse(proxy, proxy.until_commanded(Velocity(forward=0.1)), Refusal.WRONG_STATE, "me: never")
+        drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
+        proxy.state = FlightState.HOVERING
+
+    flying = background(vehicle)
+    drone.takeoff(timeout_s=WAIT_S)
+    flying.join(WAIT_S)
+
+
+@pytest.mark.parametrize("state", [FlightState.LANDED, FlightState.TAKING_OFF])
+def test_a_take_off_that_runs_out_of_time_is_withdrawn(proxy: ScriptedProxy, drone: Drone, state: FlightState) -> None:
+    """It raised at 4 s and took off at 14.6 s, the program waiting for a person."""
+    proxy.state = state
+    drone.wait(state.value, WAIT_S)
+    with pytest.raises(NoAnswerError):
+        drone.takeoff(timeout_s=0.2)
+    instead = Idle() if state is FlightState.LANDED else Hover()
+    number = drone._core.commands.intent
+    after = len(proxy.commands)
+    proxy.until(lambda: proxy.actions()[after:].count(instead) >= 3, "it wants the take-off no more")
+    later = [command for command in proxy.commands[after + 1 :] if command.action != Takeoff()]
+    assert Takeoff() not in proxy.actions()[after + 1 :]
+    assert {command.intent for command in later} == {number}, "no new intent: it takes the vehicle from nobody"
+
+
+def interrupt(_: Feedback) -> bool:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("action", "state", "instead"),
+    [
+        (Takeoff(), FlightState.LANDED, Land()),
+        (Takeoff(), FlightState.TAKING_OFF, Hover()),
+        (Position(1.0, 2.0, 1.5), FlightState.FLYING, Hover()),
+        (Land(), FlightState.LANDING, Land()),
+    ],
+)
+def test_an_interrupted_call_leaves_nothing_to_happen_later(
+    proxy: ScriptedProxy, drone: Drone, action: AnyAction, state: FlightState, instead: AnyAction
+) -> None:
+    """Ctrl-C in go_to() or takeoff() stopped nothing: it flew on, or took off 6 s later. A landing goes on."""
+    proxy.state = state
+    drone.wait(state.value, WAIT_S)
+    with pytest.raises(KeyboardInterrupt):
+        drone._core.complete(action, interrupt, True, WAIT_S)
+    after = len(proxy.commands)
+    proxy.until(lambda: proxy.actions()[after:].count(instead) >= 3, "what the vehicle does instead")
+    assert set(proxy.actions()[after + 1 :]) == {instead}
+
+
+def test_a_take_off_that_is_not_possible_yet_is_asked_for_anew_until_its_time_is_over(
+    proxy: ScriptedProxy, drone: Drone
+) -> None:
+    """The driver gave up after 25 s, the vehicle was ready at 43 s, and the call waited for nothing until 120 s."""
+
+    def vehicle() -> None:
+        first = proxy.until_commanded(Takeoff())
+        refuse(proxy, first, Refusal.DRIVER_FAILED, "me: no GPS")
+        proxy.until(lambda: proxy.commands[-1].intent > first.intent and proxy.commands[-1].action == Takeoff())
+        refuse(proxy, proxy.commands[-1], Refusal.DRIVER_FAILED, "me: it calibrates")
+
+    refusing = background(vehicle)
+    with pytest.raises(NoAnswerError, match="landed; me: it calibrates"):
+        drone.takeoff(timeout_s=0.9)
+    refusing.join(WAIT_S)
+    assert 2 <= len({command.intent for command in proxy.commands if command.action == Takeoff()}) <= 3
+
+
+def test_a_refused_take_off_that_nobody_waits_for_is_not_repeated(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.takeoff(wait=False)
+    refuse(proxy, proxy.until_commanded(Takeoff()), Refusal.DRIVER_FAILED, "me: not yet")
+    drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
+    after = len(proxy.commands)
+    proxy.until(lambda: len(proxy.commands) > after + 4, "repeats")
+    assert set(proxy.actions()[after + 1 :]) == {Idle()}
+
+
+def test_a_set_point_returns_false_while_set_points_are_refused(proxy: ScriptedProxy, drone: Drone) -> None:
+    """After another's LAND it returned True 60 of 60 times, while each was refused."""
+    proxy.state = FlightState.LANDING
+    assert drone.velocity(forward=0.1)
+    why = "me: velocity refused: the vehicle is in LAND"
+    refuse(proxy, proxy.until_commanded(Velocity(forward=0.1)), Refusal.WRONG_STATE, why, Fate.OTHERS)
+    drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
+    assert not drone.velocity(forward=0.2)
+    assert not drone.velocity(forward=0.3)
+    proxy.until_commanded(Velocity(forward=0.3))
+    assert drone.hover()
+    assert drone.velocity(forward=0.4), "a hover may have taken it back"
+
+
+def test_a_landing_is_repeated_until_the_proxy_tells_that_it_is_done(proxy: ScriptedProxy, drone: Drone) -> None:
+    """Feedback from before it said "landed": one packet was sent, then Idle, and if that one was lost it hovered on."""
+    proxy.more["outcome"] = Outcome()
+    drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
+    landing = background(lambda: drone.land(timeout_s=WAIT_S))
+    command = proxy.until_commanded(Land())
+    proxy.more["outcome"] = Outcome(drone.app_id, command.intent)
+    proxy.until(lambda: proxy.actions().count(Land()) > 15, "it is repeated for more than 0.3 s")
+    proxy.more["outcome"] = Outcome(drone.app_id, command.intent, Fate.COMPLETED)
+    landing.join(WAIT_S)
+    assert not landing.is_alive()
+    after = len(proxy.commands)
+    proxy.until(lambda: Idle() in proxy.actions()[after:], "it is done")
 
 
 PLACE = Position(1.0, 2.0, 1.5, 0.5, 0.8)
@@ -310,7 +440,7 @@ def test_a_place_that_is_refused(
 
     def vehicle() -> None:
         command = proxy.until_commanded(PLACE)
-        proxy.event(EventKind.COMMAND_REFUSED, "me: never", "me", reason=reason.value, seq=command.seq)
+        refuse(proxy, command, reason, "me: never")
 
     refusing = background(vehicle)
     with pytest.raises(error, match="me: never"):

@@ -19,12 +19,15 @@ from skyloop.messages import (
     EmergencyStop,
     EventKind,
     Failsafe,
+    Fate,
     Feedback,
     FlightState,
     Hover,
     Idle,
     Land,
+    Outcome,
     Position,
+    Refusal,
     ReturnPhase,
     Takeoff,
     Velocity,
@@ -445,9 +448,10 @@ def test_who_took_it_a_moment_ago_keeps_it_too(proxy: ScriptedProxy, drone: Dron
     """The proxy knows it before feedback has said so, and refuses the landing."""
 
     def take() -> None:
-        seq = proxy.until_commanded(Land()).seq
-        proxy.event(EventKind.COMMAND_REFUSED, "it is in RTL", "me", seq=seq, reason="wrong_state", app_id=drone.app_id)
-        proxy.more = {"others": "the vehicle is in RTL"}
+        intent = proxy.until_commanded(Land()).intent
+        refused = Outcome(drone.app_id, intent, Fate.REFUSED, Refusal.WRONG_STATE, "it is in RTL")
+        proxy.feedback(outcome=refused)
+        proxy.more = {"outcome": refused, "others": "the vehicle is in RTL"}
 
     steps: list[str] = []
     taking = background(take)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import msgspec
 import pytest
 
 import skyloop
@@ -13,7 +12,7 @@ from skyloop.control import FlyRoute, Photo, Route, RouteWaypoint, Wait
 from skyloop.control.route_flight import ENDED, check_for, save_photo
 from skyloop.control.route_law import Progress, TakePhoto
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.messages import Event, EventKind, Position, Refusal
+from skyloop.messages import Event, EventKind, Fate, Outcome, Refusal
 from skyloop.stepping.rehearsal import rehearse
 
 CALM = "sim://?world=empty&cameras=none&wind=0"
@@ -81,16 +80,16 @@ def test_a_refused_leg_pauses_with_the_reason_and_can_be_skipped() -> None:
     assert "a no-fly zone is in the straight way there" in paused[0].text
 
 
-def test_a_stall_of_this_program_is_told_as_what_it_was() -> None:
+@pytest.mark.parametrize(
+    ("fate", "told"), [(Fate.FAILSAFE, ENDED), (Fate.REFUSED, "position refused: a zone"), (Fate.REPLACED, "")]
+)
+def test_a_stall_of_this_program_is_told_as_what_it_was(fate: Fate, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with rehearse(CALM) as drone:
         flight = FlyRoute(drone, TRIANGLE)
-        flight._action = Position(0.5, 0.0, 1.0)
-        text = "position refused: it repeats a command from before a failsafe or a new lease: send a new one"
-        event = Event(EventKind.COMMAND_REFUSED, text, 1, app=drone._core.app, data={"reason": Refusal.NOT_FRESH})
-        flight._on_event(event)
-        assert flight._refused == ENDED
-        flight._on_event(msgspec.structs.replace(event, data={"reason": Refusal.OUT_OF_RANGE}))
-        assert flight._refused == text
+        flight._leg = 7
+        outcome = Outcome(1, 7, fate, Refusal.NOT_FRESH, "position refused: a zone")
+        monkeypatch.setattr(drone._core.commands, "outcome", lambda intent: outcome if intent == 7 else None)
+        assert [flight._why_ended(), flight._why_ended()] == [told, ""]
 
 
 def test_it_is_paused_and_ended_from_another_place() -> None:

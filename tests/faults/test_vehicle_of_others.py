@@ -22,7 +22,7 @@ from skyloop.control.route import Route, RouteWaypoint
 from skyloop.control.route_law import RouteState
 from skyloop.drivers.registry import make_driver
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.errors import RefusedError, SwarmError
+from skyloop.errors import NoAnswerError, RefusedError, SwarmError
 from skyloop.messages import EventKind, Feedback
 from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.core.ownership import Whose
@@ -50,10 +50,10 @@ pytestmark = pytest.mark.timeout(60)
 class Scene:
     """An autopilot, another ground station, and a proxy that may be started and killed."""
 
-    def __init__(self, kind: Kind, note: Path) -> None:
+    def __init__(self, kind: Kind, note: Path, boot_s: float = 0.5) -> None:
         world = SimHost(with_multirotors(SimOptions(world="empty", seed=4, wind=0.0, speed=3.0)))
         self.kind = kind
-        self.firmware = MavlinkFirmware(world, kind=kind, ports=Ports.free(kind), boot_s=0.5)
+        self.firmware = MavlinkFirmware(world, kind=kind, ports=Ports.free(kind), boot_s=boot_s)
         self.note = note
         self.ours: list[int] = []  #: numbers of the commands by which the proxy steered
         self.set_points = 0
@@ -207,11 +207,12 @@ def test_what_others_order_while_set_points_are_flown_stays_when_the_application
                 drone.velocity(forward=0.3)
                 time.sleep(0.02)
             scene.station_mode(mode)
-            wait_until(lambda: drone.velocity(forward=0.3) and proxy.driver.left_to() != "", "it is seen")
+            wait_until(lambda: [drone.velocity(forward=0.3), proxy.driver.left_to() != ""][1], "it is seen")
             scene.ours.clear()
             refused = threading.Event()
             drone.on_event(lambda e: refused.set() if e.kind is EventKind.COMMAND_REFUSED else None)
-            wait_until(lambda: drone.velocity(forward=0.3) and refused.is_set(), "set-points are refused")
+            wait_until(lambda: [drone.velocity(forward=0.3), refused.is_set()][1], "set-points are refused")
+            wait_until(lambda: not drone.velocity(forward=0.3), "and the program is told so by each of them")
             reason = next(e for e in reversed(drone.recent_events()) if e.kind is EventKind.COMMAND_REFUSED)
             assert "which was not chosen here: hover, take off or land first" in reason.text
             scene.watched(proxy, 150)  # the set-point decays to hover, and the ladder loses its patience
@@ -346,3 +347,111 @@ def test_a_killed_proxy_ends_its_own_flight_when_it_is_back_unless_others_took_i
             wait_until(lambda: second.handler.ownership.others != "" or not scene.armed, "it is left")
             wait_until(lambda: not scene.armed, "it is home")
             assert scene.ours == []
+
+
+# An intent that is over stays over -----------------------------------------------------------------------------------
+
+
+def ready(scene: Scene) -> Drone:
+    """A drone that stands, and may be armed."""
+    drone = scene.drone()
+    drone.wait(lambda f: bool((f.native or {}).get("mavlink.ready")), timeout_s=WAIT_S)
+    return drone
+
+
+def stays_down(scene: Scene, proxy: Proxy) -> None:
+    """It stands disarmed, and still does some seconds of its time later."""
+    wait_until(lambda: not scene.armed, "it stands")
+    scene.watched(proxy, 150)
+    assert not scene.armed
+    assert scene.height < 0.3
+
+
+@KINDS
+def test_a_take_off_that_others_land_at_once_does_not_begin_again_when_it_stands(kind: Kind, note: Path) -> None:
+    """0.1 s after touch-down, motors still turning, it took off again, to 7.8 m, with somebody walking up to it."""
+    with Scene(kind, note) as scene:
+        proxy = scene.proxy()
+        with ready(scene) as drone:
+            drone.takeoff(wait=False)
+            wait_until(lambda: scene.height > 1.0, "it climbs")
+            scene.station_mode("LAND")
+            stays_down(scene, proxy)
+
+
+@KINDS
+@pytest.mark.parametrize("wait", [True, False])
+def test_a_vehicle_that_is_disarmed_in_its_take_off_stays_disarmed(kind: Kind, wait: bool, note: Path) -> None:
+    """It tips over, or a switch kills it: 0.1 s later it armed itself, and the call returned as a success."""
+    with Scene(kind, note) as scene:
+        proxy = scene.proxy()
+        with ready(scene) as drone:
+
+            def kill() -> None:
+                wait_until(lambda: scene.armed, "it is armed")
+                scene.station(m.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, 21196.0)
+
+            killing = threading.Thread(target=kill)
+            killing.start()
+            if wait:
+                with pytest.raises(RefusedError, match=r"landed or disarmed|which was not chosen here"):
+                    drone.takeoff(timeout_s=WAIT_S)
+            else:
+                drone.takeoff(wait=False)
+            killing.join()
+            stays_down(scene, proxy)
+
+
+def test_a_take_off_that_ran_out_of_time_before_the_autopilot_was_ready_is_not_flown_later(note: Path) -> None:
+    """It raised at 4.0 s and took off at 14.6 s, the program waiting for a person."""
+    with Scene(Kind.ARDUCOPTER, note, boot_s=6.0) as scene:
+        proxy = scene.proxy()
+        with scene.drone() as drone:
+            drone.wait("landed", WAIT_S)
+            with pytest.raises(NoAnswerError, match="takeoff was not completed"):
+                drone.takeoff(timeout_s=0.7)
+            wait_until(lambda: scene.firmware.autopilot.ready, "it may be armed")
+            stays_down(scene, proxy)
+
+
+def test_a_take_off_that_is_waited_for_begins_when_the_autopilot_is_ready(note: Path) -> None:
+    with Scene(Kind.ARDUCOPTER, note, boot_s=6.0) as scene:
+        scene.proxy()
+        with scene.drone() as drone:
+            drone.wait("landed", WAIT_S)
+            drone.takeoff(timeout_s=2 * WAIT_S)
+            assert scene.height > 4.0
+
+
+@KINDS
+@pytest.mark.parametrize("meanwhile", ["hovers", "takes off"])
+def test_a_refused_place_is_not_flown_to_by_its_repeats(kind: Kind, meanwhile: str, note: Path) -> None:
+    """go_to(z=-4) was refused, and stood on the floor 3 to 4 s later with its motors running."""
+    with Scene(kind, note) as scene:
+        proxy = scene.proxy()
+        with ready(scene) as drone:
+            drone.takeoff(wait=meanwhile == "hovers", timeout_s=WAIT_S)
+            wait_until(lambda: scene.height > 1.0, "it is in the air")
+            drone.go_to(x=0.0, y=0.0, z=-4.0, wait=False)
+            refused = drone.wait(lambda f: f.outcome is not None and f.outcome.failed, WAIT_S).outcome
+            assert refused is not None
+            assert "below the ground" in refused.text
+            scene.watched(proxy, 150)
+            assert scene.height > 1.0
+            with pytest.raises(RefusedError, match="below the ground"):
+                drone.go_to(x=0.0, y=0.0, z=-4.0)
+            scene.watched(proxy, 60)
+            assert scene.height > 1.0
+            drone.land(timeout_s=WAIT_S)
+
+
+@KINDS
+def test_a_take_off_right_after_a_landing(kind: Kind, note: Path) -> None:
+    """It was told "disarmed itself", by an arming that was heard before."""
+    with Scene(kind, note) as scene:
+        scene.proxy()
+        with taken_off(scene) as drone:
+            drone.land(timeout_s=WAIT_S)
+            drone.takeoff(timeout_s=WAIT_S)
+            assert not [event for event in drone.recent_events() if event.data.get("reason") == "no_takeoff"]
+            drone.land(timeout_s=WAIT_S)

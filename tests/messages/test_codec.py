@@ -69,7 +69,7 @@ def test_a_camera_told_by_an_older_proxy_has_no_stream() -> None:
 def test_feedback_of_an_older_proxy_has_no_reason_of_its_link_and_nobody_else_who_flies(name: str) -> None:
     older = decode((PACKETS / "older" / f"{name}.bin").read_bytes())
     before: dict[str, object] = {"link_reason": "", "link_remedy": "", "others": None}
-    before |= {"start_position_m": None, "return_phase": ReturnPhase.NONE, "skipped": 0}
+    before |= {"start_position_m": None, "return_phase": ReturnPhase.NONE, "skipped": 0, "outcome": None}
     assert older == msgspec.structs.replace(SAMPLES[name], **before)
 
 

@@ -26,6 +26,7 @@ PARTS = (
     messages.CameraInfo,
     messages.Capabilities,
     messages.Parameter,
+    messages.Outcome,
     messages.VehicleOverview,
 )
 STRUCTS: list[type[msgspec.Struct]] = [*codec.KINDS, *command.ACTION_NAMES, *BODIES, *PARTS]

@@ -26,7 +26,8 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.proxy.core.command_checks import STATE_POLICIES, CommandSequence, StatePolicy, explain, explain_state
+from skyloop.proxy.core.command_checks import STATE_POLICIES, StatePolicy, explain, explain_state
+from skyloop.proxy.core.intents import Intents
 
 NOW = 100 * NS_PER_S
 MAX_AGE = NS_PER_S // 4
@@ -35,7 +36,7 @@ LEASE = 3
 
 
 def receive(
-    sequence: CommandSequence,
+    sequence: Intents,
     *,
     seq: int = 1,
     lease: int = LEASE,
@@ -44,15 +45,15 @@ def receive(
     action: AnyAction = Hover(),  # noqa: B008  frozen
     holds: bool = True,
 ) -> Refusal | None:
-    return sequence.receive(Command(seq, lease, intent, sent_ns, action), NOW, MAX_AGE, LEASE, holds)
+    return sequence.check(Command(seq, lease, intent, sent_ns, action), NOW, MAX_AGE, LEASE, holds)
 
 
 def test_a_good_command_passes() -> None:
-    assert receive(CommandSequence()) is None
+    assert receive(Intents()) is None
 
 
 def test_the_sequence_grows_strictly() -> None:
-    sequence = CommandSequence()
+    sequence = Intents()
     assert receive(sequence, seq=0) is None
     assert receive(sequence, seq=5) is None
     assert receive(sequence, seq=5) is Refusal.OUT_OF_SEQUENCE
@@ -61,7 +62,7 @@ def test_the_sequence_grows_strictly() -> None:
 
 
 def test_a_refused_command_still_counts_for_the_sequence() -> None:
-    sequence = CommandSequence()
+    sequence = Intents()
     assert receive(sequence, seq=5, sent_ns=0) is Refusal.STALE
     assert receive(sequence, seq=4) is Refusal.OUT_OF_SEQUENCE
 
@@ -71,7 +72,7 @@ def test_a_refused_command_still_counts_for_the_sequence() -> None:
     [(0, None), (250, None), (251, Refusal.STALE), (-50, None), (-51, Refusal.STALE), (99_999, Refusal.STALE)],
 )
 def test_the_age_has_both_bounds(age_ms: int, expected: Refusal | None) -> None:
-    assert receive(CommandSequence(), sent_ns=NOW - age_ms * MS) is expected
+    assert receive(Intents(), sent_ns=NOW - age_ms * MS) is expected
 
 
 @pytest.mark.parametrize(
@@ -87,12 +88,12 @@ def test_the_age_has_both_bounds(age_ms: int, expected: Refusal | None) -> None:
     ],
 )
 def test_the_lease_in_force_of_its_holder_and_no_other(lease: int, holds: bool, expected: Refusal | None) -> None:
-    assert receive(CommandSequence(), lease=lease, holds=holds) is expected
+    assert receive(Intents(), lease=lease, holds=holds) is expected
 
 
 def test_nobody_flies_without_a_lease_in_force() -> None:
     command = Command(1, 0, 1, NOW, Hover())
-    assert CommandSequence().receive(command, NOW, MAX_AGE, 0, False) is Refusal.NO_AUTHORITY
+    assert Intents().check(command, NOW, MAX_AGE, 0, False) is Refusal.NO_AUTHORITY
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -101,28 +102,7 @@ def test_nobody_flies_without_a_lease_in_force() -> None:
 def test_numbers_must_be_finite(bad: float, kind: type[Velocity | Attitude], place: int) -> None:
     numbers = [0.0] * 4
     numbers[place] = bad
-    assert receive(CommandSequence(), action=kind(*numbers)) is Refusal.NON_FINITE
-
-
-def test_repeats_from_before_the_floor_are_not_fresh() -> None:
-    sequence = CommandSequence()
-    old, new = Command(1, LEASE, 4, NOW, Hover()), Command(2, LEASE, 5, NOW, Hover())
-    sequence.receive(old, NOW, MAX_AGE, LEASE, True)
-    assert sequence.fresh(old)
-    sequence.end_intents()
-    assert not sequence.fresh(old)
-    assert sequence.fresh(new)
-
-
-def test_intents_of_refused_commands_are_ended_too() -> None:
-    sequence = CommandSequence()
-    receive(sequence, seq=1, intent=9, lease=LEASE - 1)
-    sequence.end_intents()
-    assert not sequence.fresh(Command(2, LEASE, 9, NOW, Hover()))
-
-
-def test_before_anything_was_received_intent_zero_is_fresh() -> None:
-    assert CommandSequence().fresh(Command(0, LEASE, 0, NOW, Hover()))
+    assert receive(Intents(), action=kind(*numbers)) is Refusal.NON_FINITE
 
 
 S = FlightState
@@ -162,18 +142,14 @@ def test_every_action_but_the_emergency_stop_has_a_plan_for_every_state() -> Non
     ],
 )
 def test_refusals_say_what_would_be_right(reason: Refusal, command: Command, words: list[str]) -> None:
-    sequence = CommandSequence()
-    sequence.seq = 7
-    text = explain(reason, command, sequence, now_ns=NOW, max_age_ns=MAX_AGE, lease=LEASE)
+    text = explain(reason, command, 7, now_ns=NOW, max_age_ns=MAX_AGE, lease=LEASE)
     for word in words:
         assert word in text
 
 
 def test_a_foreign_lease_when_none_is_in_force_says_so() -> None:
     command = Command(9, 2, 1, NOW, Hover())
-    assert "no lease" in explain(
-        Refusal.FOREIGN_LEASE, command, CommandSequence(), now_ns=NOW, max_age_ns=MAX_AGE, lease=0
-    )
+    assert "no lease" in explain(Refusal.FOREIGN_LEASE, command, -1, now_ns=NOW, max_age_ns=MAX_AGE, lease=0)
 
 
 @pytest.mark.parametrize(("kind", "row"), _POLICY_TABLE)
@@ -186,7 +162,7 @@ def test_each_refused_state_is_explained(kind: type[Action], row: str) -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 40), st.integers(-(10**9), 10**9)), max_size=60))
 def test_accepted_commands_are_strictly_newer_and_young(packets: list[tuple[int, int]]) -> None:
-    sequence = CommandSequence()
+    sequence = Intents()
     accepted = [(seq, age) for seq, age in packets if receive(sequence, seq=seq, sent_ns=NOW - age) is None]
     assert all(before[0] < after[0] for before, after in pairwise(accepted))
     assert all(-50 * MS <= age <= MAX_AGE for _, age in accepted)

@@ -206,7 +206,7 @@ def test_a_lost_vehicle_link_refuses_commands_until_fresh_ones_come(bench: Bench
     assert (feedback.vehicle_link, feedback.failsafe) == ("lost", "hover")
     bench.driver.link(LinkState.UP)
     pilot.command(Velocity(0.6), repeat=True)
-    assert pilot.refusals() == [Refusal.VEHICLE_LINK_LOST, Refusal.NOT_FRESH]
+    assert pilot.refusals() == [Refusal.VEHICLE_LINK_LOST], "it is over: its repeats get the same answer"
     pilot.command(Velocity(0.7))
     assert bench.driver.told == [Velocity(0.5), Hover(), Hover(), Velocity(0.7)]  # the first may have been lost
     bench.tick()

@@ -223,7 +223,7 @@ def test_a_refusal_of_the_vehicle_is_told_once_in_its_own_words_and_by_its_newes
     monkeypatch.setattr(bench.driver, "apply", refuse)
     pilot = bench.pilot()
     pilot.command(Takeoff())
-    bench.run(1.1, lambda: pilot.command(Takeoff(), repeat=True))
+    bench.run(1.1, lambda: pilot.command(Takeoff()))
     told = [event.text for event in pilot.told(EventKind.COMMAND_REFUSED)]
     assert told[0] == "pilot: takeoff refused: the vehicle does not start yet: System not initialised"
     assert "GPS has no fix" in told[1]

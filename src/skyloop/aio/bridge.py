@@ -12,6 +12,7 @@ from contextlib import AbstractAsyncContextManager
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
+from skyloop.client.completion import cancelled
 from skyloop.client.mailbox import Notifier
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
@@ -63,7 +64,8 @@ def on_loop(function: Callback[T]) -> Callable[[T], Any]:
 async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], object] | None = None) -> T:
     """Run a function that waits on a thread of its own: a pool could be full when the vehicle has to land.
 
-    If the caller is cancelled meanwhile, ``abandoned`` is called with the result that nobody waits for.
+    If the caller is cancelled meanwhile, a wait for a command ends (see :data:`skyloop.client.completion.cancelled`),
+    and ``abandoned`` is called with the result that nobody waits for.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
@@ -79,6 +81,7 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
 
     def work() -> None:
         result, error = None, None
+        cancelled.set(future.cancelled)
         try:
             result = function()
         except BaseException as problem:  # noqa: BLE001  (it is raised where the result is awaited)

@@ -16,22 +16,27 @@ from skyloop.messages import (
     Attitude,
     EmergencyStop,
     Failsafe,
+    Fate,
     Feedback,
     FlightState,
     Hover,
     Idle,
     Land,
+    Outcome,
     Position,
+    Refusal,
     ResetEmergency,
     ReturnToStart,
     Takeoff,
     Velocity,
 )
 from skyloop.messages.command import SET_POINTS
+from skyloop.messages.intent import ENDINGS
 
 _IDLE: Final = Idle()
 _HOVER: Final = Hover()
-#: Actions that are done once the vehicle is in one of these states; then they are no longer sent.
+#: Actions that are done once the vehicle is in one of these states, where the proxy does not tell; then they are no
+#: longer sent.
 _DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
     Takeoff: frozenset({FlightState.HOVERING, FlightState.FLYING}),
     Land: frozenset({FlightState.LANDED}),
@@ -91,9 +96,9 @@ class CommandSchedule:
         self._min_interval_ns = nanoseconds(min_interval_s)
         self._keep_ns = nanoseconds(keep_s)
         self.action: AnyAction = _IDLE
-        self.asked: AnyAction = _IDLE  #: what the application commanded last, whether or not it is over
-        self.intent = 0
+        self.intent = 0  #: number of the newest intent
         self.automatic = False  #: the newest set-point is the library's own, not the application's
+        self.over: Outcome | None = None  #: what ended it, once it is over
         self.owed: Unsent | None = None  #: what was asked for once, and not sent
         self._asked_ns = 0
         # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
@@ -104,10 +109,16 @@ class CommandSchedule:
         self._due_ns = 0
         self._failsafe = Failsafe.NONE
 
-    def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> None:
-        """Make ``action`` the set-point of the application; ``automatic``: it did not ask for that itself."""
+    def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
+        """Make ``action`` the set-point of the application; return the number of this intent.
+
+        Args:
+            action: The action.
+            now_ns: On this process's clock.
+            automatic: The application did not ask for it itself.
+        """
         stops = type(action) is Hover and type(self.action) is not Hover
-        self.action = self.asked = action
+        self.action, self.over = action, None
         self.intent += 1
         self.automatic = automatic
         self._asked_ns = now_ns
@@ -115,6 +126,7 @@ class CommandSchedule:
             self._due_ns = now_ns
         else:
             self._due_ns = max(now_ns, self.open_ns)
+        return self.intent
 
     @property
     def open_ns(self) -> int:
@@ -162,32 +174,48 @@ class CommandSchedule:
         """Return whether the set-point ``before`` has decayed to hover because the application made no call."""
         return self.action is _HOVER and before is not _HOVER
 
-    def observe(self, feedback: Feedback, now_ns: int) -> None:
-        """Update from the vehicle's state: end an action that is done, or a set-point that a failsafe overruled."""
-        kind = type(self.action)
+    def observe(self, feedback: Feedback, now_ns: int, app_id: int = 0) -> None:
+        """End what is over: by what the proxy tells of this intent, or because a failsafe overruled a set-point.
+
+        Args:
+            feedback: The newest.
+            now_ns: On this process's clock.
+            app_id: Number of this application in this run of the proxy.
+        """
+        kind, outcome = type(self.action), feedback.outcome
         done_in = _DONE_IN.get(kind)
+        if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent) and outcome.over:
+            self._end(outcome)
         if done_in is None:
-            over = feedback.state is FlightState.EMERGENCY
-        else:
-            over = feedback.state in done_in and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
-        if over:
+            if feedback.state is FlightState.EMERGENCY:
+                self.clear(Fate.EMERGENCY)
+        elif (
+            (outcome is None or kind is EmergencyStop)  # a proxy of an earlier version, or anybody's to press
+            and feedback.state in done_in
+            and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
+        ):
             self.action = _IDLE
         if feedback.failsafe is not self._failsafe:
             self._failsafe = feedback.failsafe
             if feedback.failsafe is not Failsafe.NONE:
-                self.clear()
+                self.clear(Fate.FAILSAFE)
 
-    def clear(self) -> None:
-        """Drop the set-point, after a lost authority or a failsafe. An emergency stop stays."""
-        if not isinstance(self.action, EmergencyStop):
-            self.action = _IDLE
+    def clear(self, fate: Fate) -> None:
+        """Drop the set-point, which ``fate`` ended here. An emergency stop stays."""
+        self._end(Outcome(0, self.intent, fate, Refusal.NOT_FRESH, ENDINGS[fate]))
         if self.owed is not None and type(self.owed.action) is not EmergencyStop:
             self.owed = None
+
+    def _end(self, outcome: Outcome) -> None:
+        if self.over is None:
+            self.over = outcome
+        if type(self.action) is not EmergencyStop:
+            self.action = _IDLE
 
     def resume(self, now_ns: int) -> None:
         """Start to send (again): drop a set-point that is too old."""
         if now_ns - self._asked_ns > self._keep_ns:
-            self.clear()
+            self.clear(Fate.LINK)
         self._failsafe = Failsafe.NONE
         self._due_ns = now_ns
 

@@ -25,8 +25,10 @@ from skyloop.messages import (
     EmergencyStop,
     Event,
     EventKind,
+    Fate,
     Feedback,
     Land,
+    Outcome,
     Position,
     Refusal,
     Refused,
@@ -36,8 +38,10 @@ from skyloop.messages import (
     Role,
     encode,
 )
+from skyloop.messages.command import SET_POINTS
 from skyloop.messages.config import MAX_REASON
 from skyloop.messages.earth import is_on_earth
+from skyloop.messages.intent import ENDINGS
 
 _OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
 ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
@@ -48,6 +52,7 @@ _LATER_NS: Final = 1_000_000_000
 #: What an application asked for and no hover of the library's own may end.
 LANDING: Final = (Land, EmergencyStop)
 _ACTIONS: Final = frozenset(ACTION_NAMES)
+_REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: so ended, the next set-point is most likely refused, too
 
 
 class CommandSender:
@@ -95,6 +100,8 @@ class CommandSender:
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
         self.barred = False  #: the end of the flight has begun: only the library's own commands and a stop pass
+        self._told: Outcome | None = None  # the newest outcome of ours
+        self._first_set_point = 0  # number of the first in the present row of set-points; 0: the newest is none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
         self.sends = ChannelCounter()  #: commands sent; ``dropped``: not handed to the transport
 
@@ -109,9 +116,9 @@ class CommandSender:
         return self._authority.app_id
 
     @property
-    def seq(self) -> int:
-        """Number of the last command sent on this connection."""
-        return self._seq
+    def intent(self) -> int:
+        """Number of the newest intent."""
+        return self._schedule.intent
 
     @property
     def open_ns(self) -> int:
@@ -159,7 +166,7 @@ class CommandSender:
             absent = known_ns < self._clock()
             self._present_until_ns = until_ns
             if absent:
-                self._schedule.clear()  # set-points from before the absence are not repeated
+                self._schedule.clear(Fate.WITHDRAWN)  # set-points from before the absence are not repeated
         if absent:
             self._connection.poke()
 
@@ -170,6 +177,16 @@ class CommandSender:
     # The application's side ------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
+        """Make ``action`` the newest set-point; see :meth:`ask`, and False also while set-points are refused."""
+        intent, sent = self.ask(action, now=now, automatic=automatic)
+        if not isinstance(action, SET_POINTS):
+            self._first_set_point = 0
+            return sent
+        told = self._told
+        self._first_set_point = self._first_set_point or intent
+        return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
+
+    def ask(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> tuple[int, bool]:
         """Make ``action`` the newest set-point.
 
         Args:
@@ -178,7 +195,8 @@ class CommandSender:
             automatic: The library asks for it by itself: the proxy takes no vehicle from others for it.
 
         Returns:
-            False if it can't be sent now, because the link is down or the authority is still awaited.
+            The number of the intent; and False if it can't be sent now, because the link is down or the authority is
+            still awaited.
 
         Raises:
             ClosedError: After :meth:`bar`.
@@ -192,7 +210,7 @@ class CommandSender:
             if self.barred and not (stop or automatic):
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
             if automatic and type(action) is not Land and type(self._schedule.action) in LANDING:
-                return False
+                return self._schedule.intent, False
             authority = self._authority
             may_send = authority.held or stop
             if (
@@ -203,35 +221,29 @@ class CommandSender:
                 raise self._not_ours(action)
             if stop and self._role is Role.OBSERVER:
                 raise self._not_ours(action)
-            self._schedule.ask(action, now_ns, automatic=automatic)
+            intent = self._schedule.ask(action, now_ns, automatic=automatic)
             if not may_send or not self._connection.connected:
                 if now:
                     if type(action) is not Land:  # what was refused now must not be carried out later
-                        self._schedule.clear()
+                        self._schedule.clear(Fate.WITHDRAWN)
                     raise self._not_now(action)
-                return False
+                return intent, False
             if self._schedule.due_ns <= now_ns:
-                return self._send_next(now_ns)
+                return intent, self._send_next(now_ns)
         self._connection.poke()  # the last one was sent just before: the supervisor's thread sends this one
-        return True
+        return intent, True
 
-    def drop(self, action: AnyAction) -> None:
-        """Clear the set-point if it is still ``action``."""
+    def outcome(self, intent: int) -> Outcome | None:
+        """Return what ended an intent; None while it is under way, as far as is known."""
         with self._lock:
-            if self._schedule.action is action:
-                self._schedule.clear()
+            if intent != self._schedule.intent:
+                return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
+            return self._schedule.over
 
-    def is_newest(self, action: AnyAction) -> bool:
-        """Return whether ``action`` is the last that the application asked for, and the authority is held."""
-        return self._authority.held and self._schedule.asked is action
-
-    def lapsed(self, action: AnyAction) -> bool:
-        """Return whether ``action`` is the newest but was ended, and could be sent again now.
-
-        A failsafe, a lost link or a lost lease ends it.
-        """
+    def drop(self) -> None:
+        """Clear the set-point: nothing of it is sent later."""
         with self._lock:
-            return self.is_newest(action) and self._schedule.action is not action and self._connection.connected
+            self._schedule.clear(Fate.WITHDRAWN)
 
     def request(self, request: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
         """Request the authority and wait for it; see :meth:`skyloop.client.drone.Drone.request_authority`.
@@ -290,7 +302,7 @@ class CommandSender:
         """
         with self._lock:
             known = self._authority.wanted or self.status.state != "none"
-            self._schedule.clear()
+            self._schedule.clear(Fate.AUTHORITY)
             changed = self._authority.given_back()
         if known and self._connection.connected:
             if wait:
@@ -316,7 +328,8 @@ class CommandSender:
     def disconnected(self) -> None:
         """Clear the set-point and the authority: nothing old is sent on the next connection."""
         with self._lock:
-            self._schedule.clear()
+            self._schedule.clear(Fate.LINK)
+            self._told = None
             changed = self._authority.disconnected()
         if changed:
             self._notify()
@@ -326,7 +339,9 @@ class CommandSender:
         with self._lock:
             before = self.status
             changed = self._authority.feedback(sample, now_ns)
-            self._schedule.observe(sample, now_ns)
+            self._schedule.observe(sample, now_ns, self.app_id)
+            if sample.outcome is not None and sample.outcome.app_id == self.app_id:
+                self._told = sample.outcome
         if changed:
             self._moved(before, now_ns)
 
@@ -425,7 +440,7 @@ class CommandSender:
             if status.state == "held":
                 self._schedule.resume(now_ns)
             elif before.state == "held":
-                self._schedule.clear()
+                self._schedule.clear(Fate.AUTHORITY)
         if status.state == "held" and status.lease != before.lease:
             self._granted(status.lease)
         self._notify()

@@ -1,34 +1,55 @@
-"""Waits until an action is done: commanded once, and judged by feedback and refusals that are newer than it."""
+"""Waits until an action is done: judged by what the proxy tells of its intent, and by feedback from after it."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
+from contextvars import ContextVar
 from typing import Final
 
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection
 from skyloop.client.telemetry import ClientState
-from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError
+from skyloop.errors import (
+    AuthorityError,
+    ClosedError,
+    NoAnswerError,
+    RefusedError,
+    UnsupportedError,
+)
 from skyloop.messages import (
     AnyAction,
-    Event,
+    Fate,
     Feedback,
     FlightState,
     Land,
+    Outcome,
     Position,
     Refusal,
     ReturnPhase,
     ReturnToStart,
+    Takeoff,
 )
 from skyloop.messages.geometry import wrap_angle
 
 AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
-_STALE_NS: Final = 100_000_000  #: feedback received sooner after a command may be older than it
+#: Where the proxy does not tell: feedback received sooner after a command may be older than it.
+_STALE_NS: Final = 100_000_000
 _TO_PLACES: Final = (Position, ReturnToStart)
 #: Refusals of one packet, not of what was asked for: the next repeat is younger, and newer.
 OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
+AGAIN_NS: Final = 500_000_000  #: between a take-off that is not possible yet and the next attempt
+_NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
+OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refused: it may be asked for again
+_OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
+
+#: Whether the caller of the present thread, or task, waits no longer; set for threads that wait for somebody else.
+cancelled: Final[ContextVar[Callable[[], bool]]] = ContextVar("cancelled", default=lambda: False)
+
+
+class _GivenUpError(Exception):
+    """The caller waits no longer; nobody sees this."""
 
 
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
@@ -64,13 +85,13 @@ class ReturnWatch:
 
 
 class ActionWait:
-    """One commanded action, and the wait for newer feedback that shows that it is done."""
+    """One commanded action, and the wait for feedback that shows that it is done."""
 
     def __init__(
         self,
         action: AnyAction,
         is_done: Callable[[Feedback], bool],
-        send: Callable[[AnyAction], object],
+        ask: Callable[[AnyAction], int],
         closed: Callable[[], bool],
         commands: CommandSender,
         state: ClientState,
@@ -81,26 +102,26 @@ class ActionWait:
         Args:
             action: The action.
             is_done: Whether feedback that is newer than the action shows it.
-            send: Sends it, now and where it is commanded again.
+            ask: Sends it under a new number, now and where it is commanded again; returns the number.
             closed: Whether the drone was closed.
-            commands: Tells what became of the command.
-            state: Newest feedback and refusal.
+            commands: Tells what became of an intent.
+            state: Newest feedback.
             connection: State of the link.
 
         Raises:
-            AuthorityError: As ``send`` does.
+            AuthorityError: As ``ask`` does.
         """
         self._action = action
         self._is_done = is_done
-        self._send = send
+        self._ask = ask
         self._closed = closed
         self._commands = commands
         self._state = state
         self._connection = connection
-        self._asked_ns = state.scheduler.clock()
         self._problem: Exception | None = None
-        self._seq = commands.seq + 1  # it may be sent a little later: what was refused before it does not concern it
-        send(action)
+        self._why = ""  # it was not done yet, for people
+        self._asked_ns = state.scheduler.clock()
+        self._intent = ask(action)
 
     def wait(self, timeout_s: float, deadline_s: float) -> None:
         """Wait until the action is done.
@@ -114,78 +135,95 @@ class ActionWait:
             ClosedError: If the drone is closed.
             AuthorityError: If another application takes over.
             UnsupportedError: If the vehicle does not support it.
-            RefusedError: If the proxy refuses it in the present state.
+            RefusedError: If the proxy refuses it in the present state, or something ends it.
         """
         if not self._state.notifier.wait_for(self._over, deadline_s - time.monotonic()):
             raise NoAnswerError(self._not_reached(timeout_s))
         if self._problem is not None:
-            self._commands.drop(self._action)  # what was refused now must not be carried out later
             raise self._problem
 
     def _over(self) -> bool:
         """Whether it is done, or waiting longer can't help."""
-        if type(self._action) is Position:  # a vehicle may be there and be refused to stay
-            self._problem = self._why_not()
-            if self._problem is not None:
-                return True
-        newest = self._state.newest
-        new = self._state.received_ns - self._asked_ns > _STALE_NS
-        if newest is not None and new and self._is_done(newest):
+        if type(self._action) is Land and self._done():  # whoever landed it
             return True
         self._problem = self._why_not()
-        if self._problem is not None:
-            return True
-        if type(self._action) is Land and (self._commands.lapsed(self._action) or self._is_too_old()):
-            # Old set-points are not sent again by themselves, but the caller still waits for this landing.
-            self._seq = self._commands.seq + 1
-            self._send(self._action)
-        return False
+        return self._problem is not None or self._done()
+
+    def _done(self) -> bool:
+        """Whether feedback from after it shows that it is done."""
+        newest = self._state.newest
+        if newest is None or not self._is_done(newest):
+            return False
+        outcome = newest.outcome
+        if outcome is None:
+            return self._state.received_ns - self._asked_ns > _STALE_NS
+        mine = outcome.app_id == self._commands.app_id
+        if mine and outcome.intent == self._intent and type(self._action) is Land:
+            return outcome.over
+        return mine and outcome.intent >= self._intent
 
     def _why_not(self) -> Exception | None:
-        """Why waiting longer can't help; None if it can."""
+        """Why waiting longer can't help; None if it can. Asks again for what may be possible then."""
         name = self._action.name
         if self._closed():
             return ClosedError(f"this drone was closed while {name} was under way")
+        if cancelled.get()():
+            return _GivenUpError()
         status = self._commands.status
         if status.state in ("queued", "preempted"):
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
-        if type(self._action) in _TO_PLACES and self._commands.lapsed(self._action):
+        outcome = self._commands.outcome(self._intent)
+        if outcome is None or not outcome.failed:
+            return None
+        if outcome.reason is Refusal.UNSUPPORTED:
+            return UnsupportedError(outcome.text)
+        self._why = self._why if outcome.fate in _OUTDONE else outcome.text
+        if type(self._action) is Takeoff:
+            return self._why_no_takeoff(outcome)
+        if type(self._action) is Land:
+            return self._why_no_landing(outcome)
+        if outcome.fate in _OUTDONE:
+            return RefusedError(f"{name} was ended on the way: another command took its place", code="replaced")
+        if outcome.fate in OVERRULED:
+            if not self._can_ask():
+                return None
             return RefusedError(
                 f"{name} was ended on the way, by a failsafe or a lost link: send the command again", code="not_fresh"
             )
-        if type(self._action) in _TO_PLACES and status.state == "held" and not self._commands.is_newest(self._action):
-            return RefusedError(f"{name} was ended on the way: another command took its place", code="replaced")
-        refusal = self._state.refusal
-        if refusal is None or not self._concerns(refusal):
+        return _refused(outcome)
+
+    def _why_no_takeoff(self, outcome: Outcome) -> Exception | None:
+        if outcome.reason in _NOT_YET or outcome.fate is Fate.TIMED_OUT:
+            if self._state.scheduler.clock() - self._asked_ns >= AGAIN_NS and self._can_ask():
+                self._again()
             return None
-        reason = refusal.data.get("reason")
-        if type(self._action) in _TO_PLACES and reason not in OF_ONE_PACKET:
-            unsupported = reason == Refusal.UNSUPPORTED
-            return UnsupportedError(refusal.text) if unsupported else RefusedError(refusal.text, code=str(reason))
-        if reason == Refusal.UNSUPPORTED:
-            return UnsupportedError(refusal.text)
-        if reason == Refusal.WRONG_STATE:
-            return RefusedError(refusal.text, code=str(reason))
-        return None
+        if outcome.fate in _OUTDONE or outcome.fate in OVERRULED:
+            return None  # what has begun ends by itself
+        return _refused(outcome)
 
-    def _is_too_old(self) -> bool:
-        """Whether the proxy refused the newest command as older than a failsafe or a new lease."""
-        refusal = self._state.refusal
-        if refusal is None or refusal.data.get("reason") != Refusal.NOT_FRESH or not self._concerns(refusal):
-            return False
-        return self._commands.is_newest(self._action)
+    def _why_no_landing(self, outcome: Outcome) -> Exception | None:
+        """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
+        if outcome.fate in OVERRULED or outcome.fate is Fate.TIMED_OUT:
+            if self._can_ask():
+                self._again()
+            return None
+        return None if outcome.fate in _OUTDONE else _refused(outcome)
 
-    def _concerns(self, refusal: Event) -> bool:
-        """Whether a refusal is of the last command sent, or of a later one."""
-        refused = refusal.data.get("seq")
-        return isinstance(refused, int) and refused >= self._seq
+    def _can_ask(self) -> bool:
+        return self._connection.connected and self._commands.status.state == "held"
+
+    def _again(self) -> None:
+        self._asked_ns = self._state.scheduler.clock()
+        self._intent = self._ask(self._action)
 
     def _not_reached(self, timeout_s: float) -> str:
-        newest, refusal, connection = self._state.newest, self._state.refusal, self._connection
+        newest, connection = self._state.newest, self._connection
         state = "in a state that is not known" if newest is None else newest.state.value
         text = f"{self._action.name} was not completed within {timeout_s:g} s: the vehicle is {state}"
         if connection.state.value not in ("up", "degraded"):
             return f"{text}, and the link is {connection.state.value} ({connection.reason})"
-        if refusal is not None and refusal.at_ns >= self._asked_ns + connection.offset_ns:
-            return f"{text}; {refusal.text}"
-        return text
+        return f"{text}; {self._why}" if self._why else text
+
+
+def _refused(outcome: Outcome) -> RefusedError:
+    return RefusedError(outcome.text, code=str(outcome.reason))

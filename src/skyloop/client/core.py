@@ -174,7 +174,7 @@ class DroneCore:
         )
         self.supervisor = ConnectionSupervisor(
             connection,
-            Receiver(app, state, connection, self.commands, restorer, keep_warm or _let_be),
+            Receiver(state, connection, self.commands, restorer, keep_warm or _let_be),
             dial,
             Hello(app, self.role),
             policy=policy,
@@ -280,7 +280,7 @@ class DroneCore:
             action = Idle() if leave or (feedback is not None and feedback.state in _SINKING) else Hover()
         try:
             if commands.status.state != "held":
-                commands.drop(commands.newest)
+                commands.drop()
                 return False
             sent = commands.command(action, automatic=True)
         except SkyloopError:
@@ -402,12 +402,24 @@ class DroneCore:
 
         Args:
             action: The action.
-            now: See :meth:`CommandSender.command`.
-            automatic: See :meth:`CommandSender.command`; it passes when the end of the flight has begun, too.
+            now: See :meth:`CommandSender.ask`.
+            automatic: See :meth:`CommandSender.ask`; it passes when the end of the flight has begun, too.
 
         Raises:
             ClosedError: After :meth:`close`, and from the beginning of :meth:`end_flight` on.
         """
+        self._check_can_do(action)
+        return self.commands.command(action, now=now, automatic=automatic)
+
+    def ask(self, action: AnyAction, *, automatic: bool = False) -> int:
+        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
+
+        ``commands.outcome`` tells what became of it.
+        """
+        self._check_can_do(action)
+        return self.commands.ask(action, automatic=automatic)[0]
+
+    def _check_can_do(self, action: AnyAction) -> None:
         if self.closed:
             self.check_open()
         welcome = self.state.welcome
@@ -416,7 +428,6 @@ class DroneCore:
             raise UnsupportedError(f"{action.name} is not possible: {why_not}")
         if welcome is not None and type(action) in LATER_ACTIONS:
             _check_knows(welcome.capabilities, action)
-        return self.commands.command(action, now=now, automatic=automatic)
 
     def complete(
         self,
@@ -429,7 +440,8 @@ class DroneCore:
     ) -> None:
         """Send the command and, if ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`.
 
-        Ctrl-C, or whatever else ends the waiting thread, lets the vehicle go: nobody waits for it any more.
+        A take-off that is not done in time lets the vehicle go. So does a caller that waits no longer, as after Ctrl-C,
+        but for a landing.
         """
         if not wait:
             self.command(action, now=True)
@@ -437,12 +449,11 @@ class DroneCore:
         if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
             self.check_may_wait()
         deadline_s = time.monotonic() + timeout_s
-        send = partial(self.command, automatic=automatic)
         try:
             waiting = ActionWait(
                 action,
                 is_done,
-                send,
+                partial(self.ask, automatic=automatic),
                 lambda: self.closed or (self.ending and not automatic),
                 self.commands,
                 self.state,
@@ -450,9 +461,13 @@ class DroneCore:
             )
             self.check_may_wait()
             waiting.wait(timeout_s, deadline_s)
-        except BaseException as error:
-            if not isinstance(error, Exception):
-                self.let_go(f"the wait for {action.name} was interrupted")
+        except SkyloopError as error:
+            if isinstance(error, NoAnswerError) and type(action) is Takeoff:
+                self.let_go("it did not take off in time")
+            raise
+        except BaseException:
+            if type(action) is not Land:
+                self.let_go(f"nobody waits for {action.name} any more")
             raise
 
     # Consumers -----------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import numpy as np
 
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
 from skyloop.client.commands import above_zero, checked, number, position_action, return_action
+from skyloop.client.completion import cancelled
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
@@ -684,7 +685,8 @@ def _what(actions: Mapping[str, AnyAction]) -> str:
 def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict[str, Exception]]:
     """Run all jobs at the same time, each on a thread of its own, and wait for the last.
 
-    The threads are daemons: an interrupt of the waiting leaves them to end by themselves.
+    The threads are daemons. An interrupt of the waiting ends their waits for commands, see
+    :data:`skyloop.client.completion.cancelled`; what else they do ends by itself.
 
     Args:
         jobs: By name.
@@ -695,8 +697,10 @@ def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict
     """
     results: dict[str, T] = {}
     raised: dict[str, BaseException] = {}
+    interrupted, outside = threading.Event(), cancelled.get()
 
     def work(name: str, job: Callable[[], T]) -> None:
+        cancelled.set(lambda: interrupted.is_set() or outside())
         try:
             results[name] = job()
         except BaseException as error:  # noqa: BLE001  (raised below, on the caller's thread)
@@ -708,7 +712,11 @@ def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict
     ]
     for thread in threads:
         thread.start()
-    for thread in threads:
-        thread.join()
+    try:
+        for thread in threads:
+            thread.join()
+    except BaseException:  # Ctrl-C: a take-off must not be carried out later
+        interrupted.set()
+        raise
     errors = _expected({name: raised[name] for name in jobs if name in raised})
     return {name: results[name] for name in jobs if name in results}, errors

@@ -144,7 +144,6 @@ class ClientState:
         self.history = FeedbackHistory()
         #: Notified with each feedback, and when something changes that somebody may wait for.
         self.notifier = scheduler.notifier()
-        self.refusal: Event | None = None  #: the last command of ours that was refused
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
         self.channels: dict[str, VideoChannel] = {}  #: by camera, with the usual request
@@ -277,14 +276,12 @@ class Receiver:
 
     def __init__(
         self,
-        name: str,
         state: ClientState,
         connection: ProxyConnection,
         commands: CommandSender,
         restorer: Restorer,
         keep_warm: Callable[[bool], None],
     ) -> None:
-        self._name = name
         self._keep_warm = keep_warm
         self._state = state
         self._connection = connection
@@ -387,8 +384,6 @@ class Receiver:
     def event(self, event: Event, now_ns: int) -> None:
         """Keep and publish an event."""
         self._state.recent.append(event)
-        if event.kind is EventKind.COMMAND_REFUSED and event.app == self._name:
-            self._state.refusal = event
         self._commands.event(event, now_ns)
         self._state.on_event.publish(event)
         self._state.notifier.notify()

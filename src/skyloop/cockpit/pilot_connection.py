@@ -7,10 +7,11 @@ from typing import Self
 
 from skyloop.client import AuthorityStatus, Drone
 from skyloop.client.commands import ANSWER_S
+from skyloop.client.completion import OVERRULED
 from skyloop.client.core import DroneCore
 from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError, RefusedError, SkyloopError
-from skyloop.messages import AnswerTakeover, AnyAction, FlightState, LinkState, Refused
+from skyloop.messages import AnswerTakeover, AnyAction, FlightState, Idle, LinkState, Refused
 from skyloop.transport.base import Dialer
 
 
@@ -19,6 +20,8 @@ class PilotConnection(Drone):
 
     Without the authority it can stop the motors in an emergency, and nothing else.
     """
+
+    _newest: tuple[AnyAction, int] = Idle(), 0  # what :meth:`command` sent last, and its number
 
     @classmethod
     def open(cls, dial: Dialer, app: str, timeout_s: float) -> Self:
@@ -88,9 +91,17 @@ class PilotConnection(Drone):
         """The time on the proxy's clock, as estimated."""
         return monotonic_ns() + self.clock_offset_ns
 
+    def command(self, action: AnyAction) -> bool:
+        """Make ``action`` the newest set-point; see :meth:`Drone.command`."""
+        sent = super().command(action)
+        self._newest = action, self._core.commands.intent
+        return sent
+
     def has_ended(self, action: AnyAction) -> bool:
         """Whether a failsafe, a lost link or a lost lease ended this action, while it was the newest."""
-        return self._core.commands.lapsed(action)
+        newest, intent = self._newest
+        outcome = self._core.commands.outcome(intent) if newest is action else None
+        return outcome is not None and outcome.fate in OVERRULED
 
     def hover_if_held(self) -> None:
         """Hover; if somebody else has the authority, or the link is lost, the proxy sees to it."""

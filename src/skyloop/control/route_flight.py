@@ -9,15 +9,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from skyloop.client.completion import OF_ONE_PACKET
+from skyloop.client.completion import OVERRULED
 from skyloop.clock import nanoseconds
-from skyloop.control.controller import Controller, RunSummary
+from skyloop.control.controller import Controller
 from skyloop.control.route import Route
 from skyloop.control.route_check import RouteCheck, check_route, conditions_of
 from skyloop.control.route_law import PHOTO_S, Command, Effect, Progress, RouteLaw, RouteState, TakePhoto
 from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
 from skyloop.files import write
-from skyloop.messages import AnyAction, Event, EventKind, Feedback, Land, Position, Refusal, Severity
+from skyloop.messages import EventKind, Fate, Feedback, Land, Position, Severity
 from skyloop.vision.opencv import opencv
 
 if TYPE_CHECKING:
@@ -66,22 +66,12 @@ class FlyRoute(Controller):
         self._folder = Path(folder)
         self._on_progress = on_progress
         self._asked: list[Callable[[], list[Effect]]] = []
-        self._refused: str | None = None
-        self._action: AnyAction | None = None
+        self._leg: int | None = None  # number of the intent that flies the present one
         self._logged_ns: int | None = None
 
     def check(self) -> RouteCheck:
         """Return what speaks against the route now, by the drone's newest feedback and its parameters."""
         return check_for(self.drone, self.law.route)
-
-    def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
-        """Fly the route; see :meth:`skyloop.Controller.run`.
-
-        Raises:
-            UsageError: The vehicle does not report its position, or is on the ground.
-        """
-        with self.drone.on_event(self._on_event, inline=True):
-            return super().run(seconds, until)
 
     def pause(self) -> None:
         """Hover until :meth:`resume`."""
@@ -110,10 +100,7 @@ class FlyRoute(Controller):
             self._carry_out(law.start(feedback))
         while self._asked:
             self._carry_out(self._asked.pop(0)())
-        refused, self._refused = self._refused, None
-        if refused is None and self._action is not None and self.drone._core.commands.lapsed(self._action):
-            refused = ENDED
-        if refused is not None:
+        if refused := self._why_ended():
             self._carry_out(law.pause(refused))
         self._carry_out(law.update(feedback, feedback.captured_ns))
         if law.over:
@@ -125,12 +112,13 @@ class FlyRoute(Controller):
     def _carry_out(self, effects: list[Effect]) -> None:
         for effect in effects:
             if isinstance(effect, Command):
-                self._action = effect.action if isinstance(effect.action, Position) else None
-                if self._action is None:  # it hovers or lands because of how the route goes, not of a person
-                    land = isinstance(effect.action, Land)
-                    self.drone._core.let_go(f"the route is {self.law.state.value}", land=land)
-                else:
-                    self.drone.command(effect.action)
+                self._leg = None
+                if isinstance(effect.action, Position):
+                    self._leg = self.drone._core.ask(effect.action)
+                else:  # it hovers or lands because of how the route goes, not of a person
+                    self.drone._core.let_go(
+                        f"the route is {self.law.state.value}", land=isinstance(effect.action, Land)
+                    )
             elif isinstance(effect, TakePhoto):
                 threading.Thread(target=self._photograph, args=(effect,), name="skyloop-photo", daemon=True).start()
             else:
@@ -154,11 +142,15 @@ class FlyRoute(Controller):
         if self._on_progress is not None:
             self._on_progress(step)
 
-    def _on_event(self, event: Event) -> None:
-        own = event.kind is EventKind.COMMAND_REFUSED and event.app == self.drone._core.app
-        if own and self._action is not None and event.data.get("reason") not in OF_ONE_PACKET:
-            # That a repeat came too late says nothing to a person; what did it, does.
-            self._refused = ENDED if event.data.get("reason") == Refusal.NOT_FRESH else event.text
+    def _why_ended(self) -> str:
+        """Return why the present leg is not flown any more, once; empty if it is."""
+        outcome = None if self._leg is None else self.drone._core.commands.outcome(self._leg)
+        if outcome is None or not outcome.failed:
+            return ""
+        self._leg = None
+        if outcome.fate in (Fate.REPLACED, Fate.WITHDRAWN):
+            return ""
+        return ENDED if outcome.fate in OVERRULED else outcome.text
 
 
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:

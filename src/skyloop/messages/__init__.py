@@ -58,6 +58,7 @@ from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback, Value, Vector
 from skyloop.messages.feedback_request import FeedbackRequest
 from skyloop.messages.frame import CameraInfo, FrameHeader, Intrinsics
+from skyloop.messages.intent import Fate, Outcome
 from skyloop.messages.kinds import (
     Encoding,
     EventKind,
@@ -100,6 +101,7 @@ __all__ = [
     "Event",
     "EventKind",
     "Failsafe",
+    "Fate",
     "Feedback",
     "FeedbackRequest",
     "FlightState",
@@ -119,6 +121,7 @@ __all__ = [
     "LinkState",
     "ListParameters",
     "LogEntry",
+    "Outcome",
     "Overview",
     "Parameter",
     "ParameterPage",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 
 from skyloop.messages.earth import EarthOrigin
+from skyloop.messages.intent import Outcome
 from skyloop.messages.kinds import Failsafe, FlightState, LinkState, ReturnPhase
 from skyloop.messages.numbers import Count, Finite, TimeNs
 
@@ -67,6 +68,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     start_position_m: Vector | None = None  #: where it took off last, in world axes [m]; None: that is not known
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far it is on its way back there
     skipped: Count = 0  #: samples before this one that the proxy left out, as the subscriber asked for fewer
+    outcome: Outcome | None = None  #: what became of the newest intent; None: a proxy that does not tell
 
     @property
     def origin(self) -> EarthOrigin | None:

@@ -69,6 +69,11 @@ class ActionExecutor:
         """Return :attr:`airborne` for a flight state that was read."""
         return state.airborne or (state is FlightState.UNKNOWN and isinstance(self._in_force, _FLYING))
 
+    @property
+    def stands(self) -> bool:
+        """Whether the vehicle stands on the ground by its own word, whatever the software autopilot is about to do."""
+        return self._vehicle.reported_state is FlightState.LANDED
+
     def left_to(self) -> str:
         """Return what others made of the vehicle since it was steered from here, as the driver observes it."""
         return self._driver.left_to()

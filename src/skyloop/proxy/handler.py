@@ -27,9 +27,11 @@ from skyloop.messages import (
     Done,
     EmergencyStop,
     Failsafe,
+    Fate,
     FlightState,
     Hover,
     Idle,
+    Land,
     Refusal,
     Refused,
     ReleaseAuthority,
@@ -40,6 +42,7 @@ from skyloop.messages import (
     Takeover,
     encode,
 )
+from skyloop.messages.command import SET_POINTS
 from skyloop.messages.numbers import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
@@ -57,6 +60,7 @@ from skyloop.proxy.core.flight_events import (
     refused_event,
     taken_event,
 )
+from skyloop.proxy.core.intents import INSISTENT, TAKEOFF_NS, Intent
 from skyloop.proxy.core.ownership import Ownership, Whose
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
@@ -66,6 +70,9 @@ from skyloop.proxy.returning import ReturnSupervisor
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
+_LAND: Final = Land()
+_LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
+_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: what may be different with the next repeat
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
 
@@ -119,6 +126,7 @@ class CommandHandler:
         self._clock = clock
         self._pilot = "none"  # why nobody holds the authority, or "held"
         self._breaks_seen = 0  # of the vehicle's link, when last looked at
+        self._rising: Intent | None = None  # a take-off that the vehicle was told of, and does not show yet
         self._enforced = True  # whether the safety box and zones could be, at the last set-point
         self._stamp()
 
@@ -216,6 +224,10 @@ class CommandHandler:
             if effects:
                 self._apply_authority(effects, now_ns)
             self._update_failsafe(now_ns)
+            holder = self.authority.holder
+            session = self._sessions.get(holder.app_id) if holder is not None else None
+            if session is not None:
+                self._observe_intent(session, now_ns)
             if self._back.update(now_ns, ours=self.ownership.ours):
                 self._stamp()
             steered = self._executor.step(now_ns)
@@ -270,42 +282,64 @@ class CommandHandler:
         vehicle, checks, ownership = self._vehicle, self.checks, self.ownership
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
-        refusal = checks.receive(command, session.sequence, session.app_id, now_ns)
+        intents = session.intents
+        refusal = checks.receive(command, intents, session.app_id, now_ns)
         if refusal is not None:
             if session.role is not Role.PILOT:
                 return self._refuse_role(session, command), now_ns
-            why = checks.explain(refusal, command, session.sequence, now_ns)
-            return self._refuse(session, command, refusal, why), now_ns
-        kind = type(command.action)
-        if kind is Idle:
-            return _NOTHING, self._count_applied(command)
-        state = self._executor.state
+            return self._refuse(session, command, refusal, checks.explain(refusal, command, intents, now_ns)), now_ns
+        action = command.action
+        kind = type(action)
         if not ownership.ours:
             self._observe_ownership(now_ns)
-        decision = checks.decide(command, session.sequence, state, vehicle.link_state, vehicle.feedback_now, now_ns)
+        state = self._observe_intent(session, now_ns)
+        intent, new = intents.receive(command, state, now_ns)
+        if kind not in _LEAVE_A_TAKEOFF:
+            if self._withdraw_takeoff(now_ns):
+                intent.withdrew = kind is Land
+                if kind is Hover:  # it stands, and stays so
+                    intent.end(Fate.COMPLETED if new else Fate.WITHDRAWN)
+            state = self._executor.state
+        if kind is Idle:
+            if type(intents.newest.action) is Takeoff:
+                intents.newest.end(Fate.WITHDRAWN)
+            self._tell(session, intents.newest)
+            return _NOTHING, self._count_applied(command)
+        if intent.over:
+            if intent.reason is None:  # it was done
+                return _NOTHING, self._count_applied(command)
+            return self._refuse(session, command, intent.reason, intent.text), now_ns
+        intent.action = action  # a set-point may have decayed to hover
+        vehicle_now = vehicle.feedback_now
+        automatic = command.automatic
+        new = new and not automatic  # what the library does by itself is nobody's decision
+        decision = checks.decide(
+            action, intent, state, vehicle.link_state, vehicle_now, now_ns, new=new, automatic=automatic
+        )
         if decision.refusal is not None:
             if decision.action is not None:
                 self._stop_instead(decision.action, now_ns)
-            return self._refuse(session, command, decision.refusal, decision.why), now_ns
+            return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
         applied: AnyAction = _NOTHING
         if decision.action is not None:
             if decision.clamps or (decision.enforced is not None and decision.enforced is not self._enforced):
                 self._report_limits(session, decision, now_ns)
             try:
-                applied = self._executor.execute(decision.action, now_ns, new=decision.new)
+                applied = self._executor.execute(decision.action, now_ns, new=new)
             except RefusedError as error:
-                return self._refuse(session, command, Refusal.WRONG_STATE, str(error)), now_ns
+                return self._refuse_intent(session, command, intent, Refusal.WRONG_STATE, str(error), now_ns), now_ns
             except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
-                if kind is Takeoff and ownership.ours:
-                    ownership.claim(now_ns)  # it may be trying
                 why = vehicle.driver_refused("apply", error)
-                return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
+                return self._refuse_intent(session, command, intent, Refusal.DRIVER_FAILED, why, now_ns), now_ns
+            intent.begun = True
             if decision.takes_off:
                 ownership.claim(now_ns)
+                self._rising = intent
             if not ownership.ours or kind is Takeoff:
-                self._take_vehicle(session, applied, decision.new)
+                self._take_vehicle(session, applied, new)
         if kind is not ReturnToStart and decision.action is not None:
             checks.back = None
+        self._tell(session, intent)
         applied_ns = self._count_applied(command)
         if not (self.ladder.idle or (command.automatic and self.ladder.step is Failsafe.LAND)):
             self._apply_failsafe(self.ladder.fresh_command(), now_ns)
@@ -320,7 +354,7 @@ class CommandHandler:
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
-        session.sequence.note(command)
+        session.intents.stop(command)
         if session.role is not Role.PILOT:
             return self._refuse_role(session, command), now_ns
         if EmergencyStop not in self._executor.native:
@@ -331,7 +365,7 @@ class CommandHandler:
         except Exception as error:  # noqa: BLE001  it is reported, and the repeats try again
             why = self._vehicle.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
-        self._end_intents()
+        self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
         return applied, self._count_applied(command)
@@ -364,12 +398,55 @@ class CommandHandler:
         )
         return _NOTHING
 
-    def _end_intents(self) -> None:
-        """Refuse repeats of what the holder asked for until now."""
+    # Intents -----------------------------------------------------------------------------------------------------
+
+    def _refuse_intent(
+        self, session: Session, command: Command, intent: Intent, reason: Refusal, why: str, now_ns: int
+    ) -> AnyAction:
+        """Refuse what the holder asked for, which is over with it: its repeats get the same answer."""
+        if type(command.action) not in INSISTENT or reason not in _PASSING:
+            intent.end(Fate.REFUSED, why, reason)
+        self._tell(session, intent)
+        if type(command.action) is Takeoff:
+            self._withdraw_takeoff(now_ns)
+        return self._refuse(session, command, reason, why)
+
+    def _end_intents(self, fate: Fate, now_ns: int, why: str = "", reason: Refusal | None = None) -> None:
+        """End what the holder asked for until now."""
         holder = self.authority.holder
         session = self._sessions.get(holder.app_id) if holder is not None else None
         if session is not None:
-            session.sequence.end_intents()
+            session.intents.end(fate, why, reason)
+            self._tell(session, session.intents.newest)
+        self._withdraw_takeoff(now_ns)
+
+    def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
+        """End, or complete, what a holder asked for by what the vehicle does; return the flight state."""
+        state, intent = self._executor.state, session.intents.newest
+        if not intent.over:
+            intent.observe(state, now_ns)
+            if intent.over:
+                self._tell(session, intent)
+                if intent.fate is not Fate.COMPLETED:
+                    self._withdraw_takeoff(now_ns)
+        rising = self._rising
+        if rising is not None and not self._executor.stands:
+            self._rising = None  # it has left the ground
+        elif rising is not None and now_ns - rising.asked_ns >= TAKEOFF_NS:
+            self._withdraw_takeoff(now_ns)  # a set-point took its place meanwhile
+        return self._executor.state
+
+    def _withdraw_takeoff(self, now_ns: int) -> bool:
+        """Make the vehicle forget a take-off that it has not begun to show; return whether there was one."""
+        rising, self._rising = self._rising, None
+        if rising is None or not self._executor.stands or self.ownership.whose is Whose.OTHERS:
+            return False
+        self._stop_instead(_LAND, now_ns)
+        return True
+
+    def _tell(self, session: Session, intent: Intent) -> None:
+        """Let feedback tell what became of an intent: soon where it ended."""
+        self._vehicle.tell(intent.outcome(session.app_id, session.name))
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
         """Publish what the proxy itself made the vehicle do."""
@@ -386,8 +463,11 @@ class CommandHandler:
                 self._pilot = effect.reason
             elif isinstance(effect, Granted):
                 self._pilot = "held"
-                self._sessions[effect.app_id].sequence.end_intents()
                 self.ladder.hand_over(now_ns)
+            if isinstance(effect, (Lost, Preempted, Granted)) and (session := self._sessions.get(effect.app_id)):
+                session.intents.end(Fate.AUTHORITY)
+                self._tell(session, session.intents.newest)
+                self._withdraw_takeoff(now_ns)
         self._stamp()
         ended = [effect for effect in effects if isinstance(effect, (Lost, Preempted))]
         for effect in ended:
@@ -440,7 +520,7 @@ class CommandHandler:
         breaks = self._vehicle.link_breaks
         if breaks != self._breaks_seen:
             self._breaks_seen = breaks
-            self._end_intents()
+            self._end_intents(Fate.LINK, now_ns)
             self.ladder.hand_over(now_ns)
             self._update_failsafe(now_ns)
 
@@ -466,6 +546,8 @@ class CommandHandler:
         self._stamp()
         if changed.whose is Whose.OTHERS:
             executor.stop_autopilot()
+            why = f"{self.ownership.others}: hover, take off or land first to take it over"
+            self._end_intents(Fate.OTHERS, now_ns, why, Refusal.WRONG_STATE)
         elif changed.why:  # found on a flight that is ours: its pilot may come back, as if a command had just come
             self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
         if changed.why and executor.supported:  # a recording that is played flies by itself, and nobody wonders
@@ -511,5 +593,5 @@ class CommandHandler:
             return
         self._stamp()
         if effect.step is not Failsafe.NONE:
-            self._end_intents()
+            self._end_intents(Fate.FAILSAFE, self._clock())
         self._events.publish_draft(failsafe_event(effect))

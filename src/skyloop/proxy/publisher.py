@@ -29,6 +29,7 @@ from skyloop.messages import (
     FrameHeader,
     Intrinsics,
     LinkState,
+    Outcome,
     Severity,
     Value,
     VideoRequest,
@@ -109,6 +110,7 @@ class VehiclePublisher:
         self.streams = Streams(server, counters, clock, lambda why: self._fail("stream", why))
         self._on_link_up = on_link_up
         self._owner: dict[str, Any] = {}
+        self._outcome = Outcome()
         self._publish = server.publish
         self._publish_frame = server.publish_frame
         self._subscribers = server.subscribers
@@ -158,6 +160,12 @@ class VehiclePublisher:
         self._owner = owner
         self._published_ns = -KEEP_ALIVE_NS
 
+    def tell(self, outcome: Outcome) -> None:
+        """Show what became of an intent in feedback from now on; where it ended, at the next tick at the latest."""
+        before, self._outcome = self._outcome, outcome
+        if outcome.over and (outcome.fate, outcome.reason) != (before.fate, before.reason):
+            self._published_ns = -KEEP_ALIVE_NS
+
     @property
     def is_shown(self) -> bool:
         """Whether feedback shows the proxy's own fields and the link as they are."""
@@ -189,6 +197,7 @@ class VehiclePublisher:
             vehicle_link=self.link_state,
             link_reason=self.link_reason,
             link_remedy=self.link_remedy,
+            outcome=self._outcome,
             **self._owner,
         )
         self.feedback_now = sample

@@ -7,7 +7,7 @@ from typing import Final
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Role
-from skyloop.proxy.core.command_checks import CommandSequence
+from skyloop.proxy.core.intents import Intents
 from skyloop.proxy.core.limits import Episodes
 from skyloop.transport.base import Peer
 
@@ -25,12 +25,12 @@ class Session:
         "app_id",
         "ended",
         "episodes",
+        "intents",
         "joined_ns",
         "name",
         "peer",
         "pending",
         "role",
-        "sequence",
     )
 
     def __init__(self, peer: Peer, joined_ns: int) -> None:
@@ -39,7 +39,7 @@ class Session:
         self.app_id = peer.id
         self.name = f"application {peer.id}"  #: until Hello has it
         self.role: Role | None = None
-        self.sequence = CommandSequence()
+        self.intents = Intents()
         self.episodes = Episodes()
         self.pending = 0  #: requests that wait for the worker
         self.ended = False  #: disconnected by the proxy: nothing more is taken from it

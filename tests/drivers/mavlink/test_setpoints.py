@@ -107,6 +107,82 @@ def test_px4_holds_is_armed_and_told_an_altitude_above_sea_level() -> None:
 
 
 @AUTOPILOTS
+def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(autopilot: int) -> None:
+    """It was told "disarmed itself" 2.5 s later: what was heard before a request proves nothing about it."""
+    bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
+    vehicle = bench.vehicle
+    bench.apply(Hover())
+    bench.go_on(1.2)
+    bench.apply(Land())
+    vehicle.mode, vehicle.landed, vehicle.place = LAND[autopilot][0], Landed.ON_GROUND, (0.0, 0.0, 0.0)
+    bench.go_on(0.3)
+    assert bench.state() is FlightState.LANDED
+    bench.apply(Takeoff())
+    bench.go_on(0.3)
+    assert bench.state() is FlightState.LANDED, "it is armed from the flight before"
+    bench.commands()
+    vehicle.armed, vehicle.mode = False, {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.go_on(0.3)
+    assert (ARM, 1.0, 0.0, 0.0, 0.0) in bench.commands()
+    bench.answer(ARM)
+    bench.go_on(0.1)
+    assert bench.state() is FlightState.TAKING_OFF
+
+
+@AUTOPILOTS
+def test_a_vehicle_that_others_armed_and_disarm_again_is_not_armed_from_here(autopilot: int) -> None:
+    """A pilot's switch, in a take-off that has not left the ground."""
+    bench = Bench(Vehicle(autopilot)).found()
+    vehicle = bench.vehicle
+    vehicle.armed, vehicle.mode = True, {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.go_on(0.3)
+    bench.apply(Takeoff())
+    bench.go_on(0.3)
+    vehicle.armed = False
+    bench.commands()
+    bench.go_on(4.0)
+    assert ARM not in [command[0] for command in bench.commands()]
+    assert bench.state() is FlightState.LANDED
+
+
+def about_to_rise(autopilot: int) -> Bench:
+    """Armed for a take-off, and on the ground still."""
+    bench = Bench(Vehicle(autopilot)).found()
+    vehicle = bench.vehicle
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.hear(vehicle.heartbeat())
+    bench.apply(Takeoff())
+    bench.answer(ARM)
+    vehicle.armed, vehicle.status = True, 3
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.TAKEOFF"}[autopilot]
+    bench.go_on(0.3)
+    assert bench.state() is FlightState.TAKING_OFF
+    return bench
+
+
+@AUTOPILOTS
+def test_a_hover_ends_the_climb_of_a_take_off(autopilot: int) -> None:
+    """A cancelled takeoff() left it climbing to the end."""
+    bench = climbing(autopilot)
+    bench.apply(Hover())
+    bench.go_on(1.5)
+    assert bench.heard_of(SET_POINT)
+    if autopilot == PX4:
+        assert (MODE, 1.0, 6.0, 0.0, 0.0) in bench.commands()
+
+
+@AUTOPILOTS
+def test_a_hover_before_it_left_the_ground_disarms_it_and_a_failsafe_lets_it_take_off(autopilot: int) -> None:
+    bench = about_to_rise(autopilot)
+    bench.apply(Hover(), alone=True)
+    bench.go_on(0.3)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) not in bench.commands()
+    bench.apply(Hover())
+    bench.go_on(1.2)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) in bench.commands()
+
+
+@AUTOPILOTS
 def test_a_refusal_is_told_with_the_vehicles_words_and_tried_again(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot)).found()
     bench.vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]

@@ -231,9 +231,10 @@ class TakeoffSequence:
         autopilot: What this autopilot does differently.
         height_m: Above the start.
         now_ns: When it begins.
+        disarms: Whether a landing from here is not over: the vehicle, found armed, may disarm by it any time.
     """
 
-    def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int) -> None:
+    def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:
         self.asked_ns = now_ns
         self.done = False
         self.given_up = ""  #: why, once it is
@@ -244,6 +245,7 @@ class TakeoffSequence:
         self._autopilot = autopilot
         self._height_m = height_m
         self._begun_ns = now_ns
+        self._disarms = disarms
         self._armed_ns: int | None = None  # when it was first seen armed, or arming was acknowledged
         self._climb_command: VehicleCommand | None = None
         self._best_m = -1.0
@@ -261,7 +263,7 @@ class TakeoffSequence:
     @property
     def started(self) -> bool:
         """Whether the vehicle is armed for it: from then on it goes on by itself."""
-        return self._armed_ns is not None
+        return self._armed_ns is not None and (self.rose or not self._disarms)
 
     def step(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> list[Message]:
         """Ask for what is missing, and return the set-points that are due.
@@ -296,6 +298,7 @@ class TakeoffSequence:
             if vehicle.armed or answer == ACCEPTED:
                 self._armed_ns = now_ns
                 self.refused = ""
+                self._disarms = self._disarms and answer != ACCEPTED
             elif answer is not None:
                 self.refused = f"arming was {result_name(answer)}" + (f": {self.reason}" if self.reason else "")
             if self._armed_ns is None and now_ns - self.asked_ns > PATIENCE_NS:
@@ -307,7 +310,9 @@ class TakeoffSequence:
         self.rose = self.rose or (commanded and vehicle.armed and self._is_off_ground(vehicle.landed, height))
         cut_short = self._is_cut_short(vehicle)
         self._observe_mode(vehicle, cut_short, now_ns)
-        if not vehicle.armed and now_ns - self._armed_ns > ARMED_NS:
+        if not vehicle.armed and not self.started:  # by our own landing before: this flight has not begun
+            self._armed_ns, self._climb_command, self._disarms = None, None, False
+        elif not vehicle.armed and now_ns - self._armed_ns > ARMED_NS:
             self.given_up = "the vehicle disarmed itself"
         elif not self.rose and now_ns - self._armed_ns > RISING_NS:
             result = commands.result(m.MAV_CMD_NAV_TAKEOFF, self._begun_ns)

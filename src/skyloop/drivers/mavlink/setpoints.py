@@ -186,8 +186,9 @@ class SetpointController:
         elif vehicle.airborne is None:
             raise DriverError("the vehicle is armed and has not reported yet whether it is in the air")
         elif not vehicle.airborne:
+            takeoff = TakeoffSequence(self._autopilot, self.takeoff_m, now_ns, disarms=self.goal is Goal.LAND)
             self._end()
-            self.goal, self._takeoff = Goal.TAKE_OFF, TakeoffSequence(self._autopilot, self.takeoff_m, now_ns)
+            self.goal, self._takeoff = Goal.TAKE_OFF, takeoff
         elif self.goal is not Goal.FOLLOW:
             self._follow(PositionHold(now_ns))
 
@@ -200,7 +201,11 @@ class SetpointController:
             self.goal = Goal.LAND
 
     def _hover(self, vehicle: VehicleState | None, now_ns: int, *, alone: bool) -> None:
-        if self.stopped or self.goal is Goal.TAKE_OFF:
+        if self.stopped:
+            return
+        if self.goal is Goal.TAKE_OFF and self._takeoff is not None and (alone or not self._takeoff.rose):
+            if not alone:
+                self._land(vehicle)  # who asked for the take-off wants it no more: it stays on the ground
             return  # a take-off ends in a hover
         if vehicle is not None and vehicle.airborne is False:
             self._end()

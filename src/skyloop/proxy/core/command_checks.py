@@ -1,8 +1,9 @@
 """The checks that a command passes before it reaches the vehicle. Pure: the time is an argument.
 
 In this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, decide whether it is a
-sign of life of the holder), then freshness, the vehicle's link, support, whose the flight is, the flight state, limits,
-safety box and zones (:meth:`CommandChecks.decide`). The rules in words are in ``docs/proxy.md``.
+sign of life of the holder), then whether its intent is under way (:mod:`skyloop.proxy.core.intents`), the vehicle's
+link, support, whose the flight is, the flight state, limits, safety box and zones (:meth:`CommandChecks.decide`). The
+rules in words are in ``docs/proxy.md``.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from enum import Enum, auto
 from typing import Final, NamedTuple
 
-from skyloop.clock import nanoseconds, seconds
+from skyloop.clock import seconds
 from skyloop.messages import (
     Action,
     AnyAction,
@@ -26,7 +27,6 @@ from skyloop.messages import (
     Position,
     Refusal,
     ResetEmergency,
-    ReturnPhase,
     ReturnToStart,
     Takeoff,
     Velocity,
@@ -34,6 +34,7 @@ from skyloop.messages import (
 from skyloop.messages.command import SET_POINTS
 from skyloop.proxy.core.authority import Authority
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
+from skyloop.proxy.core.intents import MAX_AHEAD_NS, Intent, Intents
 from skyloop.proxy.core.limits import Ceiling, Clamp, Limits
 from skyloop.proxy.core.ownership import Ownership, Whose
 from skyloop.proxy.core.places import decide_place
@@ -41,54 +42,9 @@ from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, ReturnSet
 from skyloop.proxy.core.safety import Safety
 from skyloop.zones import Space
 
-MAX_AHEAD_S: Final = 0.05  #: how far in the future a command's time may lie: the error of the clocks' offset
-_MAX_AHEAD_NS: Final = nanoseconds(MAX_AHEAD_S)
 _HOVER_ACTION: Final = Hover()
 _ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
 _TAKING: Final = (Takeoff, Hover, Land)  #: newly asked for, they take a vehicle that others fly
-
-
-class CommandSequence:
-    """The sequence numbers and intents of one connection's commands: which are newer, and which are fresh."""
-
-    __slots__ = ("acted", "floor", "intent", "seq")
-
-    def __init__(self) -> None:
-        self.seq = -1  #: of the newest command received
-        self.intent = 0  #: highest received, refused commands included
-        self.floor = -1  #: intents up to this one are from before something that ended them
-        self.acted = 0  #: highest that was acted on, or refused: a command with a higher one is no repeat
-
-    def receive(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
-        """Check sequence, age, lease and numbers, and remember the sequence and the intent.
-
-        ``lease`` is the one in force (0 for none), ``holds`` whether the sender holds it. None: it is a sign of life.
-        """
-        if command.seq <= self.seq:
-            return Refusal.OUT_OF_SEQUENCE
-        self.seq = command.seq
-        if command.intent > self.intent:
-            self.intent = command.intent
-        if not -_MAX_AHEAD_NS <= now_ns - command.sent_ns <= max_age_ns:
-            return Refusal.STALE
-        if command.lease != lease or not holds:
-            named_one = command.lease not in (0, lease)
-            return Refusal.FOREIGN_LEASE if named_one else Refusal.NO_AUTHORITY
-        if not command.action.finite:
-            return Refusal.NON_FINITE
-        return None
-
-    def note(self, command: Command) -> None:
-        """Remember a command that is carried out whatever its sequence: an emergency stop."""
-        self.seq, self.intent = max(self.seq, command.seq), max(self.intent, command.intent)
-
-    def fresh(self, command: Command) -> bool:
-        """Whether the application asked for it after the last thing that ended older intents."""
-        return command.intent > self.floor
-
-    def end_intents(self) -> None:
-        """Only what the application asks for from now on counts: a repeat of anything older is not fresh."""
-        self.floor = self.intent
 
 
 class StatePolicy(Enum):
@@ -168,55 +124,52 @@ class CommandChecks:
         self._why_not = why_not
         self._ceiling = Ceiling()
 
-    def receive(self, command: Command, sequence: CommandSequence, app_id: int, now_ns: int) -> Refusal | None:
+    def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
         """Check sequence, age, lease and numbers. None: they passed, which keeps the holder's lease."""
         authority = self._authority
         holder = authority.holder
         holds = holder is not None and holder.app_id == app_id
-        refusal = sequence.receive(command, now_ns, self.max_age_ns, authority.lease, holds)
+        refusal = intents.check(command, now_ns, self.max_age_ns, authority.lease, holds)
         if refusal is None:
             authority.last_command_ns = now_ns
         return refusal
 
-    def explain(self, refusal: Refusal, command: Command, sequence: CommandSequence, now_ns: int) -> str:
+    def explain(self, refusal: Refusal, command: Command, intents: Intents, now_ns: int) -> str:
         """Return why :meth:`receive` refused a command, for a person."""
         lease = self._authority.lease
-        return explain(refusal, command, sequence, now_ns=now_ns, max_age_ns=self.max_age_ns, lease=lease)
+        return explain(refusal, command, intents.seq, now_ns=now_ns, max_age_ns=self.max_age_ns, lease=lease)
 
     def decide(
         self,
-        command: Command,
-        sequence: CommandSequence,
+        action: AnyAction,
+        intent: Intent,
         state: FlightState,
         link: LinkState,
         feedback: Feedback | None,
         now_ns: int,
+        *,
+        new: bool,
+        automatic: bool = False,
     ) -> Decision:
-        """Decide what the vehicle does of a command that :meth:`receive` let through. Not for an emergency stop.
+        """Decide what the vehicle does of a command whose intent is under way. Not for an emergency stop.
 
         Args:
-            command: any action but :class:`Idle` and :class:`EmergencyStop`.
-            sequence: that of the sender's connection.
+            action: any action but :class:`Idle` and :class:`EmergencyStop`.
+            intent: what it is asked for, or repeated, by.
             state: the flight state now.
             link: the state of the link to the vehicle.
             feedback: the newest sample, for altitude and position; None: none came yet.
             now_ns: the time now, on the proxy's clock [ns].
+            new: whether the application newly asked for it; else the library repeats it, or asks for it by itself.
+            automatic: whether the library asks for it by itself.
         """
-        action = command.action
         kind = type(action)
         policy = STATE_POLICIES[kind][state]
-        if kind is ReturnToStart and state is FlightState.LANDED and self._has_returned(command, sequence):
-            policy = StatePolicy.HOLD
-        new = command.intent > sequence.acted
-        if new:
-            sequence.acted = command.intent
-            if kind is ReturnToStart:
-                self.back = None
-        if command.automatic:
-            new = False  # what the library does by itself is nobody's decision: it takes nothing from others
-            if state is FlightState.LANDING or self._ladder.step is Failsafe.LAND:
-                policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
-        problem = self._problem(command, sequence, state, link, new)
+        if new and kind is ReturnToStart:
+            self.back = None
+        if automatic and (state is FlightState.LANDING or self._ladder.step is Failsafe.LAND):
+            policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
+        problem = self._problem(action, policy, state, link, new=new, automatic=automatic)
         if problem is not None:
             return Decision(None, *problem, new)
         is_set_point = kind in SET_POINTS
@@ -224,19 +177,21 @@ class CommandChecks:
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state), new)
-        if policy is StatePolicy.HOLD:
-            return Decision(new=new)
         clamps: tuple[Clamp, ...] = ()
         enforced = None
-        if policy is StatePolicy.HOVER or kind is Hover:
-            action, clamps = self._hover_below_ceiling(state, feedback)
-        elif type(action) is Position:
-            place = decide_place(action, self.limits, self.space, feedback, now_ns, new=new)
+        if type(action) is Position and policy is not StatePolicy.HOVER:
+            place = decide_place(action, self.limits, self.space, feedback, now_ns, new=not intent.begun)
+            if policy is StatePolicy.HOLD:  # judged all the same: who waits for a take-off learns it now
+                return Decision(None, place.refusal, place.why, new)
             if place.action is None:  # what was flown before is not wanted any more either
                 instead = _HOVER_ACTION if Hover in self._supported else None
                 return Decision(instead, place.refusal, place.why, new)  # without a refusal: until it is known again
             action, clamps = place.action, place.clamps
             enforced = None if self.safety is None else True
+        elif policy is StatePolicy.HOLD:
+            return Decision(new=new)
+        elif policy is StatePolicy.HOVER or kind is Hover:
+            action, clamps = self._hover_below_ceiling(state, feedback)
         elif type(action) is ReturnToStart:
             if self.back is None:
                 self.begin_return(action)
@@ -268,10 +223,6 @@ class CommandChecks:
         decision = flight.step(self.limits, self.space, feedback, now_ns)
         return decision.why if decision.action is None and decision.refusal is not None else ""
 
-    def _has_returned(self, command: Command, sequence: CommandSequence) -> bool:
-        """Whether it landed at the end of the return that this command repeats."""
-        return self.back is not None and self.back.phase is ReturnPhase.LANDING and command.intent <= sequence.acted
-
     def guard(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
         """Return the nearest velocity that limits, safety box and zones allow, on the way to a place."""
         allowed, _ = self.limits.clamp(wanted, feedback.altitude_m)
@@ -281,34 +232,39 @@ class CommandChecks:
         return allowed
 
     def _problem(
-        self, command: Command, sequence: CommandSequence, state: FlightState, link: LinkState, new: bool
+        self,
+        action: AnyAction,
+        policy: StatePolicy,
+        state: FlightState,
+        link: LinkState,
+        *,
+        new: bool,
+        automatic: bool,
     ) -> tuple[Refusal, str] | None:
         """What forbids a command of the holder, whatever the policy of the flight state is."""
-        kind = type(command.action)
-        if not sequence.fresh(command):
-            return Refusal.NOT_FRESH, "it repeats a command from before a failsafe or a new lease: send a new one"
+        kind = type(action)
         if link is not LinkState.UP and link is not LinkState.DEGRADED:
             return Refusal.VEHICLE_LINK_LOST, f"the link to the vehicle is {link.value}"
         if kind not in self._supported:
             why = self._why_not or "neither the vehicle nor the software autopilot can do it"
-            return Refusal.UNSUPPORTED, f"{command.action.name} is not possible: {why}"
+            return Refusal.UNSUPPORTED, f"{action.name} is not possible: {why}"
         if self._ownership.whose is Whose.OTHERS:
             others = self._ownership.others
             if kind in SET_POINTS:
                 return Refusal.WRONG_STATE, f"{others}: hover, take off or land first to take it over"
-            if not new and kind in _TAKING:
-                what = "what the library does by itself" if command.automatic else "a repeated command"
+            if not new and (automatic or policy is not StatePolicy.HOLD) and kind in _TAKING:
+                what = "what the library does by itself" if automatic else "a repeated command"
                 return Refusal.WRONG_STATE, f"{others}, and {what} does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
-        if self._ladder.lands_for_battery and (kind in SET_POINTS or command.automatic):
+        if self._ladder.lands_for_battery and (kind in SET_POINTS or automatic):
             what = "returns to its start" if self._ladder.returning else "lands"
             return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
         if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:
             why = "the battery is low, and it would return at once (battery.return): charge it"
-            return Refusal.WRONG_STATE, f"{command.action.name} is not possible: {why}"
-        if STATE_POLICIES[kind][state] is StatePolicy.HOVER and Hover not in self._supported:
-            return Refusal.UNSUPPORTED, f"{command.action.name} is not possible while {state.value}"
+            return Refusal.WRONG_STATE, f"{action.name} is not possible: {why}"
+        if policy is StatePolicy.HOVER and Hover not in self._supported:
+            return Refusal.UNSUPPORTED, f"{action.name} is not possible while {state.value}"
         return None
 
     def _hover_below_ceiling(
@@ -322,16 +278,14 @@ class CommandChecks:
         return (_HOVER_ACTION, ()) if sink is None else (sink, clamps)
 
 
-def explain(
-    reason: Refusal, command: Command, sequence: CommandSequence, *, now_ns: int, max_age_ns: int, lease: int
-) -> str:
-    """Why a command was refused by :meth:`CommandSequence.receive`, and what would be right, in words for a person."""
+def explain(reason: Refusal, command: Command, newest_seq: int, *, now_ns: int, max_age_ns: int, lease: int) -> str:
+    """Why a command was refused by :meth:`Intents.check`, and what would be right, in words for a person."""
     if reason is Refusal.OUT_OF_SEQUENCE:
-        return f"number {command.seq} is not newer than {sequence.seq}, the last one received"
+        return f"number {command.seq} is not newer than {newest_seq}, the last one received"
     if reason is Refusal.STALE:
         age = seconds(now_ns - command.sent_ns)
         if age < 0:
-            return f"it was sent {-age:.3f} s in the future, at most {MAX_AHEAD_S:g} s are allowed"
+            return f"it was sent {-age:.3f} s in the future, at most {seconds(MAX_AHEAD_NS):g} s are allowed"
         return f"it is {age:.3f} s old, at most {seconds(max_age_ns):g} s are allowed (command.max_age_s)"
     if reason is Refusal.FOREIGN_LEASE:
         force = f"lease {lease} is in force" if lease else "no lease is in force"

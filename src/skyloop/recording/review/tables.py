@@ -206,6 +206,8 @@ def _feedback(feedback: Feedback) -> dict[str, Cell]:
         value = getattr(feedback, name)
         if name in VECTORS:
             cells |= zip(VECTORS[name], value or (None, None, None), strict=True)
+        elif name == "outcome":
+            cells["fate"] = "" if value is None else value.fate
         elif name != "native":
             cells[name] = "" if value is None and name == "owner" else value
     for name, value in (feedback.native or {}).items():

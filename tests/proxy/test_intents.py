@@ -1,0 +1,495 @@
+"""An intent has one beginning and one end, and no repeat acts after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.clock import NS_PER_S
+from skyloop.errors import DriverError
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    Command,
+    EmergencyStop,
+    EventKind,
+    Fate,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    LinkState,
+    Position,
+    Refusal,
+    ReleaseAuthority,
+    ResetEmergency,
+    ReturnToStart,
+    Takeoff,
+    Velocity,
+)
+from skyloop.messages.intent import ENDINGS
+from skyloop.proxy.core.intents import SETTLED_NS, TAKEOFF_NS, Intent, Intents
+from tests.proxy.fake import App, Bench
+
+NOW = 100 * NS_PER_S
+S = FlightState
+ORDERS: tuple[AnyAction, ...] = (
+    Takeoff(),
+    Hover(),
+    Land(),
+    Velocity(0.3),
+    Attitude(0.1),
+    Position(1.0, 0.0, 1.0),
+    ReturnToStart(),
+)
+
+
+# The pure module ---------------------------------------------------------------------------------------------------
+
+
+def received(intents: Intents, number: int, action: AnyAction, state: FlightState = S.HOVERING) -> tuple[Intent, bool]:
+    command = Command(intents.seq + 1, 1, number, NOW, action)
+    assert intents.check(command, NOW, NS_PER_S, 1, True) is None
+    return intents.receive(command, state, NOW)
+
+
+@pytest.mark.parametrize("action", ORDERS, ids=lambda action: action.name)
+@pytest.mark.parametrize("fate", ENDINGS)
+def test_each_end_of_the_list_ends_every_kind_of_intent(fate: Fate, action: AnyAction) -> None:
+    intents = Intents()
+    received(intents, 3, action)
+    intents.end(fate)
+    repeat, new = received(intents, 3, action)
+    assert (repeat.over, new, repeat.fate) == (True, False, fate)
+    later, new = received(intents, 4, action)
+    assert (later.over, new) == (False, True)
+
+
+def test_the_list_of_ends_has_each_fate_that_is_one() -> None:
+    assert set(ENDINGS) == set(Fate) - {Fate.UNDER_WAY}
+
+
+def test_a_newer_intent_takes_the_place_of_the_one_before_for_good() -> None:
+    intents = Intents()
+    first, _ = received(intents, 1, Velocity(0.3))
+    received(intents, 2, Hover())
+    assert first.fate is Fate.REPLACED
+    assert received(intents, 1, Velocity(0.3))[0].over
+
+
+def test_to_want_nothing_withdraws_what_was_asked_for() -> None:
+    intents = Intents()
+    takeoff, _ = received(intents, 1, Takeoff(), S.LANDED)
+    received(intents, 2, Idle(), S.LANDED)
+    assert takeoff.fate is Fate.WITHDRAWN
+
+
+def test_what_was_received_but_refused_as_late_is_ended_too() -> None:
+    intents = Intents()
+    intents.check(Command(1, 1, 9, 0, Hover()), NOW, NS_PER_S, 1, True)
+    intents.end(Fate.FAILSAFE)
+    repeat, new = received(intents, 9, Hover())
+    assert (repeat.over, new, repeat.reason) == (True, False, Refusal.NOT_FRESH)
+
+
+def test_before_anything_was_received_intent_zero_is_new() -> None:
+    assert received(Intents(), 0, Hover())[1]
+
+
+@pytest.mark.parametrize(
+    ("action", "states", "fate"),
+    [
+        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.HOVERING], Fate.COMPLETED),
+        (Takeoff(), [S.LANDED, S.TAKING_OFF], Fate.UNDER_WAY),
+        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDED], Fate.LANDED),  # tipped over, or killed by a switch
+        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDING], Fate.LANDED),  # somebody else lands it
+        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.EMERGENCY], Fate.EMERGENCY),
+        (Land(), [S.HOVERING, S.LANDING], Fate.UNDER_WAY),
+        (Land(), [S.HOVERING, S.LANDING, S.LANDED], Fate.COMPLETED),
+        (Land(), [S.LANDED], Fate.COMPLETED),
+        (Hover(), [S.LANDING, S.HOVERING], Fate.UNDER_WAY),  # it broke a landing off
+        (Hover(), [S.HOVERING, S.LANDING], Fate.LANDED),
+        (Velocity(0.3), [S.FLYING, S.LANDED], Fate.LANDED),
+        (Velocity(0.3), [S.FLYING, S.UNKNOWN], Fate.UNDER_WAY),
+        (Position(1.0, 0.0, 1.0), [S.TAKING_OFF, S.HOVERING, S.FLYING], Fate.UNDER_WAY),
+        (ReturnToStart(), [S.FLYING, S.LANDING], Fate.UNDER_WAY),
+        (ReturnToStart(), [S.FLYING, S.LANDING, S.LANDED], Fate.COMPLETED),
+        (ResetEmergency(), [S.EMERGENCY], Fate.UNDER_WAY),
+        (ResetEmergency(), [S.EMERGENCY, S.LANDED], Fate.COMPLETED),
+    ],
+)
+def test_what_the_vehicle_does_ends_it(action: AnyAction, states: list[FlightState], fate: Fate) -> None:
+    intent = Intent(1, action, NOW, states[0], begun=True)
+    for state in states:
+        intent.observe(state, NOW)
+    assert intent.fate is fate
+
+
+def test_a_take_off_has_a_time_on_the_ground_and_none_in_the_air() -> None:
+    stands, climbs = (Intent(1, Takeoff(), NOW, S.LANDED, begun=True) for _ in range(2))
+    stands.observe(S.LANDED, NOW + TAKEOFF_NS - 1)
+    assert not stands.over
+    stands.observe(S.LANDED, NOW + TAKEOFF_NS)
+    climbs.observe(S.TAKING_OFF, NOW + 2 * TAKEOFF_NS)
+    assert (stands.fate, climbs.fate) == (Fate.TIMED_OUT, Fate.UNDER_WAY)
+
+
+def test_a_landing_that_withdrew_a_take_off_waits_for_an_arming_that_is_on_its_way() -> None:
+    landing = Intent(1, Land(), NOW, S.LANDED, withdrew=True)
+    landing.observe(S.LANDED, NOW + SETTLED_NS - 1)
+    assert not landing.over
+    landing.observe(S.LANDED, NOW + SETTLED_NS)
+    assert landing.fate is Fate.COMPLETED
+
+
+_STEPS = st.one_of(
+    st.tuples(st.just("ask"), st.sampled_from(ORDERS)),
+    st.tuples(st.just("repeat"), st.integers(0, 3)),
+    st.tuples(st.just("end"), st.sampled_from(list(ENDINGS))),
+    st.tuples(st.just("see"), st.sampled_from(list(FlightState))),
+)
+
+
+@given(st.lists(_STEPS, max_size=40))
+def test_whatever_happens_no_repeat_is_under_way_after_an_end(steps: list[tuple[str, object]]) -> None:
+    intents, over, number = Intents(), set[int](), 0
+    for step, what in steps:
+        if step == "ask":
+            over.add(number)  # the newer one takes its place
+            number += 1
+            intent, new = received(intents, number, what)  # type: ignore[arg-type]
+            assert new
+            assert not intent.over
+        elif step == "repeat" and number:
+            wanted = max(1, number - what)  # type: ignore[operator]
+            intent, new = received(intents, wanted, Hover())
+            assert not new
+            assert intent.over or wanted not in over
+        elif step == "end":
+            over.update(range(number + 1))
+            intents.end(what)  # type: ignore[arg-type]
+        elif step == "see":
+            intents.newest.observe(what, NOW)  # type: ignore[arg-type]
+            if intents.newest.over:
+                over.add(number)
+
+
+# In a proxy --------------------------------------------------------------------------------------------------------
+
+
+def pending(bench: Bench, name: str = "pilot") -> App:
+    """A pilot whose take-off the vehicle was told of, and does not show yet."""
+    bench.driver.answers = False
+    pilot = bench.pilot(name)
+    pilot.command(Takeoff())
+    assert bench.driver.told == [Takeoff()]
+    return pilot
+
+
+def repeats(bench: Bench, pilot: App, action: AnyAction, seconds: float = 1.0) -> None:
+    """The library repeats it, as many times a second as it does."""
+    bench.run(seconds, lambda: pilot.command(action, repeat=True))
+
+
+def test_a_take_off_that_others_land_does_not_begin_again_when_it_stands(bench: Bench) -> None:
+    """Another station, or a pilot's switch, lands it at 1 m: 0.1 s after touch-down it took off again."""
+    pilot = bench.pilot()
+    pilot.command(Takeoff())
+    bench.driver.left = "LAND"
+    bench.driver.report(state=S.LANDING)
+    repeats(bench, pilot, Takeoff())
+    bench.driver.left = ""
+    bench.driver.report(state=S.LANDED)
+    repeats(bench, pilot, Takeoff(), 5.0)
+    assert bench.driver.told == [Takeoff()]
+    assert pilot.last_feedback().outcome is not None
+    assert "LAND, which was not chosen here" in pilot.told(EventKind.COMMAND_REFUSED)[0].text
+
+
+@pytest.mark.parametrize("noticed", [True, False], ids=["seen landing", "seen standing"])
+def test_a_take_off_that_ends_on_the_ground_is_over(bench: Bench, noticed: bool) -> None:
+    """It tips over, or is disarmed by a switch: 0.1 s later it armed itself and took off."""
+    pilot = bench.pilot()
+    pilot.command(Takeoff())
+    bench.tick()
+    if noticed:
+        bench.driver.report(state=S.LANDING)
+        bench.tick()
+    bench.driver.report(state=S.LANDED)
+    repeats(bench, pilot, Takeoff(), 5.0)
+    assert bench.driver.told == [Takeoff()]
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.app_id, outcome.intent, outcome.fate) == (pilot.app_id, pilot.intent, Fate.LANDED)
+    assert "landed or disarmed" in outcome.text
+
+
+def battery(bench: Bench) -> Callable[[], object]:
+    bench.driver.report(battery=0.05)
+    bench.tick()
+    return lambda: bench.driver.report(battery=0.5)
+
+
+def emergency(bench: Bench) -> Callable[[], object]:
+    bench.driver.report(state=S.EMERGENCY)
+    return lambda: bench.driver.report(state=S.LANDED)
+
+
+def not_ready(bench: Bench) -> Callable[[], object]:
+    bench.driver.refuses = "GPS has no fix"
+    return lambda: setattr(bench.driver, "refuses", "")
+
+
+def no_link(bench: Bench) -> Callable[[], object]:
+    bench.driver.link(LinkState.CONNECTING)
+    return lambda: bench.driver.link(LinkState.UP)
+
+
+@pytest.mark.parametrize("prevent", [battery, emergency, not_ready, no_link], ids=lambda one: one.__name__)
+def test_a_refused_take_off_is_not_carried_out_later(
+    bench: Bench, prevent: Callable[[Bench], Callable[[], object]]
+) -> None:
+    """Refused and not waited for: it was done when the battery read higher, or an emergency was reset."""
+    pilot = bench.pilot()
+    bench.tick()
+    release = prevent(bench)
+    pilot.command(Takeoff())
+    assert len(pilot.refusals()) == 1
+    release()
+    bench.tick()
+    repeats(bench, pilot, Takeoff())
+    assert Takeoff() not in bench.driver.told
+    pilot.command(Takeoff())
+    assert bench.driver.told[-1] == Takeoff(), "newly asked for, it is done"
+
+
+def test_a_driver_that_gives_up_on_its_way_is_told_to_forget_the_take_off(bench: Bench) -> None:
+    pilot = pending(bench)
+    bench.driver.fail = {"apply"}
+    pilot.command(Takeoff(), repeat=True)
+    bench.driver.fail = set()
+    assert pilot.refusals() == [Refusal.DRIVER_FAILED]
+    repeats(bench, pilot, Takeoff())
+    assert bench.driver.told == [Takeoff()]
+
+
+def lease_lost(bench: Bench, pilot: App) -> None:
+    pilot.ask(ReleaseAuthority())
+
+
+def taken_over(bench: Bench, pilot: App) -> None:
+    bench.pilot("boss", priority=0)
+
+
+def link_broken(bench: Bench, pilot: App) -> None:
+    bench.driver.link(LinkState.LOST)
+    bench.tick()
+
+
+def given_up(bench: Bench, pilot: App) -> None:
+    pilot.command(Idle())
+
+
+def no_longer_repeated(bench: Bench, pilot: App) -> None:
+    pilot.command(Idle(), repeat=True)
+
+
+def hovered(bench: Bench, pilot: App) -> None:
+    pilot.command(Hover())
+
+
+def landed(bench: Bench, pilot: App) -> None:
+    pilot.command(Land())
+
+
+def timed_out(bench: Bench, pilot: App) -> None:
+    bench.run(20.1, lambda: pilot.command(Takeoff(), repeat=True))
+
+
+def timed_out_behind_a_set_point(bench: Bench, pilot: App) -> None:
+    bench.run(20.1, lambda: pilot.command(Velocity(0.1)))
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        lease_lost,
+        taken_over,
+        link_broken,
+        given_up,
+        no_longer_repeated,
+        hovered,
+        landed,
+        timed_out,
+        timed_out_behind_a_set_point,
+    ],
+    ids=lambda one: one.__name__,
+)
+def test_a_take_off_that_ends_before_it_shows_is_withdrawn_from_the_vehicle(
+    bench: Bench, end: Callable[[Bench, App], None]
+) -> None:
+    """A call gave up after 4 s, and the vehicle took off at 14.6 s: its driver went on trying."""
+    pilot = pending(bench)
+    end(bench, pilot)
+    assert bench.driver.told[-1] == Land(), "which makes a driver forget it"
+    assert bench.driver.told.count(Land()) == 1
+
+
+@pytest.mark.parametrize("action", [Velocity(0.1), Takeoff()], ids=lambda action: action.name)
+def test_a_controller_that_runs_already_leaves_a_take_off_alone(bench: Bench, action: AnyAction) -> None:
+    pilot = pending(bench)
+    bench.run(0.5, lambda: pilot.command(action))
+    assert Land() not in bench.driver.told
+
+
+def test_a_take_off_that_shows_is_not_broken_off_by_a_lost_lease(bench: Bench) -> None:
+    pilot = pending(bench)
+    bench.driver.report(state=S.TAKING_OFF)
+    bench.tick()
+    pilot.ask(ReleaseAuthority())
+    pilot.command(Idle())
+    assert bench.driver.told == [Takeoff()]
+
+
+def test_nothing_is_withdrawn_from_a_vehicle_that_others_took(bench: Bench) -> None:
+    pilot = pending(bench)
+    bench.driver.left = "STABILIZE"
+    bench.driver.answers = True
+    bench.driver.report(state=S.TAKING_OFF)
+    bench.tick()
+    pilot.command(Idle())
+    bench.run(1.0)
+    assert bench.driver.told == [Takeoff()]
+
+
+def at_home(bench: Bench, state: FlightState = S.HOVERING) -> App:
+    pilot = bench.airborne()
+    bench.driver.report(state=state, position_m=(0.0, 0.0, 1.0), yaw_rad=0.0, altitude_m=1.0)
+    return pilot
+
+
+BELOW, HIGH = Position(0.0, 0.0, -4.0), Position(0.0, 0.0, 50.0)
+
+
+@pytest.mark.parametrize("place", [BELOW, HIGH], ids=["below the ground", "above the limit"])
+def test_a_refused_place_is_not_flown_to_by_its_own_repeat(bench: Bench, place: Position) -> None:
+    """Judged only while it was new, it stood on the floor 3 s later, with its motors running."""
+    pilot = at_home(bench)
+    pilot.command(place)
+    assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
+    repeats(bench, pilot, place)
+    assert set(bench.driver.told) == {Hover()}
+
+
+@pytest.mark.parametrize("place", [BELOW, HIGH], ids=["below the ground", "above the limit"])
+def test_a_place_that_is_asked_for_in_a_take_off_is_judged_at_once(bench: Bench, place: Position) -> None:
+    pilot = at_home(bench, S.TAKING_OFF)
+    pilot.command(place)
+    assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
+    bench.driver.report(state=S.HOVERING)
+    repeats(bench, pilot, place)
+    assert bench.driver.told == [], "the take-off went on, and it hovers"
+
+
+def test_a_good_place_that_is_asked_for_in_a_take_off_is_flown_to_after_it(bench: Bench) -> None:
+    pilot = at_home(bench, S.TAKING_OFF)
+    place = Position(1.0, 0.0, 1.0)
+    pilot.command(place)
+    assert bench.driver.told == []
+    bench.driver.report(state=S.HOVERING)
+    pilot.command(place, repeat=True)
+    assert [type(action) for action in bench.driver.told] == [Position]
+
+
+def test_a_place_that_came_to_lie_behind_a_zone_in_a_take_off_is_judged_again_when_it_begins(bench: Bench) -> None:
+    from tests.proxy.test_places import write
+
+    pilot = at_home(bench, S.TAKING_OFF)
+    place = Position(3.0, 0.0, 1.0)
+    pilot.command(place)
+    write(bench, pilot, "safety.zones", "box 1 -1 0 2 1 3")
+    bench.driver.report(state=S.HOVERING)
+    pilot.command(place, repeat=True)
+    assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
+    assert Position not in map(type, bench.driver.told)
+
+
+def test_a_landing_that_a_driver_fails_at_once_is_tried_again(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.fail = {"apply"}
+    pilot.command(Land())
+    bench.driver.fail = set()
+    pilot.command(Land(), repeat=True)
+    assert bench.driver.told == [Land()]
+
+
+def test_a_landing_wanted_while_others_land_does_not_take_the_vehicle_by_a_repeat(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.left = "LAND"
+    bench.driver.report(state=S.LANDING)
+    bench.tick()
+    pilot.command(Land())
+    bench.driver.left = "LOITER"
+    bench.driver.report(state=S.HOVERING)
+    repeats(bench, pilot, Land())
+    assert bench.driver.told == []
+    assert pilot.refusals() == [Refusal.WRONG_STATE]
+
+
+def test_what_became_of_an_intent_is_in_each_sample_until_a_newer_one_comes(bench: Bench) -> None:
+    pilot = bench.pilot()
+    pilot.command(Velocity(0.5))
+    for _ in range(3):
+        bench.driver.report()
+        outcome = pilot.last_feedback().outcome
+        assert outcome is not None
+        assert (outcome.intent, outcome.fate, outcome.reason) == (1, Fate.REFUSED, Refusal.WRONG_STATE)
+        assert outcome.text == "pilot: velocity refused: velocity is not possible while landed: take off first"
+    pilot.command(Takeoff())
+    bench.driver.report(state=S.TAKING_OFF)
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.intent, outcome.fate) == (2, Fate.UNDER_WAY)
+    bench.driver.report(state=S.HOVERING)
+    bench.tick()
+    bench.driver.report()
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.intent, outcome.fate) == (2, Fate.COMPLETED)
+
+
+def test_a_stop_of_the_motors_ends_what_anybody_asked_for(bench: Bench) -> None:
+    pilot, other = bench.airborne(), bench.join("other")
+    pilot.command(Velocity(0.5))
+    other.command(EmergencyStop())
+    bench.driver.report(state=S.LANDED)  # reset at the vehicle itself
+    repeats(bench, pilot, Velocity(0.5))
+    assert bench.driver.told == [Velocity(0.5), EmergencyStop()]
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert outcome.fate is Fate.EMERGENCY
+
+
+def test_a_repeat_of_what_was_done_ends_no_failsafe(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.tick()
+    bench.run(0.6)
+    bench.driver.told.clear()
+    pilot.command(Takeoff(), repeat=True)
+    assert pilot.last_feedback().failsafe == "hover"
+    assert bench.driver.told == []
+
+
+def test_a_driver_that_refuses_at_once_says_why_to_a_repeat(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: AnyAction, *, new: bool = True) -> AnyAction:
+        raise DriverError("no")
+
+    monkeypatch.setattr(bench.driver, "apply", refuse)
+    pilot = bench.pilot()
+    pilot.command(Takeoff())
+    monkeypatch.undo()
+    pilot.command(Takeoff(), repeat=True)
+    assert bench.driver.told == []
