@@ -276,7 +276,12 @@ def test_a_safety_pilot_keeps_the_vehicle_whatever_becomes_of_the_program(
             time.sleep(0.02)
         scene.ours.clear()
         scene.station_mode("RTL")
-        wait_until(lambda: drone.velocity(forward=0.3) and proxy.handler.ownership.others != "", "it is seen")
+
+        def seen() -> bool:
+            drone.velocity(forward=0.3)
+            return proxy.handler.ownership.others != ""
+
+        wait_until(seen, "it is seen")
         end(drone)
         scene.watched(proxy, 100)
         assert scene.ours == []
