@@ -58,7 +58,7 @@ def simulate(pipe: Pipe, place: str, names: list[str]) -> None:
     with ExitStack() as started:
         for proxy in proxies:
             proxy.start()
-            started.callback(proxy.stop)
+            started.callback(proxy.end)
         pipe.send("ready")
         pipe.recv()
 

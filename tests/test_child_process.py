@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import signal
@@ -9,13 +10,14 @@ import subprocess
 import sys
 import textwrap
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from skyloop.child_process import ChildProcess, on_parent_end
+from skyloop.child_process import ChildProcess, RestartingChild, on_parent_end
+from skyloop.transport.testing import wait_until
 
 SOURCE = Path(__file__).parents[1] / "src"
 
@@ -108,3 +110,94 @@ def test_the_end_of_the_parents_pipe_is_heard() -> None:
     never_open = threading.Event()
     on_parent_end(never_open.set, reading + 1000)
     assert never_open.wait(20.0), "a pipe that can't be read is as good as ended"
+
+
+def test_a_fork_leaves_the_child_of_its_parent_alone() -> None:
+    """What a fork of this process does to its copy of the object; the process itself goes on."""
+    code = "import sys; print('x', flush=True); sys.stdin.read(); print('y', flush=True)"
+    child = ChildProcess([sys.executable, "-c", code])
+    assert child.stdout.readline() == b"x\n"
+    keep = os.dup(child._process.stdin.fileno())  # type: ignore[union-attr]  # the parent's end of the pipe
+    child.forked()
+    child.terminate()
+    child.kill()
+    child.end(0.0, 0.0)
+    child.close(0.0, 0.0)
+    assert child.code is None, "it still runs"
+    os.close(keep)
+    assert child.stdout.readline() == b"y\n", "no copy of the pipe is left that would keep it running"
+    child._ours = True
+    child.close()
+
+
+def restarting(code: str, ended: Callable[[ChildProcess | None, str], float | None]) -> RestartingChild:
+    return RestartingChild(
+        [sys.executable, "-c", code], name="test-child", read=lambda child: child.stdout.read(), ended=ended
+    )
+
+
+def test_a_restart_that_fails_is_told_and_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No descriptors were left for a moment: one failed restart must not end the supervision for good."""
+    endings: list[str] = []
+    real = ChildProcess
+
+    def start(command: Sequence[str], *, keep_errors: bool) -> ChildProcess:
+        if len(endings) == 1:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return real(command, keep_errors=keep_errors)
+
+    monkeypatch.setattr("skyloop.child_process.ChildProcess", start)
+    code = "import sys; sys.stdin.read()"
+    child = restarting(code, lambda _, ending: endings.append(ending) or 0.0)  # type: ignore[func-returns-value]
+    child.start()
+    first = child.child
+    assert first is not None
+    first.kill()
+    wait_until(lambda: child.child not in (None, first), "another one runs")
+    assert endings[0] == "was killed by signal 9"
+    assert "could not be started" in endings[1]
+    assert "Too many open files" in endings[1]
+    assert child.restarts == 2
+    child.stop()
+    assert child.over
+
+
+def test_no_child_is_started_after_one_that_says_it_is_over() -> None:
+    child = restarting("raise SystemExit(2)", lambda *_: None)
+    child.start()
+    wait_until(lambda: child.over, "it is over")
+    assert child.restarts == 0
+    child.stop()
+
+
+def test_a_child_that_can_not_be_started_at_all_raises() -> None:
+    child = RestartingChild(["/nowhere/skyloop"], name="test-child", read=lambda _: None, ended=lambda *_: None)
+    with pytest.raises(FileNotFoundError):
+        child.start()
+    child.stop()
+
+
+def test_a_child_whose_output_can_not_be_read_is_replaced() -> None:
+    def read(child: ChildProcess) -> None:
+        child.stdout.read(1)
+        raise ValueError("not what it should be")
+
+    code = "import sys; print('x', flush=True); sys.stdin.read()"
+    child = RestartingChild([sys.executable, "-c", code], name="test-child", read=read, ended=lambda *_: 0.0)
+    child.start()
+    wait_until(lambda: child.restarts >= 1, "it was started again")
+    child.stop()
+
+
+def test_a_silent_child_is_killed() -> None:
+    endings: list[str] = []
+    child = RestartingChild(
+        [sys.executable, "-c", "import time; time.sleep(60)"],
+        name="test-child",
+        read=lambda child: child.stdout.read(),
+        ended=lambda _, ending: endings.append(ending),
+        silent=lambda: True,
+    )
+    child.start()
+    wait_until(lambda: child.over, "it was killed")
+    assert endings == ["was killed by signal 9"]

@@ -1,21 +1,61 @@
-"""Child processes that end with their parent, and whose last words are in the error.
+"""Child processes that end with their parent, and what a fork of this process leaves to it.
 
 A child's standard input is a pipe into which nothing is written. When the parent closes its end or is gone, however it
 ended, the child reads the end of file (:func:`on_parent_end`) and ends too.
+
+A child made by ``os.fork`` is another matter: it has copies of its parent's objects, but none of its threads, and their
+ends would end what the parent still uses (:func:`leave_to_parent`).
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import tempfile
 import threading
+import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import IO, Final
+from typing import IO, Final, Protocol
 
 GRACE_S: Final = 4.0  #: for a child to end by itself, and again to end when it is terminated
 _TAIL: Final = 2000  # bytes of a child's standard error that an error shows
+_LOOK_S: Final = 0.25  # how often a child that may fall silent is looked at
+#: How long what a dead child has written is read. A grandchild that holds the pipe keeps it open for longer.
+_DRAIN_S: Final = 1.0
+_log = logging.getLogger(__name__)
+
+
+class LeftToParent(Protocol):
+    """What belongs to the process that made it."""
+
+    def forked(self) -> None:
+        """In a child made by ``os.fork``: let nothing that is called from now on reach what the parent uses.
+
+        Other threads are gone, and their locks may be held for ever: take none.
+        """
+
+
+_left: Final[weakref.WeakSet[LeftToParent]] = weakref.WeakSet()
+_left_lock: Final = threading.RLock()
+
+
+def leave_to_parent(owner: LeftToParent) -> None:
+    """Have ``owner.forked()`` called in each child made by ``os.fork``, for as long as ``owner`` is in use."""
+    with _left_lock:
+        _left.add(owner)
+
+
+def _leave_all() -> None:
+    _left_lock.release()
+    for owner in list(_left):
+        owner.forked()
+    _left.clear()
+
+
+if hasattr(os, "register_at_fork"):  # where there is no fork nothing is inherited
+    os.register_at_fork(before=_left_lock.acquire, after_in_parent=_left_lock.release, after_in_child=_leave_all)
 
 
 class ChildProcess:
@@ -53,6 +93,13 @@ class ChildProcess:
         assert self._process.stdout is not None
         self.pid = self._process.pid
         self.stdout: IO[bytes] = self._process.stdout
+        self._ours = True
+        leave_to_parent(self)
+
+    def forked(self) -> None:
+        """Leave the child to the process that started it, without a copy of the pipe that keeps it running."""
+        self.part()
+        self._ours = False
 
     @property
     def code(self) -> int | None:
@@ -88,11 +135,13 @@ class ChildProcess:
 
     def terminate(self) -> None:
         """Send it SIGTERM. Does not wait. Idempotent."""
-        self._process.terminate()
+        if self._ours:
+            self._process.terminate()
 
     def kill(self) -> None:
         """Kill it. Does not wait. Idempotent."""
-        self._process.kill()
+        if self._ours:
+            self._process.kill()
 
     def wait(self, timeout_s: float | None = None) -> int | None:
         """Wait until it has ended; return its exit code, None if it still runs after ``timeout_s`` [s]."""
@@ -107,6 +156,8 @@ class ChildProcess:
             grace_s: Time to end by itself [s].
             harder_s: Time to end when it was terminated [s].
         """
+        if not self._ours:
+            return
         self.part()
         if self.wait(grace_s) is None:
             self._process.terminate()
@@ -116,11 +167,150 @@ class ChildProcess:
 
     def close(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
         """End it as :meth:`end` does, and close its output, which nobody may be reading then. Idempotent."""
+        if not self._ours:
+            return  # and its output may be locked for ever by a thread that the fork left behind
         self.end(grace_s, harder_s)
         self.stdout.close()
-        if self._errors is not None:
+        self.close_errors()
+
+    def close_errors(self) -> None:
+        """Keep the end of what it wrote to standard error, and nothing else of it. Idempotent."""
+        if self._errors is not None and not self._errors.closed:
             self._last_words = self.last_words
             self._errors.close()
+
+
+class RestartingChild:
+    """Keeps one child running: whenever it ends another is started, until :meth:`stop`. Any thread.
+
+    Everything is decided under one lock, so that no child begins after :meth:`request_stop`, and each is ended.
+
+    Attributes:
+        child: The present one, or the last; None before the first.
+        restarts: How many were started in place of another.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        *,
+        name: str,
+        read: Callable[[ChildProcess], object],
+        ended: Callable[[ChildProcess | None, str], float | None],
+        started: Callable[[ChildProcess], object] = lambda _: None,
+        silent: Callable[[], bool] | None = None,
+        keep_errors: bool = False,
+    ) -> None:
+        """Prepare; :meth:`start` starts the first child.
+
+        Args:
+            command: The children's command line.
+            name: Of the threads.
+            read: Reads a child's ``stdout`` to its end, on a thread of its own for each child.
+            ended: Called when a child has ended, with how, for people; with None when one could not be started.
+                Returns the pause before the next one is started [s]; None: none is.
+            started: Called with each child before anything of it is read, under the lock: must be quick.
+            silent: Whether the present child has hung and is to be killed; asked four times a second.
+            keep_errors: See :class:`ChildProcess`.
+        """
+        self._command = command
+        self._read = read
+        self._ended = ended
+        self._started = started
+        self._silent = silent
+        self._keep_errors = keep_errors
+        self._changed = threading.Condition(threading.RLock())
+        self._stopping = False
+        self._reader: threading.Thread | None = None
+        self._name = name
+        self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
+        self.child: ChildProcess | None = None
+        self.restarts = 0
+
+    @property
+    def stopping(self) -> bool:
+        """Whether no other child will be started."""
+        return self._stopping
+
+    @property
+    def over(self) -> bool:
+        """Whether the last child has ended and no other will be started."""
+        return not self._keeper.is_alive()
+
+    def start(self) -> None:
+        """Start the first child. Once.
+
+        Raises:
+            OSError: It can't be started.
+        """
+        self._begin()
+        self._keeper.start()
+
+    def request_stop(self) -> ChildProcess | None:
+        """Start no other child, and return the present one, which goes on. Does not wait. Idempotent."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+            return self.child
+
+    def stop(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
+        """End the present child as :meth:`ChildProcess.end` does, and start no other. Idempotent."""
+        child = self.request_stop()
+        if child is not None:
+            child.end(grace_s, harder_s)
+        for thread in (self._keeper, self._reader):
+            if thread is not None and thread.ident is not None and thread is not threading.current_thread():
+                thread.join(_DRAIN_S if thread is self._reader else None)
+
+    def _begin(self) -> ChildProcess | None:
+        with self._changed:
+            if self._stopping:
+                return None
+            child = self.child = ChildProcess(self._command, keep_errors=self._keep_errors)
+            self._started(child)
+        self._reader = threading.Thread(target=self._listen, args=(child,), name=f"{self._name}-output", daemon=True)
+        self._reader.start()
+        return child
+
+    def _listen(self, child: ChildProcess) -> None:
+        try:
+            self._read(child)
+        except Exception:  # noqa: BLE001  the child is replaced all the same
+            _log.exception("the output of a child process could not be read: it is killed")
+            child.kill()
+        finally:
+            child.stdout.close()  # only here: closing what another thread reads would wait for it
+
+    def _keep(self) -> None:
+        child, ending = self.child, ""
+        while True:
+            if child is not None:
+                ending = self._wait(child)
+            pause_s = self._ended(child, ending)
+            with self._changed:
+                if pause_s is None or self._stopping or self._changed.wait_for(lambda: self._stopping, pause_s):
+                    self._stopping = True
+                    return
+                self.restarts += 1
+            try:
+                child = self._begin()
+            except OSError as error:  # no memory or no descriptors left, for a moment
+                child, ending = None, f"could not be started: {error}"
+                continue
+            if child is None:
+                return
+
+    def _wait(self, child: ChildProcess) -> str:
+        """Wait until a child has ended and its output was read; return how it ended, for people."""
+        while child.wait(None if self._silent is None else _LOOK_S) is None:
+            if self._silent is not None and self._silent():
+                child.kill()
+        reader = self._reader
+        assert reader is not None
+        reader.join(_DRAIN_S)
+        child.part()
+        child.close_errors()
+        return child.ending
 
 
 def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:

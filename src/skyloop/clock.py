@@ -19,6 +19,7 @@ Clock = Callable[[], int]
 NS_PER_S: Final = 1_000_000_000
 
 monotonic_ns: Clock = time.monotonic_ns
+_BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 def seconds(ns: int) -> float:
@@ -29,6 +30,17 @@ def seconds(ns: int) -> float:
 def nanoseconds(s: float) -> int:
     """Convert seconds to whole nanoseconds, rounded to nearest."""
     return round(s * NS_PER_S)
+
+
+def slept_ns() -> int:
+    """Return for how long this computer has slept since it was started [ns]; 0 where that is not known.
+
+    The monotonic clock stands still meanwhile: nothing that was heard before is as young as it says afterwards. May be
+    too small for a moment, never too large.
+    """
+    if _BOOTTIME is None:
+        return 0
+    return time.clock_gettime_ns(_BOOTTIME) - time.monotonic_ns()
 
 
 @functools.cache

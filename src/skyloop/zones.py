@@ -8,14 +8,16 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 from skyloop.errors import ParameterError
-from skyloop.messages import Refusal
+from skyloop.messages import Refusal, Value
 
 FAR_M: Final = 10_000.0  #: a wall of the safety box that far away is none
 MAX_ZONES: Final = 32
+#: A thinner zone is kept clear of as if it were so thick: an overshoot or a gust must not end on its far side [m].
+THINNEST_M: Final = 0.5
 BOX: Final = "safety.box"  #: the parameters of the box begin so
 ZONES: Final = "safety.zones"
 ROOM: Final = "safety.room"
@@ -74,6 +76,12 @@ class Box:
             first, last = _within(low, high, at, to, first, last)
         return first <= last
 
+    def thickened(self) -> Box:
+        """Return it at least :data:`THINNEST_M` thick along each axis, about the same middle."""
+        x, y, z = (_thickened(low, high) for low, high in zip(self.low, self.high, strict=True))
+        low, high = (x[0], y[0], z[0]), (x[1], y[1], z[1])
+        return self if (low, high) == (self.low, self.high) else replace(self, low=low, high=high)
+
     def __str__(self) -> str:
         return f"{_prefix(self.name)}box {_numbers(*self.low, *self.high)}"
 
@@ -119,6 +127,13 @@ class Cylinder:
         share = max(first, min(last, nearest))
         return math.hypot(x + share * across, y + share * along) <= self.radius
 
+    def thickened(self) -> Cylinder:
+        """Return it at least :data:`THINNEST_M` thick, about the same middle."""
+        radius, (low, high) = max(self.radius, THINNEST_M / 2), _thickened(self.low, self.high)
+        if (radius, low, high) == (self.radius, self.low, self.high):
+            return self
+        return replace(self, radius=radius, low=low, high=high)
+
     def __str__(self) -> str:
         return f"{_prefix(self.name)}cylinder {_numbers(self.x, self.y, self.radius, self.low, self.high)}"
 
@@ -133,12 +148,28 @@ class Space:
     Attributes:
         room: The walls that it can't pass, where they are known; None: they are not.
         box: The safety box; None: there is none.
-        zones: The no-fly zones.
+        zones: The no-fly zones, as they are written.
+        barriers: The same, none of them thinner than :data:`THINNEST_M`.
     """
 
     room: Box | None = None
     box: Box | None = None
     zones: tuple[Zone, ...] = ()
+    barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)  # the zones as they are kept clear of
+
+    def __post_init__(self) -> None:
+        """Thicken what is too thin."""
+        object.__setattr__(self, "barriers", tuple(zone.thickened() for zone in self.zones))
+
+    @property
+    def walled(self) -> bool:
+        """Whether there are walls that shorten set-points; those of a room do not."""
+        return self.box is not None or bool(self.zones)
+
+    @property
+    def thin(self) -> tuple[Zone, ...]:
+        """The zones that are kept clear of as if they were thicker, as they are written."""
+        return tuple(zone for zone, kept in zip(self.zones, self.barriers, strict=True) if zone is not kept)
 
     def problem_at(self, place: Vec3) -> str:
         """Return why a place can't be flown to, and what can, in words for a person; empty if it can."""
@@ -146,9 +177,9 @@ class Space:
             return f"the place is outside of the room, {self.room} [m] ({ROOM})"
         if self.box is not None and not self.box.holds(place):
             return f"the place is outside of the safety box, {self.box} [m] ({BOX})"
-        for zone in self.zones:
-            if zone.holds(place):
-                return f"the place is in a no-fly zone, {zone} [m] ({ZONES}): choose a place outside of it"
+        for zone, kept in zip(self.zones, self.barriers, strict=True):
+            if kept.holds(place):
+                return f"the place is in a no-fly zone, {_shown(zone, kept)}: choose a place outside of it"
         return ""
 
     def problem_between(self, start: Vec3, end: Vec3) -> str:
@@ -156,9 +187,9 @@ class Space:
 
         A zone that the way begins in may be left.
         """
-        for zone in self.zones:
-            if not zone.holds(start) and zone.is_in_the_way(start, end):
-                return f"a no-fly zone is in the straight way there, {zone} [m] ({ZONES}): fly round it, place by place"
+        for zone, kept in zip(self.zones, self.barriers, strict=True):
+            if not kept.holds(start) and kept.is_in_the_way(start, end):
+                return f"a no-fly zone is in the straight way there, {_shown(zone, kept)}: fly round it, place by place"
         return ""
 
 
@@ -226,6 +257,32 @@ def _parse_zone(text: str) -> Zone:
     if radius <= 0.0 or bottom >= top:
         raise _wrong(f"a cylinder has a radius above 0 and its low end below its high one: {text.strip()!r:.60}")
     return Cylinder(x, y, radius, bottom, top, name)
+
+
+def check_written(name: str, value: Value, number: Callable[[str], float]) -> None:
+    """Check a value of a safety parameter against the others.
+
+    Raises:
+        ParameterError: a wall of the box beyond the opposite one, or no list of zones.
+    """
+    if name == ZONES:
+        parse_zones(str(value))
+    elif name.startswith(f"{BOX}.") and isinstance(value, float):
+        end = "high" if name.endswith("low") else "low"
+        other = number(f"{name.rpartition('_')[0]}_{end}")
+        if not (value < other if end == "high" else value > other):
+            word = "below" if end == "high" else "above"
+            raise ParameterError(f"{name} must be {word} the box's other wall, {other:g} m", code=Refusal.OUT_OF_RANGE)
+
+
+def _thickened(low: float, high: float) -> tuple[float, float]:
+    more = (THINNEST_M - (high - low)) / 2
+    return (low - more, high + more) if more > 0.0 else (low, high)
+
+
+def _shown(zone: Zone, kept: Zone) -> str:
+    thin = "" if zone is kept else f"; it is thin, and kept clear of as if it were {THINNEST_M:g} m thick"
+    return f"{zone} [m] ({ZONES}{thin})"
 
 
 def _prefix(name: str) -> str:

@@ -32,7 +32,7 @@ def proxies(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Proxy]]:
             proxy.start()
         yield made
         for proxy in made:
-            proxy.stop()
+            proxy.end()
 
 
 def test_one_connection_for_all_of_a_process(proxies: list[Proxy], monkeypatch: pytest.MonkeyPatch) -> None:

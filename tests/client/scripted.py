@@ -89,9 +89,11 @@ class ScriptedProxy:
             why_not="" if can_fly else "it has no motors",
         )
         self.run_id = random.getrandbits(40)  # sessions of another test's proxy are not taken for this one's
+        self.momentary: set[str] = set()  #: parameters whose writing does something once
         self.forgets = True  #: whether who leaves loses the authority at once
         self._peers: dict[int, tuple[Peer, str]] = {}
         self._lock = threading.Lock()
+        self.first_lease = 1  #: of the next run; higher: others have held the authority in it before
         self._leases = 0
         self._seq = 0
         self._event_seq = 0
@@ -101,7 +103,8 @@ class ScriptedProxy:
     def start(self) -> Self:
         self._ended.clear()
         self.run_id += 1
-        self._seq = self._event_seq = self._leases = 0
+        self._seq = self._event_seq = 0
+        self._leases = self.first_lease - 1
         self.owner = None
         self.server.start(self)
         self.beating.set()
@@ -260,7 +263,7 @@ class ScriptedProxy:
         return ParameterValue(self._parameter(body.name))
 
     def _parameter(self, name: str) -> Parameter:
-        return Parameter(name, ParameterType.FLOAT, self.parameters[name], "rad")
+        return Parameter(name, ParameterType.FLOAT, self.parameters[name], "rad", momentary=name in self.momentary)
 
     def _beat(self) -> None:
         while not self._ended.wait(0.01):

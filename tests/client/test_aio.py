@@ -12,9 +12,11 @@ import pytest
 
 import skyloop.client
 from skyloop import aio
+from skyloop.aio.bridge import in_thread
 from skyloop.client.drone import open_drone
+from skyloop.client.swarm import in_parallel
 from skyloop.errors import ClosedError, NoAnswerError, UsageError
-from skyloop.messages import Encoding, EventKind, FlightState, Hover, Land, Takeoff
+from skyloop.messages import AnyAction, Encoding, EventKind, FlightState, Hover, Idle, Land, ResetEmergency, Takeoff
 from skyloop.transport.base import results
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
 from tests.client.test_results import Sender
@@ -101,6 +103,8 @@ def test_authority_and_emergency(proxy: ScriptedProxy) -> None:
             assert (await drone.request_authority(2)).priority == 2
             assert drone.emergency_stop()
             assert drone.reset_emergency()
+            proxy.state = FlightState.EMERGENCY
+            await drone.wait(lambda _: ResetEmergency() in proxy.actions(), WAIT_S)
             await drone.land(wait=False)
 
     run(fly())
@@ -286,6 +290,34 @@ def test_a_cancelled_connect_leaves_no_drone(proxy: ScriptedProxy, monkeypatch: 
     run(give_up())
 
 
+def test_a_connect_cancelled_as_it_succeeds_leaves_no_drone(
+    proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop was busy while the connection was made: result and cancellation come in the same round."""
+    made, closed = threading.Event(), threading.Event()
+    connect: Any = skyloop.client.connect
+
+    def noted(target: str, **options: Any) -> skyloop.client.Drone:
+        drone: skyloop.client.Drone = connect(target, on_close=closed.set, **options)
+        made.set()
+        return drone
+
+    monkeypatch.setattr("skyloop.client.connect", noted)
+
+    async def give_up() -> None:
+        task = asyncio.ensure_future(aio.connect("me")._connect())
+        await asyncio.sleep(0)
+        assert made.wait(WAIT_S)
+        for worker in [thread for thread in threading.enumerate() if thread.name == "skyloop-aio"]:
+            worker.join()  # which has handed its result to the loop
+        asyncio.get_running_loop().call_soon(task.cancel)
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert await asyncio.to_thread(closed.wait, WAIT_S)
+
+    run(give_up())
+
+
 def test_a_connect_whose_loop_has_ended_leaves_no_drone(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on, closed = threading.Event(), threading.Event()
     connect: Any = skyloop.client.connect  # the one that was put in its place
@@ -338,5 +370,37 @@ def test_clocks_poses_and_own_events_are_the_drones(proxy: ScriptedProxy) -> Non
             drone.emit(EventKind.VEHICLE_MESSAGE, "seen")
             assert any(event.text == "seen" for event in drone.recent_events())
         assert drone.closed
+
+    run(fly())
+
+
+@pytest.mark.parametrize(("state", "instead"), [(FlightState.LANDED, Idle()), (FlightState.TAKING_OFF, Hover())])
+def test_a_cancelled_take_off_is_not_carried_out(proxy: ScriptedProxy, state: FlightState, instead: AnyAction) -> None:
+    """Cancelling takeoff() left it climbing."""
+    proxy.state = state
+
+    async def fly() -> None:
+        drone = await aio.connect("me", on_exit="hover")
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.3):
+                await drone.takeoff(timeout_s=WAIT_S)
+        after = len(proxy.commands)
+        await asyncio.to_thread(proxy.until, lambda: proxy.actions()[after:].count(instead) >= 3)
+        assert Takeoff() not in proxy.actions()[-2:]
+        await drone.close()
+
+    run(fly())
+
+
+def test_a_cancelled_flight_of_a_swarm_is_not_carried_out(proxy: ScriptedProxy) -> None:
+    async def fly() -> None:
+        drone = await aio.connect("me", on_exit="hover")
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.3):
+                await in_thread(lambda: in_parallel({"left": lambda: drone.sync.takeoff(timeout_s=WAIT_S)}))
+        after = len(proxy.commands)
+        await asyncio.to_thread(proxy.until, lambda: proxy.actions()[after:].count(Idle()) >= 3)
+        assert Takeoff() not in proxy.actions()[-2:]
+        await drone.close()
 
     run(fly())

@@ -132,6 +132,27 @@ def test_who_lost_it_because_the_time_is_over_does_not_ask_again(held: Authority
     assert (held.status.state, held.wanted) == ("none", False)
 
 
+def test_feedback_may_overtake_the_event_that_the_time_is_over(held: AuthorityTracker) -> None:
+    """Shown as pre-empted, it would wait for ever in a queue that it is not in."""
+    assert held.feedback(owned(9, 6, "next"), NOW)
+    assert held.status.state == "preempted"
+    assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason="expired", by="next"), NOW)
+    assert (held.status.state, held.wanted) == ("none", False)
+
+
+def test_feedback_may_overtake_the_event_that_it_was_silent(held: AuthorityTracker) -> None:
+    assert held.feedback(owned(9, 6, "next"), NOW)
+    assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason="silent"), NOW)
+    assert (held.status.state, held.wanted) == ("none", True), "it is to be asked for again"
+
+
+def test_the_event_that_the_time_is_over_may_be_lost(authority: AuthorityTracker) -> None:
+    authority.asked(RequestAuthority(for_s=1.0))
+    authority.granted(7, NOW, until_ns=500)
+    assert authority.feedback(Feedback(captured_ns=501, owner_id=9, lease=8, owner="next"), NOW)
+    assert (authority.status.state, authority.wanted) == ("none", False)
+
+
 def test_that_the_holder_declined_is_remembered_until_it_is_asked_again(authority: AuthorityTracker) -> None:
     assert not authority.event(Event(EventKind.AUTHORITY_DECLINED, "not yet", 0, data={"app_id": 4}), NOW)
     assert authority.declined == ""
@@ -197,3 +218,22 @@ def test_the_oldest_ended_session_is_forgotten() -> None:
     assert (7, 1) in ended
     assert (7, EndedSessions.MOST) in ended
     assert (8, 1) not in ended
+
+
+@pytest.mark.parametrize(
+    ("reason", "state", "wanted"), [("expired", "none", False), ("silent", "none", True), ("gone", "none", True)]
+)
+def test_feedback_that_overtakes_the_loss_does_not_make_it_a_takeover(
+    held: AuthorityTracker, reason: str, state: str, wanted: bool
+) -> None:
+    """It was shown as "preempted" for ever, and asked for nothing any more."""
+    assert held.feedback(owned(9, 6, "other"), NOW)
+    assert held.status.state == "preempted"
+    assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason=reason, by="other"), LATER)
+    assert (held.status.state, held.wanted) == (state, wanted)
+
+
+def test_a_loss_of_an_older_lease_changes_no_takeover(held: AuthorityTracker) -> None:
+    assert held.feedback(owned(9, 6, "other"), NOW)
+    assert not held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=4, reason="silent"), LATER)
+    assert held.status.state == "preempted"

@@ -23,6 +23,7 @@ from skyloop.messages import (
     FlightState,
     GetStatistics,
     Hover,
+    Land,
     LinkState,
     Polyline,
     ReleaseAuthority,
@@ -151,6 +152,21 @@ def test_where_no_frame_comes_because_of_the_vehicle_the_reason_is_told(proxy: S
     drone.wait(lambda _: drone.link.vehicle is LinkState.LOST, WAIT_S)
     with pytest.raises(NoAnswerError, match=r"0\.02 s: the vehicle's link is lost: no camera there: plug it in$"):
         drone.next_frame(timeout_s=0.02)
+
+
+def test_in_a_fork_a_drone_neither_lands_nor_releases_what_its_parent_flies(proxy: ScriptedProxy) -> None:
+    with flown(proxy) as drone:
+        proxy.state = FlightState.HOVERING
+        drone.wait("hovering", WAIT_S)
+        drone._core.forked()
+        asked, commanded = list(proxy.requests), proxy.actions()
+        with pytest.raises(ClosedError, match=r"belongs to process \d+, of which this one is a fork: connect here"):
+            drone.velocity(forward=1.0)
+        drone._core.leave()
+        drone.close()
+        assert proxy.requests == asked
+        assert Land() not in proxy.actions()[len(commanded) :]
+        assert drone.link.application is not LinkState.LOST
 
 
 def test_closing_ends_iterators_and_waits(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -99,6 +99,70 @@ def test_what_cannot_be_put_back_is_told(proxy: ScriptedProxy, drone: Drone) -> 
     assert event.data == {"name": "limits.tilt", "reason": "out_of_range"}
 
 
+def writes(proxy: ScriptedProxy) -> list[SetParameter]:
+    return [request for request in list(proxy.requests) if isinstance(request, SetParameter)]
+
+
+def held_again(drone: Drone, lease: int) -> None:
+    drone.wait(lambda _: drone.authority.state == "held" and drone.authority.lease != lease, WAIT_S)
+    _ = drone.config["limits.tilt"]  # what is written at the grant was sent before this
+
+
+def test_a_lost_link_alone_writes_nothing_again(proxy: ScriptedProxy, drone: Drone) -> None:
+    """The proxy forgot nothing: another pilot's newer value would be overwritten."""
+    drone.config["limits.tilt"] = 0.2
+    lease = drone.authority.lease
+    proxy.hang_up()
+    held_again(drone, lease)
+    assert len(writes(proxy)) == 1
+
+
+def test_a_restarted_proxy_gets_the_values_and_no_momentary_parameter(proxy: ScriptedProxy, drone: Drone) -> None:
+    """A drone flipped a second time by itself."""
+    proxy.momentary = {"tello.flip"}
+    proxy.parameters["tello.flip"] = 0.0
+    drone.config["limits.tilt"] = 0.2
+    drone.config["tello.flip"] = 1.0
+    proxy.stop()
+    proxy.requests.clear()
+    proxy.start()
+    drone.wait(lambda _: bool(writes(proxy)), WAIT_S)
+    _ = drone.config["limits.tilt"]
+    assert [(write.name, write.value) for write in writes(proxy)] == [("limits.tilt", 0.2)]
+
+
+def test_what_another_pilot_wrote_is_not_overwritten(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.config["limits.tilt"] = 0.2
+    drone.config["limits.speed"] = 1.0
+    proxy.event(EventKind.PARAMETER_CHANGED, "", "other", name="limits.tilt", value=0.1, app_id=99)
+    proxy.event(
+        EventKind.PARAMETER_CHANGED,
+        "",
+        "me",
+        name="limits.speed",
+        value=1.0,
+        app_id=proxy.owner[0] if proxy.owner else 0,
+    )
+    drone.wait(lambda _: len(drone.recent_events()) >= 2, WAIT_S)
+    proxy.stop()
+    proxy.requests.clear()
+    proxy.start()
+    drone.wait(lambda _: bool(writes(proxy)), WAIT_S)
+    _ = drone.config["limits.tilt"]
+    assert [write.name for write in writes(proxy)] == ["limits.speed"]
+
+
+def test_nothing_is_written_again_where_another_flew_since_the_restart(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.config["limits.tilt"] = 0.2
+    proxy.stop()
+    proxy.requests.clear()
+    proxy.first_lease = 5
+    proxy.start()
+    drone.wait(lambda _: any("others have flown since" in event.text for event in drone.recent_events()), WAIT_S)
+    _ = drone.config["limits.tilt"]
+    assert writes(proxy) == []
+
+
 @pytest.mark.parametrize(
     ("given", "expected"),
     [

@@ -22,7 +22,7 @@ def node() -> Iterator[Node]:
     node = Node(FakeVehicle())
     node.proxy.start()
     yield node
-    node.proxy.stop()
+    node.proxy.end()
 
 
 @contextmanager

@@ -317,7 +317,7 @@ class Node:
     def stop(self) -> None:
         if self.up:
             self.up = False
-            self._proxy.stop()
+            self._proxy.end()
 
     def restart(self) -> None:
         self._proxy = Proxy(self.flyer, self._server, name=self.name)

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds
+from skyloop.control.airframe import Motion, TiltVelocity
 from skyloop.control.chase_law import ChaseLaw, FollowMode, TargetPhase
 from skyloop.control.chase_settings import ChaseSettings
-from skyloop.control.dead_reckoning import TiltVelocity
-from skyloop.control.target import Motion
-from skyloop.control.target_estimate import TRAITS, TargetEstimator, Traits
+from skyloop.control.target_estimate import TRAITS, TargetEstimator, TargetState, Traits
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.messages import Attitude, Feedback, FlightState
 from skyloop.messages.geometry import wrap_angle
@@ -94,6 +93,8 @@ class ChaseWorld:
         speeds: Towards the target, of each step [m/s].
         azimuths: Of the target, from straight ahead [rad].
         places: Of the vehicle, (3,) each.
+
+    With ``drift_m_s`` the velocity that it reports is off by so much, to the east, and its position is known.
     """
 
     def __init__(
@@ -107,7 +108,10 @@ class ChaseWorld:
         seed: int | None = 1,
         altitude: bool = True,
         traits: Traits = PERSON,
+        drift_m_s: float = 0.0,
+        others: Callable[[int], list[TargetState]] = lambda now_ns: [],
     ) -> None:
+        self._drift, self._others = np.array([drift_m_s, 0.0, 0.0]), others
         self.law = ChaseLaw(settings, mode)
         self.position, self.velocity, self.yaw = np.array([0.0, 0.0, 1.2]), np.zeros(3), 0.0
         self.tilt = np.zeros(2)  # roll and pitch
@@ -141,9 +145,20 @@ class ChaseWorld:
         if not self._hidden(self.time_s):
             self._look(foot, now_ns)
         position, velocity = (self._reckoned, self._airspeed) if self._relative else (self.position, self.velocity)
-        motion = Motion(now_ns, position.copy(), velocity.copy(), self.yaw, self._rate)
+        drift = self._drift
+        motion = Motion(now_ns, position + drift * self.time_s, velocity + drift, self.yaw, self._rate)
         altitude_m = float(self.position[2]) if self._altitude else None
-        command = self.law.step(now_ns, motion, altitude_m, self.estimator, self._seen_ns, relative=self._relative)
+        x, y, z = self.position.tolist()
+        command = self.law.step(
+            now_ns,
+            motion,
+            altitude_m,
+            self.estimator,
+            self._seen_ns,
+            self._others(now_ns),
+            relative=self._relative,
+            position=(x, y, z) if drift.any() else None,
+        )
         self._note(foot, command)
         if isinstance(command, Attitude):
             self.tilt += (np.array([command.roll, command.pitch]) - self.tilt) * (1 - math.exp(-PERIOD_S / 0.15))
@@ -172,9 +187,10 @@ class ChaseWorld:
 
     def _look(self, foot: Array, now_ns: int) -> None:
         roll, pitch = self.tilt.tolist()
-        x, y = (self._reckoned if self._relative else self.position)[:2].tolist()
+        drifted = self._drift * self.time_s
+        x, y = ((self._reckoned if self._relative else self.position) + drifted)[:2].tolist()
         camera = camera_at(x, y, float(self.position[2]), roll=roll, pitch=pitch, yaw=self.yaw)
-        shown = np.add(foot, [*(self._reckoned - self.position)[:2], 0.0]) if self._relative else foot
+        shown = np.add(foot, [*(self._reckoned - self.position)[:2], 0.0]) if self._relative else foot + drifted
         box = box_of(camera, shown)
         view = None if box is None else BoxView.of(box if self._rng is None else noisy(box, self._rng), camera)
         if view is None:

@@ -28,8 +28,8 @@ from skyloop.control.course_law import CourseSettings
 from skyloop.control.gate_law import GatePhase, GateSettings
 from skyloop.control.landing_law import LandingPhase
 from skyloop.control.landing_settings import LandingSettings
-from skyloop.errors import UnknownNameError, UsageError
-from skyloop.messages import Annotation, FlightState, Land, LinkState, Severity, Velocity
+from skyloop.errors import AuthorityError, UnknownNameError, UsageError
+from skyloop.messages import Annotation, AnyAction, FlightState, Land, LinkState, Severity, Velocity
 from skyloop.sim.geometry import geometry_of
 from skyloop.sim.world_file import load_world
 from skyloop.stepping.rehearsal import Radio, rehearse
@@ -48,6 +48,25 @@ def script() -> Iterator[ModuleType]:
         patch.syspath_prepend(str(path.parent))  # it has modules beside it
         spec.loader.exec_module(module)
         yield module
+
+
+def test_a_landing_that_others_took_over_does_not_go_on_where_they_give_it_back() -> None:
+    """It was still down in its own mind, and landed the vehicle from any height, wherever that was."""
+    with rehearse("sim://?world=empty&cameras=bottom&fps=10") as drone:
+        drone.takeoff()
+        pilot = LandOnMarker(drone)
+        pilot._landing_law.phase = LandingPhase.DOWN
+
+        def refused(action: AnyAction) -> bool:
+            raise AuthorityError(f"{action.name} refused: taken over")
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(drone, "command", refused)
+            pilot.run(seconds=0.5)
+        assert pilot.phase is LandingPhase.SEARCHING
+        pilot.run(seconds=1.0)
+        assert not pilot.landed
+        assert drone.feedback().state is FlightState.FLYING
 
 
 @pytest.mark.slow

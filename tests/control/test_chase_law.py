@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import nanoseconds, seconds
+from skyloop.control.airframe import Motion
 from skyloop.control.chase_law import LOSSES, ChaseLaw, FollowMode, TargetPhase
 from skyloop.control.chase_settings import ChaseSettings
-from skyloop.control.target import Motion
-from skyloop.control.target_estimate import TargetEstimator
+from skyloop.control.target_estimate import TargetEstimator, TargetState
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, Value, Velocity
 from skyloop.messages.geometry import wrap_angle
@@ -240,6 +240,27 @@ def test_a_leash_is_not_left(leash_m: float) -> None:
     free = ChaseWorld(walk(4.0, 0.0), settings=ChaseSettings(leash_m=leash_m))
     free.run(4.0)
     assert free.law.held_by == ""
+
+
+def test_a_leash_is_by_the_position_where_that_is_known() -> None:
+    """A velocity that is off by 5 cm/s led 8 m away on a leash of 5 m."""
+    world = ChaseWorld(walk(8.0, 0.0), settings=ChaseSettings(leash_m=2.0), drift_m_s=-0.1)
+    world.run(40.0)
+    assert max(float(np.hypot(*place[:2])) for place in world.places) < 2.4
+    assert world.law.held_by == "leash"
+
+
+def test_a_leash_is_not_left_to_make_way_either() -> None:
+    """Somebody who walks up from behind pushed it out beyond the leash."""
+
+    def behind(now_ns: int) -> list[TargetState]:
+        time_s = seconds(now_ns) - 1.0
+        x, speed = (-2.5 + 0.5 * time_s, 0.5) if time_s < 8.6 else (1.8, 0.0)  # it stops beside where the leash ends
+        return [TargetState(now_ns, np.array([x, 0.0, 0.0]), np.array([speed, 0.0]), 1.75, 0.1, 5.0, 0.1)]
+
+    world = ChaseWorld(walk(8.0, 0.0), settings=ChaseSettings(leash_m=2.0), others=behind)
+    world.run(14.0)
+    assert max(float(np.hypot(*place[:2])) for place in world.places) < 2.2
 
 
 def test_to_look_is_to_stay_and_to_turn() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.control.filters import Complementary, LowPass, Median
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.errors import UsageError
 from skyloop.messages import Velocity
 
@@ -87,6 +87,15 @@ def test_vectors() -> None:
     assert (clamped(3.0, 1.0), clamped(-3.0, 1.0), clamped(0.5, 1.0)) == (1.0, -1.0, 0.5)
 
 
+@given(st.one_of(st.floats(-1e6, 1e6), st.sampled_from([math.nan, math.inf, -math.inf])), st.floats(0.0, 100.0))
+def test_nothing_that_is_no_number_passes_a_clamp(value: float, longest: float) -> None:
+    assert abs(clamped(value, longest)) <= longest
+    assert clamped(math.nan, longest) == 0.0
+    assert within(math.nan, 2.0, 3.0) == 2.0
+    assert np.linalg.norm(shortened(np.array([value, 1.0]), longest)) <= longest + 1e-9
+    assert np.isfinite(shortened(np.array([value, 1.0]), math.inf)).all()
+
+
 LIMITS = SetpointLimits(1.0, 0.5, 0.8, acceleration_m_s2=2.0, climb_acceleration_m_s2=1.0, turn_acceleration_rad_s2=4.0)
 
 
@@ -107,6 +116,13 @@ def test_set_points_keep_to_their_limits(wanted: list[tuple[list[float], float]]
             assert abs(new.up - last.up) <= 1.0 * dt + 1e-9
             assert abs(new.yaw_rate - last.yaw_rate) <= 4.0 * dt + 1e-9
         last = new
+
+
+def test_one_nan_neither_passes_the_limiter_nor_stays_in_it() -> None:
+    limiter = SetpointLimiter(LIMITS)
+    assert limiter.step(np.array([math.nan, math.inf, math.nan, -math.inf]), 0.1) == Velocity()
+    assert limiter.step(np.zeros(4), math.nan) == Velocity()
+    assert limiter.step(np.array([0.1, 0.0, 0.0, 0.0]), 0.1) == Velocity(forward=0.1)
 
 
 def test_limiter_begins_where_it_is_told() -> None:

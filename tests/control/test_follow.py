@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from typing import Any, Self
+from unittest.mock import ANY
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -12,7 +15,7 @@ from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
 from skyloop.control.follow import FollowMarker, FollowScore
 from skyloop.control.follow_law import Mode
-from skyloop.errors import UnknownNameError
+from skyloop.errors import AuthorityError, UnknownNameError
 from skyloop.messages import (
     CameraInfo,
     Capabilities,
@@ -130,6 +133,52 @@ def test_holds_its_place_when_pictures_stop(follower: FollowMarker, drone: Recor
     assert drone.hovers == 0
     follower.on_feedback(state(now + 600_000_000))
     assert drone.hovers == 1
+
+
+def test_holds_its_place_and_says_so_when_the_velocity_is_not_known(
+    follower: FollowMarker, drone: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Frame, "age_s", 0.0)
+    now = time.monotonic_ns()
+    follower.on_feedback(state(now))
+    follower.on_frame(frame(now, [(7, [0.3, 0.0, 2.5])]))
+    flown = len(drone.velocities)
+    for ms in (300, 600, 900):
+        later = now + ms * 1_000_000
+        follower.on_feedback(msgspec.structs.replace(state(later), velocity_m_s=None))
+        follower.on_frame(frame(later, [(7, [0.3, 0.0, 2.5])]))
+    assert drone.hovers == 2
+    assert len(drone.velocities) == flown + 1
+    assert follower.problem == "the vehicle's velocity is not known"
+    follower.on_feedback(state(now + 1_000_000_000))
+    follower.on_frame(frame(now + 1_000_000_000, [(7, [0.3, 0.0, 2.5])]))
+    assert drone.told[-2:] == [
+        ("follow: the vehicle's velocity is not known: hovering", Severity.WARNING),
+        ("follow: the vehicle's motion is known again: flying on", Severity.INFO),
+    ]
+
+
+def test_set_points_that_others_made_moot_are_begun_from_rest(
+    follower: FollowMarker, drone: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Frame, "age_s", 0.0)
+    now = time.monotonic_ns()
+    taken = [False]
+
+    def velocity(**values: float) -> None:
+        if taken[0]:
+            raise AuthorityError("taken over")
+        drone.velocities.append(values)
+
+    drone.velocity = velocity  # type: ignore[method-assign]
+    for k in range(31):
+        at_ns = now + k * 100_000_000
+        taken[0] = k in range(10, 30)
+        follower.on_feedback(state(at_ns))
+        with suppress(AuthorityError):
+            follower.on_frame(frame(at_ns, [(7, [0.3, 0.0, 4.5])]))
+    assert drone.velocities[9]["forward"] > 0.5
+    assert drone.velocities[10] == {"forward": 0.0, "left": 0.0, "up": pytest.approx(0.0, abs=0.1), "yaw_rate": ANY}
 
 
 def test_unknown_camera(drone: Recorder) -> None:

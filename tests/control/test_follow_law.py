@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S, nanoseconds
-from skyloop.control.follow_law import FollowLaw, FollowSettings, Mode
-from skyloop.control.target import Odometry, TargetFilter
+from skyloop.control.airframe import Airframe
+from skyloop.control.follow_law import FollowLaw, FollowSettings, Mode, TargetFilter
 from skyloop.messages import Feedback
 from tests.control.follow_world import FollowWorld
 
@@ -156,17 +156,17 @@ def test_whatever_is_seen_the_answer_is_finite_and_within_limits(
 
 
 def test_odometry_places_a_capture_between_samples() -> None:
-    odometry = Odometry()
+    odometry = Airframe()
     for k in range(11):
         odometry.add(still(1.0 + 0.1 * k, yaw_rad=math.pi / 2, velocity_m_s=(0.5, 0.0, 0.1)))
     motion = odometry.at(nanoseconds(1.55))
     assert motion is not None
     assert motion.position == pytest.approx([0.0, 0.275, 0.055])
-    assert Odometry().at(0) is None
+    assert Airframe().at(0) is None
 
 
 def test_odometry_passes_over_what_is_old_or_incomplete() -> None:
-    odometry = Odometry()
+    odometry = Airframe()
     odometry.add(still(1.0, velocity_m_s=(1.0, 0.0, 0.0)))
     odometry.add(still(0.9, velocity_m_s=(9.0, 0.0, 0.0)))
     odometry.add(still(1.1, velocity_m_s=None))

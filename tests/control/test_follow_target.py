@@ -280,6 +280,21 @@ def test_the_vehicle_is_held_while_nothing_is_known() -> None:
     assert follower.step(nanoseconds(9.0)) == Velocity(), "the vehicle's motion is not known any longer"
 
 
+@pytest.mark.parametrize("mode", [FollowMode.FOLLOW, FollowMode.LOOK])
+def test_a_velocity_that_goes_missing_holds_the_vehicle_and_keeps_the_target(mode: FollowMode) -> None:
+    """It flew on for good at the velocity that it had last, and turned away from what it saw."""
+    follower = follower_of(mode=mode)
+    flown(follower, 1.5, velocity_m_s=(0.5, 0.0, 0.0))
+    assert follower.sighting.box is not None
+    command, _ = flown(follower, 1.0, start=2.5, velocity_m_s=None)
+    assert command == Velocity()
+    assert follower.status.problem == "the vehicle's velocity is not known"
+    assert follower.sighting.box is not None
+    command, _ = flown(follower, 0.5, start=3.5)
+    assert command != Velocity(), "it flies on"
+    assert follower.status.problem == ""
+
+
 def test_it_says_since_when_the_target_is_lost_and_where_it_should_be() -> None:
     follower = follower_of()
     flown(follower, 1.5)

@@ -90,7 +90,7 @@ def flying(movers: dict[str, Mover], *, on_error: str = "raise") -> Iterator[Swa
     finally:
         drones.close()
         for proxy in proxies:
-            proxy.stop()
+            proxy.end()
 
 
 def row(spacing: float = 1.0) -> dict[str, Mover]:

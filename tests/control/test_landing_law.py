@@ -110,6 +110,23 @@ def test_what_turns_just_above_is_waited_for() -> None:
     assert world.phase() is LandingPhase.DOWN
 
 
+def test_who_was_down_when_others_took_over_searches_the_marker_anew() -> None:
+    """It stayed down: given back at 2 m, the vehicle was landed wherever it was."""
+    world = World((0.0, 0.0, 2.0), 0.0)
+    while world.phase() is not LandingPhase.DOWN:
+        world.step()
+    world.law.forget()
+    assert world.phase() is LandingPhase.DOWN, "a gap in the feedback does not abort what is all but landed"
+    world.law.pause()
+    assert world.phase() is LandingPhase.SEARCHING
+    world.position, world.velocity = np.array([0.4, 0.0, 2.0]), Velocity()
+    world.step()
+    assert world.phase() is not LandingPhase.DOWN
+    while world.phase() is not LandingPhase.DOWN:
+        world.step()
+    assert world.off < 0.08
+
+
 def hovering(roll_rate: float, late_s: float, sights: list[tuple[float, float, float]]) -> LandingLaw:
     """A law that saw these places, in levelled axes, while its vehicle rolled; attitudes are from ``late_s`` before."""
     law, rate = LandingLaw(), (roll_rate, 0.0, 0.0)

@@ -10,11 +10,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skyloop.client import Drone
 from skyloop.control import Circle, DeadReckoning, Fix, FixedYaw, FollowPath, Polyline, Waypoint, Waypoints
-from skyloop.errors import UsageError
-from skyloop.messages import Feedback
+from skyloop.errors import AuthorityError, UsageError
+from skyloop.messages import AnyAction, Feedback
 from skyloop.stepping.rehearsal import Radio, rehearse
 
 CALM = "sim://?world=empty&cameras=none&wind=0"
@@ -130,6 +131,61 @@ def test_another_source_of_positions_and_its_loss(how: str) -> None:
         assert "the position is not known: hovering" in texts
         assert "the position is known again: flying on" in texts
         assert flight.error.rms_m < 0.2
+
+
+def test_one_fix_that_is_no_number_is_no_fix() -> None:
+    """One NaN of a source of positions, and the vehicle climbed for ever."""
+    with rehearse("sim://?world=empty&cameras=none&wind=0") as drone:
+        drone.takeoff()
+        capture = Capture(drone)
+        drone.next_feedback()
+
+        def source() -> Fix | None:
+            fix = capture()
+            if fix is None or len(wrong) == 3:
+                return fix
+            wrong.append(fix)
+            return fix._replace(yaw_rad=math.nan)
+
+        wrong: list[Fix] = []
+        flight = Waypoints(drone, [(0.5, 0, 1)], source=source)
+        assert flight.run(seconds=30.0).reason == "stopped"
+        assert len(wrong) == 3
+        assert np.linalg.norm(truth(drone.feedback()) - [0.5, 0, 1]) < 0.25
+        assert "the position is not known: hovering" in [event.text for event in drone.recent_events()]
+
+
+def test_while_others_fly_it_a_path_waits_and_integrates_nothing() -> None:
+    with rehearse(CALM) as drone:
+        drone.takeoff()
+        flight = FollowPath(drone, Polyline([(0, 0, 1), (5, 0, 1)]))
+        flight.run(seconds=3.0)
+        assert flight._law is not None
+        taken = flight._law.time_s
+
+        def refused(action: AnyAction) -> bool:
+            raise AuthorityError(f"{action.name} refused: taken over")
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(drone, "command", refused)
+            patch.setattr(drone._core, "command", refused)
+            feedback = drone.feedback()
+            for k in range(1, 400):
+                later = replace(feedback, captured_ns=feedback.captured_ns + k * 25_000_000, position_m=(0.0, 0.4, 1.0))
+                with pytest.raises(AuthorityError):
+                    flight.on_feedback(later)
+        assert flight._law.time_s == taken
+        assert not flight._law._loop.integral.any()
+
+
+def test_a_finished_flight_does_not_begin_again_and_its_run_returns() -> None:
+    """The second run waited for ever for an end that had been reached before."""
+    with rehearse(CALM) as drone:
+        drone.takeoff()
+        flight = Waypoints(drone, [(0.3, 0, 1)])
+        assert flight.run(seconds=20.0).reason == "stopped"
+        again = flight.run(seconds=20.0)
+        assert (again.reason, again.feedback) == ("stopped", 0)
 
 
 def test_a_vehicle_without_position_flies_by_its_velocity() -> None:

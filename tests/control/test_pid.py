@@ -150,3 +150,11 @@ def test_limits_that_make_no_sense() -> None:
         Pid(Gains(), low=1.0, high=1.0)
     with pytest.raises(UsageError, match="rate"):
         Pid(Gains(), rate=0.0)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_one_measurement_that_is_no_number_leaves_the_loop_as_it_was(wrong: float) -> None:
+    pid, other = (Pid(Gains(p=1.0, i=0.5, d=0.1), low=-1.0, high=1.0) for _ in range(2))
+    before = [loop.step(0.0, 0.1, 0.02) for loop in (pid, other)]
+    assert pid.step(0.0, wrong, 0.02) == before[0]
+    assert [pid.step(0.0, m, 0.02) for m in (0.1, -0.1)] == [other.step(0.0, m, 0.02) for m in (0.1, -0.1)]

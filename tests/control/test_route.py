@@ -234,6 +234,21 @@ def test_pause_resume_skip_and_stop() -> None:
     assert law.state is RouteState.STOPPED
 
 
+@pytest.mark.parametrize(("end", "last"), [("land", Land()), ("hover", Hover()), ("return", Land())])
+def test_a_paused_route_whose_last_waypoint_is_left_out_stays_paused(end: Any, last: Any) -> None:
+    """It landed, though a person had paused it."""
+    law = RouteLaw(places((1, 0, 1), end=end))
+    law.start(at(0, 0, 1))
+    law.pause()
+    left_out = [effect for _ in range(3) for effect in law.skip()]
+    assert actions_of(left_out) == []
+    assert kinds(left_out) == ["skipped"] * (2 if end == "return" else 1)
+    assert law.state is RouteState.PAUSED
+    assert law.update(at(1, 0, 1), NS_PER_S) == []
+    on = law.resume()
+    assert (kinds(on), actions_of(on), law.state) == (["resumed", "done"], [last], RouteState.DONE)
+
+
 def test_actions_go_on_after_a_pause_and_are_not_told_twice() -> None:
     law = RouteLaw(TOUR)
     law.start(at(0, 0, 1))

@@ -267,7 +267,7 @@ def served(flight: Path) -> Iterator[MemoryServer]:
     try:
         yield server
     finally:
-        proxy.stop()
+        proxy.end()
 
 
 def test_who_watches_moves_it_and_a_controller_goes_on(flight: Path) -> None:

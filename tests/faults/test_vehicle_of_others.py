@@ -25,7 +25,7 @@ from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multiro
 from skyloop.errors import NoAnswerError, RefusedError, SwarmError
 from skyloop.messages import EventKind, Feedback
 from skyloop.proxy.core.failsafe import FailsafeSettings
-from skyloop.proxy.core.ownership import Whose
+from skyloop.proxy.core.flight import Whose
 from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.proxy import Proxy
 from skyloop.sim.host import SimHost
@@ -77,7 +77,7 @@ class Scene:
 
     def __exit__(self, *_: object) -> None:
         for proxy in self._proxies:
-            proxy.stop()
+            proxy.end()
         self.firmware.stop()
 
     @property
@@ -131,7 +131,7 @@ class Scene:
     def die(self, proxy: Proxy) -> None:
         """Without a word: nothing is told to the vehicle any more."""
         proxy.handler.leave_hovering = lambda now_ns: None  # type: ignore[method-assign]
-        proxy.stop()
+        proxy.end()
 
     def drone(self) -> Drone:
         return open_drone(self.server.dial, app="me", on_exit="hover")
@@ -162,7 +162,7 @@ def test_a_proxy_that_is_started_beside_a_flight_of_others_says_nothing_to_it(
     with Scene(kind, note) as scene:
         scene.station_flies()
         proxy = scene.proxy()
-        wait_until(lambda: proxy.handler.ownership.others != "", "it is seen whose flight it is")
+        wait_until(lambda: proxy.handler.flight.others != "", "it is seen whose flight it is")
         scene.station_mode(mode)
         scene.watched(proxy)
         assert scene.ours == []
@@ -185,7 +185,7 @@ def test_a_landing_that_others_order_during_a_take_off_is_not_undone_and_who_wai
             at = len(scene.ours)
             wait_until(lambda: not scene.armed, "it lands as the other one wants")
             assert scene.ours[at:] == []
-        assert proxy.handler.ownership.whose is not Whose.OURS
+        assert proxy.handler.flight.whose is not Whose.OURS
 
 
 def _land_when_up(scene: Scene) -> None:
@@ -321,7 +321,7 @@ def test_a_new_order_takes_it_back(kind: Kind, note: Path) -> None:
         with taken_off(scene) as drone:
             scene.station_mode("RTL")
             wait_until(lambda: proxy.driver.left_to() != "", "it is seen")
-            wait_until(lambda: proxy.handler.ownership.others != "", "it is told")
+            wait_until(lambda: proxy.handler.flight.others != "", "it is told")
             drone.hover()
             guided = "GUIDED" if kind is Kind.ARDUCOPTER else "OFFBOARD"
             wait_until(lambda: scene.mode == guided, "it follows again")
@@ -349,7 +349,7 @@ def test_a_killed_proxy_ends_its_own_flight_when_it_is_back_unless_others_took_i
             wait_until(lambda: m.MAV_CMD_DO_SET_MODE in scene.ours, "it is held, and then landed")
             wait_until(lambda: not scene.armed, "it stands")
         else:
-            wait_until(lambda: second.handler.ownership.others != "" or not scene.armed, "it is left")
+            wait_until(lambda: second.handler.flight.others != "" or not scene.armed, "it is left")
             wait_until(lambda: not scene.armed, "it is home")
             assert scene.ours == []
 

@@ -18,7 +18,7 @@ PACKAGES = {
     "msp": ["skyloop.wire.msp"],
     "vrpn": ["skyloop.wire.vrpn", "skyloop.motion_capture.vrpn"],
     "recording": ["skyloop.logfile", "mcap"],
-    "files": ["skyloop.sim", "skyloop.calibration", "skyloop.proxy.core.safety", "skyloop.drivers.uri", "tomllib"],
+    "files": ["skyloop.sim", "skyloop.calibration", "skyloop.zones", "skyloop.drivers.uri", "tomllib"],
     "page": ["skyloop.cockpit.commands"],
 }
 

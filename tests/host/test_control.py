@@ -44,7 +44,7 @@ def test_vehicles_come_and_go(served: Hosting) -> None:
     assert (row.name, row.condition, row.process) == ("alpha", "running", "shared")
     proxy = served.shared("alpha").proxy
     assert proxy is not None
-    assert proxy.handler.checks.limits.speed == 0.5
+    assert proxy.handler.checks.airspace.settings.limits.speed == 0.5
     assert [row.name for row in ask("host", Status()).vehicles] == ["alpha"]
     served.vehicle("bravo").fail = {"open"}
     answer = ask("host", Add(tuple(map(served.settings, ("alpha", "bravo")))))
@@ -71,7 +71,7 @@ def test_errors_come_back_as_they_were_raised(served: Hosting) -> None:
 
 
 def test_garbage_and_callers_who_ask_nothing_do_no_harm(served: Hosting) -> None:
-    for packet in (b"", b"{", b"[" * 5000, b'{"type":"remove"}', b'{"type":"reboot"}', b"\0" * control.MAX_REQUEST):
+    for packet in (b"", b"{", b"[" * 5000, b'{"type":"remove"}', b'{"type":"reboot"}', b"\0" * control.MAX_PACKET):
         sock = connect(find_directory(None, HOST).socket_path("host"))
         if packet:
             sock.send(packet)
@@ -173,3 +173,51 @@ def test_a_mistake_in_the_file_is_one_line(capsys: pytest.CaptureFixture[str], t
     error = capsys.readouterr().err
     assert "did you mean 'address'" in error
     assert threading.active_count() >= 1
+
+
+def test_a_large_fleet_is_added_in_one_request(served: Hosting) -> None:
+    """`skyloop host add FILE` failed beyond 64 KiB."""
+    settings = served.settings("alpha")
+    zones = "; ".join(f"keep_out: polygon {number}.0 0.5, {number}.1 0.6, {number}.2 0.7" for number in range(6))
+    many = tuple(
+        msgspec.structs.replace(
+            settings, name=f"drone-{number}", address="no-such://x", presets={"safety.zones": zones}
+        )
+        for number in range(500)
+    )
+    assert len(msgspec.json.encode(Add(many))) > 1 << 17
+    taken: list[control.Request] = []
+    server = ControlServer("large", lambda request: taken.append(request) or Answer())  # type: ignore[func-returns-value]
+    server.start()
+    try:
+        ask("large", Add(many))
+        assert taken == [Add(many)]
+        exact = AddNamed("x", "a" * (control._CHUNK - len(msgspec.json.encode(AddNamed("x", "")))))
+        assert len(msgspec.json.encode(exact)) == control._CHUNK
+        ask("large", exact)
+        assert taken[1] == exact
+    finally:
+        server.stop()
+
+
+def test_without_descriptors_the_control_socket_does_not_take_the_processor() -> None:
+    """It tried to accept again at once, all the time, and took a whole core."""
+
+    class Full:
+        tries = 0
+
+        def accept(self) -> None:
+            self.tries += 1
+            raise OSError(24, "Too many open files")
+
+        def hang_up(self) -> None: ...
+
+    server, full = ControlServer("full", lambda _: Answer()), Full()
+    server._listener = full  # type: ignore[assignment]
+    thread = threading.Thread(target=server._run, args=(full,))
+    thread.start()
+    thread.join(0.35)
+    server._thread = thread
+    server.stop()
+    assert not thread.is_alive()
+    assert 1 <= full.tries <= 5

@@ -10,6 +10,7 @@ import pytest
 from skyloop.errors import NameTakenError, RefusedError, UnknownNameError
 from skyloop.host import vehicle as vehicles
 from skyloop.host.fleet import VehicleSettings
+from skyloop.host.ticker import Ticker
 from skyloop.messages import (
     EventKind,
     Failsafe,
@@ -30,7 +31,7 @@ from skyloop.transport.base import OVERVIEW
 from skyloop.transport.local import LocalServer, list_names
 from skyloop.transport.testing import wait_until
 from tests.host.fleet import Flight, Hosting, closing_reason
-from tests.proxy.fake import FakeDriver
+from tests.proxy.fake import WAIT_S, FakeDriver
 
 
 def test_a_driver_that_blocks_in_a_command_ends_only_its_own_vehicle(hosting: Hosting) -> None:
@@ -222,7 +223,7 @@ def test_all_land_at_the_end_though_one_hangs(hosting: Hosting) -> None:
         hosting.add(name)
         hosting.airborne(name)
     hosting.drivers["stuck"].hangs = {"land"}
-    landing = threading.Thread(target=hosting.host.land, args=(20.0,))
+    landing = threading.Thread(target=hosting.host.close, args=("it is late", 20.0))
     landing.start()
     for name in ("one", "two"):
         wait_until(partial(hosting.drivers[name].told.__contains__, Land()), "it lands")
@@ -244,8 +245,10 @@ def test_presets_are_in_force_from_the_beginning(hosting: Hosting) -> None:
     hosting.host.add(VehicleSettings("alpha", "fake://alpha", presets=presets))
     proxy = hosting.shared("alpha").proxy
     assert proxy is not None
-    wait_until(lambda: proxy.handler.checks.limits.tilt == 0.2, "the vehicle's own parameter was written")
-    assert proxy.handler.checks.limits.speed == 0.5
+    wait_until(
+        lambda: proxy.handler.checks.airspace.settings.limits.tilt == 0.2, "the vehicle's own parameter was written"
+    )
+    assert proxy.handler.checks.airspace.settings.limits.speed == 0.5
     pilot = hosting.airborne("alpha")
     pilot.command(Velocity(2.0, 0.0, 0.0, 0.0))
     flown = driver.told[-1]
@@ -291,3 +294,43 @@ def test_one_overview_shows_all_vehicles_of_the_host_and_no_more_who_has_failed(
     wait_until(lambda: hosting.condition("two") == "failed", "it was given up")
     wait_until(lambda: names() == ["one", "three"], "it is shown no longer")
     stuck.let_go.set()
+
+
+def test_one_that_is_removed_while_it_starts_leaves_no_proxy_that_nobody_ticks(hosting: Hosting) -> None:
+    """It went on to serve, and a dead pilot's drone was never landed."""
+    driver = hosting.vehicle("alpha")
+    driver.hangs = {"open"}
+    adding = threading.Thread(target=hosting.host.add, args=(hosting.settings("alpha"),))
+    adding.start()
+    assert driver.stuck.wait(WAIT_S)
+    removing = threading.Thread(target=hosting.host.remove, args=("alpha",))
+    removing.start()
+    removing.join(0.1)
+    driver.let_go.set()
+    adding.join(WAIT_S)
+    removing.join(WAIT_S)
+    assert not removing.is_alive()
+    assert driver.closed, "its proxy has ended"
+    assert "alpha" not in hosting.host.vehicles
+    assert hosting.host._ticker.empty, "and is not ticked"
+    driver.hangs = set()
+    hosting.add("alpha")
+    assert hosting.condition("alpha") == "running"
+
+
+def test_a_vehicle_that_blocks_again_and_again_keeps_its_one_loop(hosting: Hosting) -> None:
+    """Each further stall left an empty loop behind, with a thread and two descriptors, until there were none left."""
+    hosting.add("alpha")
+    hosting.add("bravo")
+    host, proxy = hosting.host, hosting.shared("alpha").proxy
+    assert proxy is not None
+    counts = []
+    for _ in range(5):
+        loops = [loop for loop in host._loops if isinstance(loop, Ticker) and proxy in loop._failures]
+        assert len(loops) == 1
+        host._on_stall(loops[0], proxy)
+        counts.append(len(host._loops))
+    assert counts == [4] * 5
+    assert sum("has blocked" in line for line in hosting.lines) == 1
+    host.remove("alpha")
+    assert len(host._loops) == 3, "what was its own is closed with it"

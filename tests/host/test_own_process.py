@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
+from skyloop.child_process import ChildProcess
 from skyloop.errors import RefusedError
 from skyloop.host import own_process
 from skyloop.host.fleet import VehicleSettings
@@ -52,7 +55,7 @@ def test_one_that_dies_again_and_again_is_started_after_longer_and_longer_pauses
     assert "ended with exit code 7" in lines[0]
     assert dying.status().restarts >= 1
     assert "exit code 7" in dying.status().failed
-    dying.stop("it is enough")
+    dying.end(0.0, "it is enough")
     assert dying.status().condition == "stopped"
     count = len(pauses)
     time.sleep(0.05)
@@ -61,12 +64,12 @@ def test_one_that_dies_again_and_again_is_started_after_longer_and_longer_pauses
 
 def test_one_that_reports_nothing_any_more_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(own_process, "SILENT_LOOKS", 2)
-    monkeypatch.setattr(own_process, "_LOOK_S", 0.05)
+    monkeypatch.setattr("skyloop.child_process._LOOK_S", 0.05)
     lines: list[str] = []
     hung = vehicle("say(); time.sleep(60)", lines)
     hung.start()
     wait_until(lambda: any("was killed by signal 9" in line for line in lines), "it was killed")
-    hung.stop("it is enough")
+    hung.end(0.0, "it is enough")
 
 
 def test_it_lands_at_sigterm_and_is_not_started_again(tmp_path: Path) -> None:
@@ -86,16 +89,79 @@ time.sleep(60)
     landing.start()
     assert landing.status().pilot == "jane"
     assert landing.runs
-    assert landing.land(10.0)
+    assert landing.end(10.0, "it was removed", unless_flying=True)
     assert (tmp_path / "landed").exists()
-    landing.stop("it was removed")
+    landing.end(0.0, "it was removed")
     assert lines == []
-    assert landing.land(0.0)
+    assert landing.end(0.0, "it was removed", unless_flying=True)
 
 
 def test_one_that_does_not_land_is_ended(tmp_path: Path) -> None:
     stubborn = vehicle("import signal; signal.signal(signal.SIGTERM, lambda *_: None); say(); sys.stdin.read()", [])
     stubborn.start()
-    assert not stubborn.land(0.05)
-    stubborn.stop("it was removed")
+    assert not stubborn.end(0.05, "it was removed", unless_flying=True)
+    stubborn.end(0.0, "it was removed")
     assert stubborn.status().condition == "stopped"
+
+
+def test_a_grandchild_that_keeps_the_pipe_open_holds_up_neither_the_restart_nor_the_end() -> None:
+    lines: list[str] = []
+    code = """
+import signal, subprocess
+subprocess.Popen([sys.executable, "-c", "import time; time.sleep(20)"])
+say()
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    dying = vehicle(code, lines)
+    began_s = time.monotonic()
+    dying.start()
+    wait_until(lambda: dying.status().restarts >= 1, "it was started again")
+    dying.end(0.0, "it is enough")
+    assert time.monotonic() - began_s < 15.0
+
+
+def test_no_process_is_left_if_it_ends_while_it_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process died, and the vehicle is removed in the very moment in which the next one begins."""
+    monkeypatch.setattr(own_process, "pause_s", lambda _: 0.0)
+    begun: list[ChildProcess] = []
+    dying = vehicle("say(); sys.stdin.read(1)", [])
+    real, stopping = ChildProcess, threading.Event()
+
+    def slow(command: Sequence[str], *, keep_errors: bool) -> ChildProcess:
+        if begun:  # the second one
+            stopping.set()
+            time.sleep(0.2)
+        begun.append(real(command, keep_errors=keep_errors))
+        return begun[-1]
+
+    monkeypatch.setattr("skyloop.child_process.ChildProcess", slow)
+    dying.start()
+    begun[0].kill()
+    assert stopping.wait(10.0)
+    dying.end(0.0, "it was removed")
+    assert all(child.code is not None for child in begun)
+    assert dying.status().condition == "stopped"
+
+
+def test_one_that_lands_after_its_removal_timed_out_is_shown_as_stopped() -> None:
+    landing = vehicle(
+        """
+import signal, threading
+asked = threading.Event()
+signal.signal(signal.SIGTERM, lambda *_: asked.set())
+say(airborne=True, pilot="jane", state="flying")
+asked.wait()
+sys.stdin.read(1)
+""",
+        [],
+    )
+    landing.start()
+    assert not landing.end(0.05, "it is removed", unless_flying=True), "it takes its time"
+    child = landing._runner.child
+    assert child is not None
+    child.part()  # landed: it ends by itself
+    wait_until(lambda: landing.status().condition == "stopped", "it is shown as ended")
+    row = landing.status()
+    assert (row.airborne, row.pilot, row.state) == (False, None, "")
+    assert not landing.runs, "its name is free"
+    landing.end(0.0, "it was removed")

@@ -20,6 +20,7 @@ from tests.proxy.fake import Bench
 class Loop:
     inside: object = None
     entries: int = 0
+    empty: bool = False
 
     def close(self) -> None: ...
 

@@ -63,7 +63,7 @@ class Beating:
     def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join()
-        self.proxy.stop()
+        self.proxy.end()
 
     def _beat(self) -> None:
         while not self._ended.wait(0.01):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import queue
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
@@ -12,12 +13,13 @@ import pytest
 from skyloop import aio
 from skyloop.client import Drone, Swarm
 from skyloop.client.drone import open_drone
+from skyloop.clock import NS_PER_S
 from skyloop.drivers.registry import make_driver
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.emulators.mavlink.places import ORIGIN
 from skyloop.emulators.tello import TelloFirmware, with_tellos
 from skyloop.errors import NoAnswerError, RefusedError, SwarmError, UnknownNameError, UsageError
-from skyloop.messages import Applied, Feedback, FlightState, Hover, Vector, Velocity
+from skyloop.messages import Applied, EventKind, Feedback, FlightState, Hover, Vector, Velocity
 from skyloop.proxy import Proxy
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
@@ -43,7 +45,7 @@ def flown(vehicle: str) -> Iterator[Drone]:
         server = MemoryServer("v")
         proxy = Proxy(make_driver(address), server, name="v")
         proxy.start()
-        stack.callback(proxy.stop)
+        stack.callback(proxy.end)
         drone = stack.enter_context(open_drone(server.dial, app="me", on_exit="hover", timeout_s=WAIT_S))
         drone.wait(lambda feedback: feedback.vehicle_link == "up" and feedback.position_m is not None, LONG_S)
         drone.takeoff(timeout_s=LONG_S)
@@ -53,6 +55,21 @@ def flown(vehicle: str) -> Iterator[Drone]:
 def place(feedback: Feedback) -> tuple[float, float, float]:
     assert feedback.position_m is not None
     return feedback.position_m
+
+
+@pytest.mark.parametrize("vehicle", [SIM, *AUTOPILOTS])
+def test_a_place_that_is_refused_is_not_flown_to_afterwards(vehicle: str) -> None:
+    """``go_to(z=-4, wait=False)`` was refused, and the vehicle stood on the floor 3 s later: its repeats flew it."""
+    with flown(vehicle) as drone:
+        refused: queue.Queue[str] = queue.Queue()
+        drone.on_event(lambda event: refused.put(event.text) if event.kind is EventKind.COMMAND_REFUSED else None)
+        x, y, z = place(drone.feedback())
+        drone.go_to(x=x + 1.0, y=y, z=z - 5.0, wait=False)
+        assert "position refused: " in refused.get(timeout=WAIT_S)
+        end_ns = drone.feedback().captured_ns + 4 * NS_PER_S
+        while (now := drone.next_feedback()).captured_ns < end_ns:
+            assert now.state.airborne
+            assert math.dist(place(now), (x, y, z)) < 0.5
 
 
 @pytest.mark.parametrize("vehicle", [SIM, SIM + "&native=velocity", SIM + "&native=attitude", *AUTOPILOTS])
@@ -167,7 +184,7 @@ def test_a_swarm_and_asyncio_fly_to_places() -> None:
         for name, server in servers.items():
             proxy = Proxy(make_driver(SIM), server, name=name)
             proxy.start()
-            stack.callback(proxy.stop)
+            stack.callback(proxy.end)
         drones = {name: open_drone(server.dial, app="me", timeout_s=WAIT_S) for name, server in servers.items()}
         swarm = stack.enter_context(Swarm(drones, on_error="raise"))
         swarm.takeoff(timeout_s=LONG_S)

@@ -32,6 +32,7 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
+from skyloop.proxy.core.flight import BELIEF_NS
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import video
 from skyloop.transport.memory import MemoryServer
@@ -49,7 +50,7 @@ class Node:
         self.proxy = Proxy(vehicle, self.server, name="alpha")
 
     def restart(self) -> None:
-        self.proxy.stop()
+        self.proxy.end()
         self.proxy = Proxy(self.vehicle, self.server, name="alpha")
         self.proxy.start()
 
@@ -59,7 +60,7 @@ def node() -> Iterator[Node]:
     node = Node(FakeVehicle())
     node.proxy.start()
     yield node
-    node.proxy.stop()
+    node.proxy.end()
 
 
 @contextmanager
@@ -223,10 +224,12 @@ def test_a_restarted_proxy(node: Node, drone: Drone) -> None:
     drone.takeoff()
     drone.velocity(forward=0.5)
     drone.wait("flying", WAIT_S)
-    node.proxy.stop()
+    node.proxy.end()
     node.vehicle.applied.clear()
     node.proxy = Proxy(node.vehicle, node.server, name="alpha")
-    node.proxy.handler.ownership.began_before()  # as the note of its flight says to a named proxy that was killed
+    node.proxy.handler.flight.began_before(
+        node.proxy.clock() + BELIEF_NS
+    )  # as the note of its flight says to a named proxy that was killed
     started_s = time.monotonic()
     node.proxy.start()
     drone.wait(lambda _: drone.link.application is LinkState.UP and drone.authority.state == "held", WAIT_S)
@@ -339,7 +342,7 @@ def test_a_vehicle_that_cannot_fly() -> None:
                 drone.takeoff()
             assert drone.next_frame(timeout_s=WAIT_S).camera == "front"
     finally:
-        node.proxy.stop()
+        node.proxy.end()
 
 
 def test_annotations_reach_the_others(node: Node, drone: Drone) -> None:

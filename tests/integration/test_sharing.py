@@ -47,7 +47,7 @@ def shared() -> Iterator[Shared]:
     shared = Shared()
     shared.proxy.start()
     yield shared
-    shared.proxy.stop()
+    shared.proxy.end()
 
 
 def held(drone: Drone) -> None:

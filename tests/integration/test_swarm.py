@@ -87,7 +87,7 @@ class Field:
 
     def stop(self) -> None:
         for proxy in self.proxies.values():
-            proxy.stop()
+            proxy.end()
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def swarming(field: Field, **options: Any) -> Iterator[Swarm]:
 
 def gone(field: Field, drones: Swarm, name: str) -> None:
     """The proxy of one of them is killed, and the swarm's end has seen it."""
-    field.proxies[name].stop()
+    field.proxies[name].end()
     wait_until(lambda: drones[name].link.application is LinkState.LOST, "the link is lost")
 
 

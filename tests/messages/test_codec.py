@@ -80,6 +80,11 @@ def test_a_command_of_an_older_client_was_asked_for_by_its_application() -> None
     assert not older.automatic
 
 
+@pytest.mark.parametrize("name", ["reply-value", "reply-page"])
+def test_an_older_proxy_marks_no_parameter_as_momentary(name: str) -> None:
+    assert decode((PACKETS / "older" / f"{name}.bin").read_bytes()) == SAMPLES[name]
+
+
 def test_an_older_proxy_does_not_tell_its_clock() -> None:
     older = decode((PACKETS / "older" / "reply-welcome-without-clock.bin").read_bytes())
     newer = SAMPLES["reply-welcome"]

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import io
+import itertools
+import math
 import sys
+import threading
 import types
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 
-from skyloop.errors import LinkError, MissingExtraError
+from skyloop.clock import monotonic_ns
+from skyloop.errors import LinkError, MissingExtraError, UsageError
+from skyloop.messages import FlightState
 from skyloop.motion_capture import MotionCapture, parse_system, worker
 from skyloop.motion_capture.source import ChildSource
 from skyloop.motion_capture.worker import RawFrame, read
@@ -143,3 +149,48 @@ def test_a_child_that_sends_nonsense_is_replaced() -> None:
     failing.close()
     failing.close()
     assert any("bytes" in text for text in told)
+
+
+def test_a_refused_recalibration_keeps_the_calibration_in_force() -> None:
+    """Somebody touched the drone meanwhile: its attitude must not be wrong by 90 degrees from then on."""
+    turned = (0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4))  # the body's axes, for those of the drone
+    sources: list[Callable[[RawFrame], None]] = []
+
+    class Source:
+        def start(self, timeout_s: float) -> None: ...
+        def close(self) -> None: ...
+
+    def make(_system: object, _names: object, take: Callable[[RawFrame], None], _trouble: object) -> Source:
+        sources.append(take)
+        return Source()
+
+    standing = SimpleNamespace(state=FlightState.LANDED, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0)
+    drone: Any = SimpleNamespace(name="alpha", feedback=lambda: standing)
+    capture = MotionCapture(parse_system("vicon://nowhere"), {"alpha": "body"}, make)._open()
+
+    def calibrate(spread_m: float) -> None:
+        ended = threading.Event()
+
+        def see() -> None:
+            for number in itertools.count():
+                place = ((number % 2) * spread_m + number % 3 * 1e-6, 0.0, 0.0)
+                sources[0](RawFrame(monotonic_ns(), {"body": (place, turned)}))
+                if ended.wait(0.005):
+                    return
+
+        thread = threading.Thread(target=see)
+        thread.start()
+        try:
+            capture.calibrate(drone, seconds=0.3)
+        finally:
+            ended.set()
+            thread.join()
+
+    with capture:
+        calibrate(0.0)
+        with pytest.raises(UsageError, match="let it stand still"):
+            calibrate(0.1)
+        sources[0](RawFrame(monotonic_ns(), {"body": ((0.5, 0.0, 0.0), turned)}))
+        pose = capture.pose("alpha")
+        assert pose is not None
+        assert pose.yaw_rad == pytest.approx(0.0, abs=1e-6)

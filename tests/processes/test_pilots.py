@@ -137,7 +137,7 @@ def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_some
 def forge(drone: skyloop.Drone, lease: int, action: Velocity | Land) -> None:
     """Send a command under another lease over this application's own connection."""
     pilot = drone._core.commands
-    packet = encode(Command(pilot.seq + 1, lease, pilot._schedule.intent, time.monotonic_ns(), action))
+    packet = encode(Command(pilot._seq + 1, lease, pilot._schedule.intent, time.monotonic_ns(), action))
     pilot._seq += 1
     assert drone._core.connection.transmit(packet)
 

@@ -26,7 +26,6 @@ def command(code: str) -> list[str]:
 
 
 def total(group: Group) -> int:
-    group.look()
     status = group.status
     return 0 if status is None else status.results
 
@@ -50,7 +49,7 @@ def test_children_are_summed_started_anew_and_ended() -> None:
 def test_an_exit_code_is_told() -> None:
     told: list[str] = []
     with Group(command("raise SystemExit(3)"), 1, told.append, pause_s=0.01) as group:
-        wait_until(lambda: group.look() is None and len(told) >= 2, "it failed again and again")
+        wait_until(lambda: group.code is None and len(told) >= 2, "it failed again and again")
     assert "ended with exit code 3" in told[0]
 
 
@@ -66,8 +65,8 @@ def test_it_is_over_when_all_are_or_one_can_never_work(tmp_path: Path, codes: tu
         "    sys.exit(int(path.name[2:]))\n"
     )
     with Group(command(takes_one), 2, print) as group:
-        wait_until(lambda: group.look() is not None, "they ended")
-        assert group.look() == end
+        wait_until(lambda: group.code is not None, "they ended")
+        assert group.code == end
 
 
 def test_a_child_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:

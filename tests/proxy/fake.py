@@ -3,6 +3,7 @@ that stands still. A Ping's answer shows that everything sent before it was deal
 
 from __future__ import annotations
 
+import math
 import queue
 import time
 from collections.abc import Callable, Iterable
@@ -208,6 +209,15 @@ class App:
         assert self.end.send(encode(Request(self._ids, body)))
         return self._ids
 
+    def reserve(self) -> int:
+        """Return the number of a request that is lost on the way."""
+        self._ids += 1
+        return self._ids
+
+    def repeat(self, number: int, body: AnyRequest) -> None:
+        """Send a request once more under its number, as the library does while no answer comes."""
+        assert self.end.send(encode(Request(number, body)))
+
     def answer(self, number: int) -> AnyReply:
         reply = self._replies.get(timeout=WAIT_S)
         assert reply.id == number
@@ -269,7 +279,10 @@ class Bench:
             transport = memory, memory.dial
         self.server, self.dial = transport
         self.driver = FakeDriver(self.clock, actions, parameters)
-        self.proxy = Proxy(self.driver, self.server, name="bench", clock=self.clock, ticker=False)
+        self.slept_ns = 0  #: for how long the computer has slept
+        self.proxy = Proxy(
+            self.driver, self.server, name="bench", clock=self.clock, ticker=False, slept=lambda: self.slept_ns
+        )
         self.apps: list[App] = []
         self.events: list[Event] = []  #: published, whether or not they arrive anywhere
         self._publish, self.proxy.events._publish = self.proxy.events._publish, self._publish_event
@@ -289,7 +302,7 @@ class Bench:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.proxy.stop()
+        self.proxy.end()
         for app in self.apps:
             app.end.close()
 
@@ -325,6 +338,15 @@ class Bench:
             app.command(Takeoff())
         self.driver.report(state=FlightState.HOVERING)
         self.driver.told.clear()
+
+    def move(self, position_m: tuple[float, float, float], **more: Any) -> None:
+        """Report the vehicle at another place, and before that on the way there: its position does not jump."""
+        start = self.driver.now.position_m or position_m
+        steps = math.ceil(math.dist(start, position_m) / 0.9)
+        for step in range(1, steps + 1):
+            between = [a + step / steps * (b - a) for a, b in zip(start, position_m, strict=True)]
+            self.driver.report(position_m=tuple(between), **more)
+            self.tick()
 
     def run(self, seconds: float, each: Callable[[], object] = lambda: None) -> None:
         """Let time pass in steps of 20 ms, the proxy's tick after each, then ``each``."""

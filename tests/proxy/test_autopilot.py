@@ -107,16 +107,16 @@ def test_signs_are_those_of_rep_103(wanted: Velocity, roll_sign: int, pitch_sign
 def test_take_off_hover_and_landing() -> None:
     mass = PointMass()
     autopilot = Autopilot(ATTITUDE)
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED
     autopilot.start(Takeoff(), mass.now_ns, mass.feedback())
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.TAKING_OFF
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.TAKING_OFF
     fly(autopilot, mass, 6.0)
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.HOVERING
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.HOVERING
     assert mass.position[2] == pytest.approx(1.0, abs=0.05)
     autopilot.start(Land(), mass.now_ns, mass.feedback())
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDING
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDING
     fly(autopilot, mass, 6.0)
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED
     assert mass.position[2] == pytest.approx(0.0, abs=0.01)
     assert autopilot.step(mass.now_ns, mass.feedback()) is None
 
@@ -130,7 +130,7 @@ def test_a_velocity_is_reached_and_held(wanted: Velocity) -> None:
     velocity = mass.feedback().velocity_m_s
     assert velocity is not None
     assert velocity == pytest.approx((wanted.forward, wanted.left, wanted.up), abs=0.12)
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.FLYING
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.FLYING
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0, -1.2])
@@ -171,14 +171,117 @@ def test_without_knowledge_it_stays_level_and_goes_by_time() -> None:
     autopilot.start(Takeoff(), 0, None)
     assert autopilot.step(0, None) == Attitude(climb=0.5)
     assert autopilot.step(2 * NS_PER_S, None) == Attitude()
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.HOVERING
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.HOVERING
     autopilot.start(Velocity(1.0, 0.0, 0.2, 0.1), 2 * NS_PER_S, None)
     assert autopilot.step(3 * NS_PER_S, None) == Attitude(0.0, 0.0, 0.2, 0.1)
     autopilot.start(Land(), 3 * NS_PER_S, None)
     assert autopilot.step(17 * NS_PER_S, None) == Attitude(climb=-0.4)
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDING
-    autopilot.step(18 * NS_PER_S, None)
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDING
+    assert autopilot.step(60 * NS_PER_S, None) == Attitude(climb=-0.4)
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDING, "time shows nothing"
+
+
+def test_what_becomes_of_a_landing_that_no_altimeter_shows_is_not_known() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Land(), 0, None)
+    heard = 0
+    while autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDING:
+        heard += STEP_NS
+        assert autopilot.step(heard, Feedback(captured_ns=heard)) == Attitude(climb=-0.4)
+    assert 15.0 <= heard / NS_PER_S <= 15.1
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.UNKNOWN
+    assert autopilot.flight.state(FlightState.FLYING) is FlightState.FLYING
+
+
+@pytest.mark.parametrize("shown", [FlightState.UNKNOWN, FlightState.FLYING])
+def test_a_gap_in_what_is_heard_ends_no_landing(shown: FlightState) -> None:
+    """Late in a long landing nothing is heard for 0.6 s, or for a minute."""
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Land(), 0, None)
+    now = 0
+    for gap_s in (0.6, 60.0):
+        for _ in range(20 * 50):
+            now += STEP_NS
+            last = Feedback(captured_ns=now, altitude_m=20.0 - 0.4 * now / NS_PER_S % 10)
+            autopilot.step(now, last, shown)
+        for _ in range(round(gap_s * 50)):
+            now += STEP_NS
+            assert autopilot.step(now, last, shown) == Attitude(climb=-0.4)
+            assert autopilot.flight.state(shown) is FlightState.LANDING
+    assert autopilot.step(now + STEP_NS, Feedback(captured_ns=now + STEP_NS, altitude_m=0.4), shown) is not None
+    assert autopilot.flight.state(shown) is FlightState.LANDING, "no headway for a second counts while it is heard"
+
+
+def test_a_landing_over_lower_ground_ends_where_the_vehicle_says_that_it_stands() -> None:
+    """Its altimeter counts from where it took off, 2 m higher."""
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Land(), 0, None)
+    now = 0
+    for below in range(100):
+        now += STEP_NS
+        seen(autopilot, FlightState.FLYING, now, 0.0 - 0.02 * below)
+        assert autopilot.flight.state(FlightState.FLYING) is FlightState.LANDING
+    for _ in range(100):  # it makes no headway either, and still says that it flies
+        now += STEP_NS
+        assert seen(autopilot, FlightState.FLYING, now, -2.0) == Attitude(climb=-0.4)
+    assert seen(autopilot, FlightState.LANDED, now + STEP_NS, -2.0) == Attitude(climb=-0.4), "it stays in force"
+    assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
+    assert seen(autopilot, FlightState.LANDED, now + 2 * STEP_NS, -2.0) is None
+
+
+def test_a_landing_right_after_a_take_off_began_is_not_over_by_what_was_reported_before() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Takeoff(), 0, None)
+    seen(autopilot, FlightState.LANDED, STEP_NS, 0.0)
+    autopilot.start(Land(), 2 * STEP_NS, None)
+    seen(autopilot, FlightState.LANDED, 3 * STEP_NS, 0.0)
+    assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDING
+    seen(autopilot, FlightState.LANDED, 60 * STEP_NS, 0.0)
+    assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
+
+
+@pytest.mark.parametrize("position", [True, False])
+def test_a_take_off_ends_without_the_altimeter(position: bool) -> None:
+    """It is stuck at zero: the position says how high it is, or else the time."""
+    autopilot = Autopilot(frozenset({"velocity"}))
+    autopilot.start(Takeoff(), 0, None)
+    height, now = 0.0, 0
+    while autopilot.flight.state(FlightState.UNKNOWN) is FlightState.TAKING_OFF:
+        now += STEP_NS
+        place = (0.0, 0.0, height) if position else None
+        told = autopilot.step(now, Feedback(captured_ns=now, altitude_m=0.0, position_m=place, yaw_rad=0.0))
+        assert isinstance(told, Velocity)
+        height += told.up * PERIOD_S
+        assert height < 5.0
+    assert height == pytest.approx(1.0 if position else 3.0, abs=0.05)
+    told = autopilot.step(now + STEP_NS, Feedback(captured_ns=now + STEP_NS, altitude_m=0.0))
+    assert told == Velocity(), "it does not climb to where the altimeter should be"
+
+
+def test_a_vehicle_that_reports_to_stand_has_not_taken_off_whatever_its_altimeter_says() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Takeoff(), 0, None)
+    for step in range(1, 400):
+        assert seen(autopilot, FlightState.LANDED, step * STEP_NS, 1.2) == Attitude(climb=0.5)
+    assert autopilot.flight.state(FlightState.LANDED) is FlightState.TAKING_OFF
+    seen(autopilot, FlightState.FLYING, 400 * STEP_NS, 1.2)
+    assert autopilot.flight.state(FlightState.FLYING) is FlightState.HOVERING
+
+
+def test_what_is_found_on_the_ground_after_a_gap_stays_there() -> None:
+    """A flight controller stood still for a while, and its vehicle fell."""
+    autopilot = Autopilot(ATTITUDE)
+    now = 0
+    autopilot.start(Hover(), now, Feedback(captured_ns=0, altitude_m=1.0))
+    heard = Feedback(captured_ns=0, altitude_m=1.0)
+    for _ in range(100):
+        now += STEP_NS
+        told = autopilot.step(now, heard, FlightState.FLYING)
+    autopilot.start(Hover(), now, heard)
+    for _ in range(50):
+        now += STEP_NS
+        told = seen(autopilot, FlightState.FLYING, now, 0.02)
+        assert told == Attitude()
 
 
 def test_stale_feedback_is_not_steered_by() -> None:
@@ -197,7 +300,7 @@ def test_an_altimeter_that_never_reads_zero_still_ends_the_landing() -> None:
         if step == 0:
             autopilot.start(Land(), now, feedback)
         autopilot.step(now, feedback)
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED
 
 
 @pytest.mark.parametrize(
@@ -217,7 +320,7 @@ def test_the_vehicles_own_word_counts_where_it_has_the_notion(
 ) -> None:
     autopilot = Autopilot(frozenset(native))
     autopilot.start(mode, 0, None)
-    assert autopilot.state(told) is expected
+    assert autopilot.flight.state(told) is expected
 
 
 @pytest.mark.parametrize(
@@ -234,21 +337,27 @@ def test_what_the_vehicle_does_itself_stops_the_autopilot(action: str, expected:
     autopilot.start(Hover(), 0, None)
     autopilot.stop(action)
     assert autopilot.step(0, None) is None
-    assert autopilot.state(FlightState.UNKNOWN) is expected
+    assert autopilot.flight.state(FlightState.UNKNOWN) is expected
 
 
 def test_an_attitude_on_the_ground_is_no_flight() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.stop("attitude")
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED
 
 
 def test_a_vehicle_first_seen_in_the_air_is_flying() -> None:
     autopilot = Autopilot(ATTITUDE)
-    autopilot.on_first_feedback(Feedback(captured_ns=0, altitude_m=0.1))
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
-    autopilot.on_first_feedback(Feedback(captured_ns=0, altitude_m=1.0))
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.FLYING
+    autopilot.flight.observe(FlightState.UNKNOWN, "", 0, Feedback(captured_ns=0, altitude_m=0.1))
+    autopilot.flight.observe(FlightState.UNKNOWN, "", 0, Feedback(captured_ns=0, altitude_m=1.0))
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED, "it drifts"
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.flight.observe(FlightState.LANDED, "", 0, Feedback(captured_ns=0, altitude_m=1.0))
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.flight.observe(FlightState.UNKNOWN, "", 0, Feedback(captured_ns=0))
+    autopilot.flight.observe(FlightState.UNKNOWN, "", 0, Feedback(captured_ns=0, altitude_m=1.0))
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.FLYING
 
 
 @settings(max_examples=60)
@@ -297,7 +406,7 @@ def test_a_place_is_reached_and_held(yaw: float, wind: tuple[float, float]) -> N
     mass = PointMass(yaw=yaw, wind=wind)
     autopilot = taken_off(mass)
     autopilot.start(Position(3.0, -2.0, 2.0, yaw=-1.0), mass.now_ns, mass.feedback())
-    assert autopilot.state(FlightState.UNKNOWN) is FlightState.FLYING
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.FLYING
     fly(autopilot, mass, 30.0)
     assert math.dist(mass.position, (3.0, -2.0, 2.0)) < 0.15
     assert math.hypot(*mass.velocity) < 0.1
@@ -391,9 +500,9 @@ def test_a_vehicle_that_was_disarmed_in_the_air_is_flown_no_more() -> None:
     autopilot.start(Takeoff(), 0, None)
     assert seen(autopilot, FlightState.LANDED, STEP_NS, 0.0) is not None, "it is about to rise"
     seen(autopilot, FlightState.FLYING, 2 * STEP_NS, 1.0)
-    assert autopilot.state(FlightState.FLYING) is FlightState.HOVERING
+    assert autopilot.flight.state(FlightState.FLYING) is FlightState.HOVERING
     assert seen(autopilot, FlightState.LANDED, 3 * STEP_NS, 0.1) is None
-    assert autopilot.state(FlightState.LANDED) is FlightState.LANDED
+    assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
 
 
 def test_a_take_off_that_never_leaves_the_ground_ends() -> None:
@@ -401,7 +510,7 @@ def test_a_take_off_that_never_leaves_the_ground_ends() -> None:
     autopilot.start(Takeoff(), 0, None)
     assert seen(autopilot, FlightState.LANDED, 14 * NS_PER_S, 0.0) is not None
     assert seen(autopilot, FlightState.LANDED, 15 * NS_PER_S, 0.0) is None
-    assert autopilot.state(FlightState.LANDED) is FlightState.LANDED
+    assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
 
 
 def test_a_refusal_ends_a_take_off_and_no_flight() -> None:
@@ -409,7 +518,7 @@ def test_a_refusal_ends_a_take_off_and_no_flight() -> None:
     autopilot.start(Takeoff(), 0, None)
     autopilot.refused(FlightState.UNKNOWN)
     autopilot.refused(FlightState.FLYING)
-    assert autopilot.state(FlightState.FLYING) is FlightState.TAKING_OFF
+    assert autopilot.flight.state(FlightState.FLYING) is FlightState.TAKING_OFF
     autopilot.refused(FlightState.LANDED)
     assert autopilot.step(STEP_NS, None) is None
-    assert autopilot.state(FlightState.LANDED) is FlightState.LANDED
+    assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Attitude, Velocity
-from skyloop.proxy.core.limits import SLACK_M, Ceiling, Clamp, Episodes, Limits
+from skyloop.proxy.core.limits import SLACK_M, Clamp, Episodes, Limits
 
 LIMITS = Limits(tilt=0.3, climb=1.0, yaw_rate=1.5, speed=2.0, altitude=5.0)
 numbers = st.floats(-1e6, 1e6)
@@ -60,18 +60,6 @@ def test_what_is_beyond_is_shortened(
         [getattr(expected, name) for name in expected.__struct_fields__]
     )
     assert [clamp.limit for clamp in clamps] == limits
-
-
-def test_a_vehicle_that_hovers_above_the_limit_is_brought_down_below_it() -> None:
-    ceiling, altitude, steps = Ceiling(), 7.4, 0
-    assert ceiling.instead(LIMITS, None) == (None, ())
-    assert ceiling.instead(LIMITS, 5.2) == (None, ())
-    while (sink := ceiling.instead(LIMITS, altitude)[0]) is not None:
-        assert -1.0 <= sink.up <= -0.2
-        altitude += sink.up / 32
-        steps += 1
-    assert altitude == pytest.approx(5.15, abs=0.05)
-    assert steps < 32 * 6
 
 
 def test_the_clamp_says_what_was_asked() -> None:

@@ -15,13 +15,15 @@ from skyloop.messages import (
     Feedback,
     FlightState,
     Hover,
+    Idle,
     Position,
     Refusal,
     SetParameter,
+    Severity,
     Velocity,
 )
+from skyloop.proxy.core.airspace import Airspace, AirspaceSettings, Verdict
 from skyloop.proxy.core.limits import Limits
-from skyloop.proxy.core.places import PlaceDecision, decide_place
 from skyloop.zones import Box, Cylinder, Space
 from tests.proxy.fake import ALL, App, Bench
 
@@ -41,15 +43,28 @@ def at(x: float, y: float, z: float, **more: Any) -> Feedback:
 START = at(0.0, 0.0, 1.0)
 
 
+def within(limits: Limits, space: Space) -> Airspace:
+    return Airspace(AirspaceSettings(limits, space))
+
+
+def asked_newly(action: Position, limits: Limits, space: Space, feedback: Feedback | None) -> Verdict:
+    return within(limits, space).judge(action, feedback, NOW, new=True)
+
+
+def flown(verdict: Verdict) -> Position:
+    assert isinstance(verdict.action, Position)
+    return verdict.action
+
+
 # What is decided -------------------------------------------------------------------------------------------------
 
 
 def test_both_speeds_are_filled_in() -> None:
-    decided = decide_place(Position(3.0, 0.0, 1.0, 0.5), LIMITS, ANYWHERE, START, NOW, new=True)
+    decided = asked_newly(Position(3.0, 0.0, 1.0, 0.5), LIMITS, ANYWHERE, START)
     assert decided.action == Position(3.0, 0.0, 1.0, 0.5, 2.0, 1.5)
     assert decided.clamps == ()
     slow = Position(3.0, 0.0, 1.0, None, 0.3, 0.2)
-    assert decide_place(slow, LIMITS, ANYWHERE, START, NOW, new=True).action == slow
+    assert asked_newly(slow, LIMITS, ANYWHERE, START).action == slow
 
 
 @pytest.mark.parametrize(
@@ -62,12 +77,12 @@ def test_both_speeds_are_filled_in() -> None:
     ],
 )
 def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed: float, limit: str) -> None:
-    decided = decide_place(asked, LIMITS, ANYWHERE, START, NOW, new=True)
-    assert decided.action is not None
-    assert decided.action.speed == pytest.approx(speed)
+    airspace = within(LIMITS, ANYWHERE)
+    decided = airspace.judge(asked, START, NOW, new=True)
+    assert flown(decided).speed == pytest.approx(speed)
     (clamp,) = decided.clamps
-    assert (clamp.limit, clamp.asked, clamp.applied) == (limit, 9.0, decided.action.speed)
-    assert decide_place(asked, LIMITS, ANYWHERE, START, NOW, new=False).clamps == (), "repeats are not told again"
+    assert (clamp.limit, clamp.asked, clamp.applied) == (limit, 9.0, flown(decided).speed)
+    assert airspace.judge(asked, START, NOW).clamps == (), "repeats are not told again"
 
 
 @pytest.mark.parametrize(
@@ -87,7 +102,7 @@ def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed
     ],
 )
 def test_what_is_refused_and_why(asked: Position, feedback: Feedback | None, reason: Refusal, words: str) -> None:
-    decided = decide_place(asked, LIMITS, BOXED, feedback, NOW, new=True)
+    decided = asked_newly(asked, LIMITS, BOXED, feedback)
     assert (decided.action, decided.refusal) == (None, reason)
     assert words in decided.why
 
@@ -101,42 +116,78 @@ def test_what_is_refused_and_why(asked: Position, feedback: Feedback | None, rea
     ],
 )
 def test_a_known_room_is_not_left(asked: Position, feedback: Feedback, words: str) -> None:
-    for new in (True, False) if "room" in words else (True,):
-        decided = decide_place(asked, LIMITS, ROOM, feedback, NOW, new=new)
+    airspace = within(LIMITS, ROOM)
+    for new in (True, False):
+        decided = airspace.judge(asked, feedback, NOW, new=new)
         assert (decided.action, decided.refusal) == (None, Refusal.OUT_OF_RANGE)
         assert words in decided.why
 
 
 def test_no_place_below_the_ground_is_flown_to() -> None:
-    into = decide_place(Position(2.0, 0.0, -3.0), LIMITS, ANYWHERE, START, NOW, new=True)
+    into = asked_newly(Position(2.0, 0.0, -3.0), LIMITS, ANYWHERE, START)
     assert (into.action, into.refusal) == (None, Refusal.OUT_OF_RANGE)
     assert "z is -3 m, which is 3.00 m below the ground under the vehicle" in into.why
     hill = at(0.0, 0.0, -4.0, altitude_m=2.0)  # it took off farther up
-    assert decide_place(Position(2.0, 0.0, -5.0), LIMITS, ANYWHERE, hill, NOW, new=True).action is not None
-    assert decide_place(Position(2.0, 0.0, -7.0), LIMITS, ANYWHERE, hill, NOW, new=True).action is None
+    assert asked_newly(Position(2.0, 0.0, -5.0), LIMITS, ANYWHERE, hill).action is not None
+    assert asked_newly(Position(2.0, 0.0, -7.0), LIMITS, ANYWHERE, hill).action is None
     unknown = at(0.0, 0.0, 1.0, altitude_m=None)
-    assert decide_place(Position(2.0, 0.0, -3.0), LIMITS, ANYWHERE, unknown, NOW, new=True).action is not None
+    assert asked_newly(Position(2.0, 0.0, -3.0), LIMITS, ANYWHERE, unknown).action is not None
 
 
 def test_an_old_position_is_waited_for_a_moment() -> None:
     old = at(0, 0, 1, captured_ns=NOW - NS_PER_S)
     for new in (True, False):
-        assert decide_place(Position(1.0, 0.0, 1.0), LIMITS, BOXED, old, NOW, new=new) == PlaceDecision()
+        assert within(LIMITS, BOXED).judge(Position(1.0, 0.0, 1.0), old, NOW, new=new) == Verdict()
 
 
 def test_repeats_are_lowered_to_a_lower_ceiling_and_drift_past_a_zone_is_not_refused() -> None:
-    decided = decide_place(Position(0.0, 0.0, 4.0), Limits(altitude=3.0), ANYWHERE, START, NOW, new=False)
-    assert decided.action is not None
-    assert decided.action.z == pytest.approx(3.0)
+    airspace, high = within(LIMITS, ANYWHERE), Position(0.0, 0.0, 4.0)
+    assert flown(airspace.judge(high, START, NOW, new=True)).z == 4.0
+    airspace.settings = AirspaceSettings(Limits(altitude=3.0))
+    decided = airspace.judge(high, START, NOW)
+    assert flown(decided).z == pytest.approx(3.0)
     assert [clamp.limit for clamp in decided.clamps] == ["limits.altitude"]
-    past = Position(3.5, 0.1, 1.0)
-    assert decide_place(past, LIMITS, BOXED, START, NOW, new=False).action is not None
+    airspace, past = within(LIMITS, BOXED), Position(3.5, 0.1, 1.0)
+    assert airspace.judge(past, at(0.0, 3.0, 1.0), NOW, new=True).action is not None
+    assert airspace.judge(past, START, NOW).action is not None
     inside = Position(2.1, 0.1, 1.0)
-    assert decide_place(inside, LIMITS, BOXED, START, NOW, new=False).refusal is Refusal.OUT_OF_RANGE
+    assert airspace.judge(inside, START, NOW).refusal is Refusal.OUT_OF_RANGE
+
+
+REFUSED = [
+    (Position(3.5, 0.1, 1.0), "in the straight way there"),
+    (Position(0.0, 0.0, 6.0), "at most 5.00 m is allowed"),
+    (Position(-2.0, 0.0, -3.0), "3.00 m below the ground"),
+]
+
+
+@pytest.mark.parametrize(("asked", "words"), REFUSED, ids=["behind a zone", "too high", "below the ground"])
+def test_a_refused_place_stays_refused_when_it_is_asked_for_again(asked: Position, words: str) -> None:
+    """A place that was refused was flown to by its repeats."""
+    airspace = within(LIMITS, Space(zones=BOXED.zones))
+    for new in (True, False, False):
+        decided = airspace.judge(asked, START, NOW, new=new)
+        assert (decided.action, decided.refusal) == (None, Refusal.OUT_OF_RANGE)
+        assert words in decided.why
+
+
+def test_a_zone_that_is_drawn_across_the_way_ends_it() -> None:
+    airspace, far = within(LIMITS, ANYWHERE), Position(3.5, 0.1, 1.0)
+    assert airspace.judge(far, START, NOW, new=True).action is not None
+    airspace.settings = AirspaceSettings(LIMITS, BOXED)
+    assert airspace.judge(far, START, NOW).refusal is Refusal.OUT_OF_RANGE
+    assert airspace.judge(far, START, NOW).refusal is Refusal.OUT_OF_RANGE
+
+
+def test_what_was_asked_for_between_ends_the_way() -> None:
+    airspace, past = within(LIMITS, BOXED), Position(3.5, 0.1, 1.0)
+    assert airspace.judge(past, at(0.0, 3.0, 1.0), NOW, new=True).action is not None
+    assert airspace.judge(Velocity(left=-1.0), START, NOW).action is not None
+    assert airspace.judge(past, START, NOW).refusal is Refusal.OUT_OF_RANGE
 
 
 def test_a_zone_that_the_vehicle_is_in_can_be_left() -> None:
-    decided = decide_place(Position(0.0, 0.0, 1.0), LIMITS, BOXED, at(2.1, 0.0, 1.0), NOW, new=True)
+    decided = asked_newly(Position(0.0, 0.0, 1.0), LIMITS, BOXED, at(2.1, 0.0, 1.0))
     assert decided.action is not None
 
 
@@ -163,8 +214,7 @@ def test_what_is_flown_keeps_to_each_limit(
 ) -> None:
     assume(math.dist(start, end) > 0.1 and end[2] >= 0.0)
     limits = Limits(climb=0.7, speed=1.3, altitude=100.0)
-    action = decide_place(Position(*end, speed=speed), limits, ANYWHERE, at(*start), NOW, new=True).action
-    assert action is not None
+    action = flown(asked_newly(Position(*end, speed=speed), limits, ANYWHERE, at(*start)))
     assert action.speed is not None
     away = math.dist(start, end)
     assert action.speed <= speed
@@ -236,6 +286,46 @@ def test_a_refused_place_ends_the_set_point_before_it() -> None:
         assert "safety.box" in event.text
 
 
+@pytest.mark.parametrize("actions", [ALL, SOFTWARE], ids=["native", "software"])
+@pytest.mark.parametrize(("asked", "words"), REFUSED, ids=["behind a zone", "too high", "below the ground"])
+def test_a_refused_place_is_not_flown_to_by_its_repeats(actions: frozenset[str], asked: Position, words: str) -> None:
+    """``go_to(wait=False)`` to a place that is refused: its repeats brought the vehicle there, or to the floor."""
+    with Bench(actions) as bench:
+        pilot = placed(bench)
+        if "zone" in words or "way" in words:
+            write(bench, pilot, "safety.zones", "cylinder 2 0 0.5 0 3")
+        pilot.command(asked)
+        for _ in range(10):
+            bench.run(0.03, bench.driver.report)
+            pilot.command(asked, repeat=True)
+        bench.run(0.1, bench.driver.report)
+        assert {type(action) for action in bench.driver.told if action != Velocity()} <= {Hover}
+        assert words in pilot.told(EventKind.COMMAND_REFUSED)[0].text
+
+
+@pytest.mark.parametrize(("asked", "words"), REFUSED[1:], ids=["too high", "below the ground"])
+def test_a_place_is_judged_while_the_vehicle_takes_off(asked: Position, words: str) -> None:
+    """A ``go_to`` during a take-off was held, then flown to by its repeats without having been judged at all."""
+    with Bench() as bench:
+        pilot = placed(bench, state=FlightState.TAKING_OFF)
+        pilot.command(asked)
+        assert words in pilot.told(EventKind.COMMAND_REFUSED)[0].text
+        assert bench.driver.told == [], "the take-off goes on"
+        bench.driver.report(state=FlightState.FLYING)
+        pilot.command(asked, repeat=True)
+        assert Position not in map(type, bench.driver.told)
+
+
+def test_a_place_that_is_all_right_waits_for_the_end_of_the_take_off() -> None:
+    with Bench() as bench:
+        pilot = placed(bench, state=FlightState.TAKING_OFF)
+        pilot.command(Position(2.0, 0.0, 1.0))
+        assert pilot.refusals() == []
+        bench.driver.report(state=FlightState.FLYING)
+        pilot.command(Position(2.0, 0.0, 1.0), repeat=True)
+        assert isinstance(bench.driver.told[-1], Position)
+
+
 def test_a_position_that_gets_lost_on_the_way_stops_a_vehicle_that_flies_there_itself() -> None:
     with Bench() as bench:
         pilot = placed(bench)
@@ -267,8 +357,7 @@ def test_with_walls_the_proxy_checks_each_step_of_the_way() -> None:
         write(bench, pilot, "safety.box.x_high", 3.0)
         pilot.command(Position(2.9, 0.0, 1.0))
         assert Position not in map(type, bench.driver.told)
-        bench.driver.report(position_m=(2.5, 0.0, 1.0), velocity_m_s=(2.0, 0.0, 0.0))
-        bench.tick()
+        bench.move((2.5, 0.0, 1.0), velocity_m_s=(2.0, 0.0, 0.0))
         told = bench.driver.told[-1]
         assert isinstance(told, Velocity)
         assert told.forward < 0.2, "as slow as any velocity so near to the wall: the way alone allows 0.36 m/s"
@@ -276,6 +365,44 @@ def test_with_walls_the_proxy_checks_each_step_of_the_way() -> None:
         pilot.command(Position(2.9, 0.0, 1.0), repeat=True)
         assert bench.driver.told[-1] == Hover(), "the place is outside by now"
         assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
+
+
+@pytest.mark.parametrize("actions", [ALL, SOFTWARE], ids=["native", "software"])
+def test_a_position_that_jumps_is_told_and_the_vehicle_hovers(actions: frozenset[str]) -> None:
+    """An autopilot's estimate that is reset, or motion capture that takes one drone for another: nobody noticed."""
+    with Bench(actions) as bench:
+        pilot = placed(bench)
+        bench.move((0.5, 0.0, 1.0))
+        pilot.command(Position(5.0, 0.0, 1.0))
+        bench.move((1.5, 0.0, 1.0))
+        assert pilot.told(EventKind.VEHICLE_MESSAGE) == []
+        bench.driver.told.clear()
+        bench.driver.report(position_m=(1.5, 3.0, 1.0))
+        bench.tick()
+        (event,) = pilot.told(EventKind.VEHICLE_MESSAGE)
+        assert (event.severity, event.data["reason"]) == (Severity.WARNING, "position_jumped")
+        assert event.data["jumped_m"] == pytest.approx(3.0)
+        assert bench.driver.told == [Hover()]
+        bench.run(0.2, lambda: pilot.command(Position(5.0, 0.0, 1.0), repeat=True))
+        assert bench.driver.told == [Hover()], "it does not go on by itself"
+        assert set(pilot.refusals()) == {Refusal.NOT_FRESH}
+        pilot.command(Position(5.0, 0.0, 1.0))
+        assert pilot.applied[-1].applied != Idle(), "a new one is flown"
+
+
+def test_a_vehicle_that_is_carried_or_was_not_seen_for_long_does_not_jump() -> None:
+    with Bench() as bench:
+        pilot = bench.pilot()
+        bench.driver.report(position_m=(0.0, 0.0, 0.0), yaw_rad=0.0)
+        bench.tick()
+        bench.driver.report(position_m=(4.0, 0.0, 0.0))
+        bench.tick()
+        bench.take_off(pilot)
+        bench.driver.report(position_m=None)
+        bench.run(1.5, lambda: pilot.command(Hover(), repeat=True))
+        bench.driver.report(position_m=(8.0, 0.0, 0.0))
+        bench.tick()
+        assert pilot.told(EventKind.VEHICLE_MESSAGE) == []
 
 
 def test_walls_that_are_set_on_the_way_take_over_from_the_vehicle() -> None:

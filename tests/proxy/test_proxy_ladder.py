@@ -16,9 +16,11 @@ from skyloop.messages import (
     LinkState,
     Refusal,
     ReleaseAuthority,
+    RequestAuthority,
     Takeoff,
     Velocity,
 )
+from skyloop.proxy.core.flight import BELIEF_NS
 from skyloop.transport.testing import wait_until
 from tests.proxy.fake import App, Bench
 
@@ -148,7 +150,7 @@ def test_nothing_is_done_on_the_ground(bench: Bench) -> None:
 def test_a_flight_that_an_earlier_run_began_waits_for_its_pilot_and_is_ended() -> None:
     bench = Bench()
     bench.driver.now = Feedback(captured_ns=0)
-    bench.proxy.handler.ownership.began_before()
+    bench.proxy.handler.flight.began_before(bench.clock() + BELIEF_NS)
     with bench:
         witness = bench.join("witness")
         bench.run(20.0)  # until the vehicle is heard
@@ -181,8 +183,7 @@ def test_landing_before_the_end(bench: Bench) -> None:
     pilot.command(Velocity(0.5))
     assert pilot.refusals() == [Refusal.WRONG_STATE]
     bench.driver.report(state=FlightState.LANDED)
-    assert bench.proxy.land(1.0)
-    bench.proxy.stop(reason="it is late")
+    assert bench.proxy.end(1.0, reason="it is late")
     # What was published before the end still comes, on the pilot's own thread.
     wait_until(lambda: any(event.kind is EventKind.PROXY_CLOSING for event in pilot.events), "the pilot hears of it")
     assert "it is late" in next(event.text for event in pilot.events if event.kind is EventKind.PROXY_CLOSING)
@@ -193,7 +194,7 @@ def test_landing_before_the_end(bench: Bench) -> None:
 def test_ending_in_the_air_leaves_it_hovering(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
-    bench.proxy.stop()
+    bench.proxy.end()
     assert bench.driver.told == [Velocity(0.5), Hover()]
 
 
@@ -226,6 +227,32 @@ def test_a_driver_whose_failsafe_raises_against_its_contract_is_tried_again(
     monkeypatch.undo()
     bench.run(0.3)
     assert bench.driver.told == [Hover()]
+
+
+def test_pilots_who_hang_one_after_another_keep_it_in_the_air_no_longer_than_one_does(bench: Bench) -> None:
+    """Ten programs wait in the queue and hang: each is granted the authority, and never heard."""
+    bench.airborne()
+    for number in range(10):
+        bench.join(f"pilot {number}").ask(RequestAuthority(16, queue=True))
+    bench.run(4.98)
+    assert Land() not in bench.driver.told
+    assert bench.proxy.handler.authority.granted > 2
+    bench.run(0.04)
+    assert bench.driver.told[-1] == Land()
+
+
+def test_a_landing_is_repeated_until_the_vehicle_shows_it(bench: Bench) -> None:
+    """It flew, and has told nothing of its flight since the ladder's landing was sent."""
+    bench.airborne()
+    bench.tick()
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.UNKNOWN)
+    bench.run(7.0)
+    assert bench.driver.told.count(Land()) >= 7
+    bench.driver.report(state=FlightState.LANDING)
+    count = len(bench.driver.told)
+    bench.run(1.0)
+    assert len(bench.driver.told) == count
 
 
 def test_nothing_is_at_rest_from_a_grant_until_the_flight_is_over(bench: Bench) -> None:
@@ -261,5 +288,15 @@ def test_a_link_that_broke_and_feedback_that_is_due_are_no_rest(bench: Bench) ->
 def test_what_others_fly_is_not_at_rest(bench: Bench) -> None:
     bench.driver.report(state=FlightState.FLYING)
     bench.run(1.1)
-    assert bench.proxy.handler.ownership.others
+    assert bench.proxy.handler.flight.others
     assert not bench.proxy.at_rest
+
+
+def test_in_a_fork_the_proxy_leaves_its_vehicle_to_the_parent(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.proxy.forked()
+    bench.proxy.end()
+    assert bench.driver.told == []
+    assert not bench.driver.closed
+    bench.proxy.ended = False  # the parent's
+    assert pilot.told(EventKind.PROXY_CLOSING) == []

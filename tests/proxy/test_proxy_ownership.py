@@ -12,6 +12,7 @@ from skyloop.messages import (
     Attitude,
     EventKind,
     Failsafe,
+    Feedback,
     FlightState,
     Hover,
     Land,
@@ -37,7 +38,7 @@ def test_a_proxy_beside_a_vehicle_that_somebody_else_flies_does_nothing(bench: B
         bench.driver.link(link, "")
         bench.run(1.0)
     assert not bench.proxy.handler.order_landing(bench.clock())
-    bench.proxy.stop()
+    bench.proxy.end()
     assert bench.driver.told == []
     assert bench.published(EventKind.FAILSAFE) == []
     (told,) = [event.text for event in bench.published(EventKind.VEHICLE_MESSAGE)]
@@ -256,6 +257,33 @@ def test_a_proxy_that_was_killed_ends_its_own_flight_when_it_is_back(tmp_path: P
         again.driver.report(state=FlightState.LANDED)
         again.run(1.1)
         wait_until(lambda: not path.exists(), "the note goes with the flight")
+
+
+def test_a_flight_that_is_found_long_after_the_proxy_was_killed_is_somebody_elses(tmp_path: Path) -> None:
+    """The vehicle was away, for another battery, and comes back in the air."""
+    path = tmp_path / "alpha.flight"
+    fly_and_die(path)
+    again = Bench()
+    again.proxy.keep_record(FlightRecord(path, "fake://"))
+    again.driver.now = Feedback(captured_ns=0)
+    with again:
+        again.run(LIFE_S + 1.0)
+        wait_until(lambda: not path.exists(), "it is not looked for any more")
+        again.driver.report(state=FlightState.FLYING)
+        again.run(6.0)
+        assert again.driver.told == []
+        assert again.proxy.handler.flight.others
+
+
+def test_the_note_of_a_flight_goes_when_the_vehicle_is_found_standing(tmp_path: Path) -> None:
+    path = tmp_path / "alpha.flight"
+    fly_and_die(path)
+    again = Bench()
+    again.proxy.keep_record(FlightRecord(path, "fake://"))
+    with again:
+        assert path.exists()
+        again.run(1.1)
+        wait_until(lambda: not path.exists(), "it is over")
 
 
 @pytest.mark.parametrize("what", ["another vehicle", "old", "damaged", "of the future"])

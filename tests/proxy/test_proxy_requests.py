@@ -33,6 +33,7 @@ from skyloop.messages import (
     Welcome,
 )
 from skyloop.proxy.requests import MAX_PENDING
+from skyloop.proxy.sessions import MAX_KEPT
 from tests.proxy.fake import WAIT_S, App, Bench
 
 FPS = Parameter("camera.fps", ParameterType.INT, 15, "1/s", 1, 30, 15)
@@ -85,7 +86,8 @@ def test_a_parameter_is_written_told_and_in_force(bench: Bench) -> None:
     assert isinstance(reply, ParameterValue)
     assert reply.parameter.value == 1.0
     (event,) = witness.told(EventKind.PARAMETER_CHANGED)
-    assert (event.app, event.data) == ("pilot", {"name": "limits.speed", "value": 1.0})
+    written = {"name": "limits.speed", "value": 1.0, "app_id": pilot.app_id}
+    assert (event.app, event.data) == ("pilot", written)
     assert witness.ask(GetParameter("limits.speed")) == reply
     pilot.command(Velocity(5.0))
     assert bench.driver.told == [Velocity(1.0)]
@@ -211,3 +213,93 @@ def test_a_driver_parameter_too_large_to_send_is_told() -> None:
         assert "a.huge" not in [parameter.name for parameter in page.parameters]
         bench.run(1.0)  # it was told when the proxy started: this is the sum
         assert "a.huge" in app.told(EventKind.DRIVER_ERROR)[-1].text
+
+
+def test_a_repeated_request_joins_the_one_that_is_being_answered() -> None:
+    """One write of a parameter that takes the vehicle a second is written once, and the next read gets its answer."""
+    with Bench(parameters=[FPS]) as bench:
+        app, begun, go_on = bench.pilot(), threading.Event(), threading.Event()
+        written: list[int] = []
+
+        def slowly() -> None:
+            written.append(1)
+            begun.set()
+            go_on.wait(WAIT_S)
+
+        bench.driver.while_setting = slowly
+        write = SetParameter("camera.fps", 20, app.lease)
+        number = app.post(write)
+        assert begun.wait(WAIT_S)
+        for _ in range(MAX_PENDING + 4):
+            app.repeat(number, write)
+        app.sync()  # all of them have arrived
+        go_on.set()
+        assert isinstance(app.answer(number), ParameterValue)
+        assert isinstance(app.ask(GetParameter("camera.fps")), ParameterValue)
+        assert len(written) == 1
+
+
+def test_a_repeated_write_is_answered_and_not_written_again() -> None:
+    """The reply to a write was lost: its repeat gets the same reply."""
+    with Bench(parameters=[FPS]) as bench:
+        app = bench.pilot()
+        written: list[int] = []
+        bench.driver.while_setting = lambda: written.append(1)
+        write = SetParameter("camera.fps", 20, app.lease)
+        number = app.post(write)
+        first = app.answer(number)
+        app.repeat(number, write)
+        assert app.answer(number) == first
+        assert len(written) == 1
+
+
+def test_a_repeated_request_does_not_undo_a_release(bench: Bench) -> None:
+    """The reply to a grant was lost: the library's repeat of the request must not take the authority back."""
+    app = bench.join("app")
+    request = RequestAuthority(16)
+    number = app.post(request)
+    granted = app.answer(number)
+    assert app.ask(ReleaseAuthority()) == Done()
+    app.repeat(number, request)
+    assert app.answer(number) == granted  # which is not granted again
+    assert bench.proxy.handler.authority.holder is None
+
+
+def test_a_request_that_arrives_after_its_release_is_refused(bench: Bench) -> None:
+    """The request itself was lost at first, and only its repeat arrives, after the release."""
+    app = bench.join("app")
+    late = app.reserve()
+    assert app.ask(ReleaseAuthority()) == Done()
+    app.repeat(late, RequestAuthority(16))
+    reply = app.answer(late)
+    assert isinstance(reply, Refused)
+    assert reply.code is Refusal.NOT_FRESH
+    assert bench.proxy.handler.authority.holder is None
+
+
+def test_kept_answers_are_bounded_and_a_forgotten_request_is_not_carried_out_again() -> None:
+    with Bench(parameters=[FPS]) as bench:
+        app = bench.pilot()
+        written: list[int] = []
+        bench.driver.while_setting = lambda: written.append(1)
+        write = SetParameter("camera.fps", 20, app.lease)
+        first = app.post(write)
+        app.answer(first)
+        for _ in range(MAX_KEPT + 1):
+            app.ask(write)
+        app.repeat(first, write)
+        app.sync()
+        assert len(written) == MAX_KEPT + 2
+
+
+def test_a_repeated_read_is_answered_with_what_is_true_now(bench: Bench) -> None:
+    app = bench.pilot()
+    read = GetParameter("limits.tilt")
+    number = app.post(read)
+    before = app.answer(number)
+    app.ask(SetParameter("limits.tilt", 0.2, app.lease))
+    app.repeat(number, read)
+    after = app.answer(number)
+    assert isinstance(before, ParameterValue)
+    assert isinstance(after, ParameterValue)
+    assert (before.parameter.value, after.parameter.value) == (0.35, 0.2)

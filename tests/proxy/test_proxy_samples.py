@@ -294,8 +294,8 @@ def test_a_name_must_fit() -> None:
 def test_a_proxy_is_started_once_and_stops_twice(bench: Bench) -> None:
     with pytest.raises(UsageError, match="started before"):
         bench.proxy.start()
-    bench.proxy.stop()
-    bench.proxy.stop()
+    bench.proxy.end()
+    bench.proxy.end()
 
 
 def test_a_driver_that_cannot_be_opened_leaves_nothing_behind() -> None:
@@ -313,7 +313,7 @@ def test_a_server_end_that_cannot_be_started_opens_no_driver() -> None:
         second = Proxy(FakeDriver(first.clock), first.server, name="bench", clock=first.clock, ticker=False)
         with pytest.raises(UsageError):
             second.start()
-        second.stop()
+        second.end()
         assert isinstance(second.driver, FakeDriver)
         assert second.driver.sink is None
 

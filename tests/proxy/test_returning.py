@@ -27,6 +27,7 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
+from skyloop.proxy.core.airspace import Airspace, AirspaceSettings
 from skyloop.proxy.core.limits import Limits
 from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, ReturnSettings, StartPoint
 from skyloop.zones import Box, Cylinder, Space
@@ -51,6 +52,10 @@ def flight(
     settings: ReturnSettings = SETTINGS,
 ) -> ReturnFlight:
     return ReturnFlight(action or ReturnToStart(), start, settings)
+
+
+def within(limits: Limits, space: Space) -> Airspace:
+    return Airspace(AirspaceSettings(limits, space))
 
 
 def place(decision: ReturnDecision) -> tuple[float, float, float]:
@@ -125,34 +130,66 @@ def test_an_old_position_is_none() -> None:
 
 def test_it_climbs_flies_over_its_start_and_lands() -> None:
     back = flight()
-    assert place(back.step(LIMITS, ANYWHERE, at(5.0, 0.0, 1.0), NOW)) == (5.0, 0.0, 2.1)
+    assert place(back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.0), NOW)) == (5.0, 0.0, 2.1)
     assert str(back.phase) == "climbing"
-    assert place(back.step(LIMITS, ANYWHERE, at(5.1, 0.0, 1.5), NOW)) == (5.0, 0.0, 2.1)
-    assert place(back.step(LIMITS, ANYWHERE, at(5.0, 0.0, 1.9), NOW)) == (0.0, 0.0, 2.1)
+    assert place(back.step(within(LIMITS, ANYWHERE), at(5.1, 0.0, 1.5), NOW)) == (5.0, 0.0, 2.1)
+    assert place(back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.9), NOW)) == (0.0, 0.0, 2.1)
     assert str(back.phase) == "flying"
     fast = at(0.1, 0.0, 2.1, velocity_m_s=(0.8, 0.0, 0.0))
-    assert place(back.step(LIMITS, ANYWHERE, fast, NOW)) == (0.0, 0.0, 2.1), "it is not at rest yet"
-    assert back.step(LIMITS, ANYWHERE, at(0.1, 0.0, 2.1), NOW).action == Land()
+    assert place(back.step(within(LIMITS, ANYWHERE), fast, NOW)) == (0.0, 0.0, 2.1), "it is not at rest yet"
+    assert back.step(within(LIMITS, ANYWHERE), at(0.1, 0.0, 2.1), NOW).action == Land()
     assert str(back.phase) == "landing"
-    assert back.step(LIMITS, ANYWHERE, None, NOW + 60 * S).action == Land(), "whatever happens to its position"
+    assert back.step(within(LIMITS, ANYWHERE), None, NOW + 60 * S).action == Land(), "whatever happens to its position"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{100: 8.0}, dict.fromkeys(range(100, 103), 7.0), {0: 8.0}, dict.fromkeys(range(100, 150), 7.0)],
+    ids=["one sample", "a narrow hole", "the first sample", "a second long"],
+)
+def test_wrong_heights_do_not_lower_the_way_for_good(wrong: dict[int, float]) -> None:
+    """One reading of 8 m lowered the way back for good: it slanted down to 4 cm, half a metre before the start."""
+    back, airspace = flight(settings=ReturnSettings(height=3.0)), within(LIMITS, ANYWHERE)
+    x, z, lowest, overhead = 8.0, 4.0, 4.0, 0.0
+    for step in range(-10, 2000):
+        now_ns = NOW + step * S // 50
+        seen = at(x, 0.0, z, now_ns, altitude_m=wrong.get(step, z))
+        airspace.observe(seen)  # as at each tick
+        if step < 0:
+            continue
+        decision = back.step(airspace, seen, now_ns)
+        if decision.action == Land():
+            break
+        to = place(decision)
+        away = max(1e-9, ((to[0] - x) ** 2 + (to[2] - z) ** 2) ** 0.5)
+        share = min(1.0, 0.02 / away)
+        x, z = x + share * (to[0] - x), z + share * (to[2] - z)
+        lowest, overhead = min(lowest, z), z
+    assert decision.action == Land()
+    assert abs(x) < 0.4
+    assert overhead > 3.5
+    assert lowest > (2.9 if len(wrong) > 10 else 3.9)
 
 
 def test_it_stays_above_its_start_if_it_is_to() -> None:
     back = flight(ReturnToStart(land=False))
-    back.step(LIMITS, ANYWHERE, at(5.0, 0.0, 3.0), NOW)
+    back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 3.0), NOW)
     assert str(back.phase) == "flying", "it is high enough, and never comes down on the way"
-    assert place(back.step(LIMITS, ANYWHERE, at(0.0, 0.0, 3.0), NOW)) == (0.0, 0.0, 3.0)
+    assert place(back.step(within(LIMITS, ANYWHERE), at(0.0, 0.0, 3.0), NOW)) == (0.0, 0.0, 3.0)
     assert str(back.phase) == "arrived"
-    assert place(back.step(LIMITS, ANYWHERE, at(2.0, 0.0, 3.0, NOW + 60 * S), NOW + 60 * S)) == (0.0, 0.0, 3.0)
+    assert place(back.step(within(LIMITS, ANYWHERE), at(2.0, 0.0, 3.0, NOW + 60 * S), NOW + 60 * S)) == (0.0, 0.0, 3.0)
 
 
 def test_the_command_goes_before_the_settings() -> None:
     settings = ReturnSettings(height=1.0, speed=0.5, land=False)
-    decided = flight(settings=settings).step(LIMITS, ANYWHERE, at(5.0, 0.0, 0.5), NOW)
+    decided = flight(settings=settings).step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 0.5), NOW)
     assert place(decided) == (5.0, 0.0, 1.1)
     assert isinstance(decided.action, Position)
     assert decided.action.speed == 0.5
-    assert place(flight(ReturnToStart(3.0), settings=settings).step(LIMITS, ANYWHERE, at(5.0, 0.0, 0.5), NOW))[2] == 3.1
+    assert (
+        place(flight(ReturnToStart(3.0), settings=settings).step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 0.5), NOW))[2]
+        == 3.1
+    )
 
 
 @pytest.mark.parametrize(
@@ -167,7 +204,7 @@ def test_the_command_goes_before_the_settings() -> None:
     ids=["room", "box", "limit", "comes down to the limit", "near its start"],
 )
 def test_the_height_is_kept_where_it_may_fly(space: Space, limits: Limits, feedback: Feedback, top: float) -> None:
-    assert place(flight().step(limits, space, feedback, NOW))[2] == pytest.approx(top)
+    assert place(flight().step(within(limits, space), feedback, NOW))[2] == pytest.approx(top)
 
 
 @pytest.mark.parametrize(
@@ -188,39 +225,39 @@ def test_what_is_against_it(
     start: tuple[float, float, float] | None, space: Space, feedback: Feedback | None, reason: Refusal, words: str
 ) -> None:
     back = flight(start=start)
-    decided = back.step(LIMITS, space, feedback, NOW)
+    decided = back.step(within(LIMITS, space), feedback, NOW)
     assert (decided.action, decided.refusal) == (None, reason)
     assert words in decided.why
     assert str(back.phase) == "none"
 
 
 def test_a_height_that_makes_no_sense_is_refused() -> None:
-    decided = flight(ReturnToStart(-1.0)).step(LIMITS, ANYWHERE, at(5, 0, 1), NOW)
+    decided = flight(ReturnToStart(-1.0)).step(within(LIMITS, ANYWHERE), at(5, 0, 1), NOW)
     assert (decided.refusal, "height is -1 m" in decided.why) == (Refusal.OUT_OF_RANGE, True)
 
 
 def test_from_outside_of_the_box_it_flies_straight_back_inside() -> None:
     space = Space(box=Box((-4, -4, 0), (4, 4, 9)))
-    assert place(flight().step(LIMITS, space, at(5.0, 0.0, 1.0), NOW)) == (0.0, 0.0, 2.1)
+    assert place(flight().step(within(LIMITS, space), at(5.0, 0.0, 1.0), NOW)) == (0.0, 0.0, 2.1)
 
 
 def test_a_zone_that_is_set_on_the_way_stops_it() -> None:
     back = flight()
-    back.step(LIMITS, ANYWHERE, at(5.0, 0.0, 1.0), NOW)
+    back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.0), NOW)
     zones = Space(zones=(Cylinder(2, 0, 0.5, 0, 5),))
-    assert "a no-fly zone is in the straight way" in back.step(LIMITS, zones, at(5.0, 0.0, 2.1), NOW).why
-    assert back.step(LIMITS, zones, at(5.0, 0.0, 2.1), NOW).action is None, "repeats don't change that"
-    assert back.step(LIMITS, ANYWHERE, at(5.0, 0.0, 2.1), NOW).action is not None
+    assert "a no-fly zone is in the straight way" in back.step(within(LIMITS, zones), at(5.0, 0.0, 2.1), NOW).why
+    assert back.step(within(LIMITS, zones), at(5.0, 0.0, 2.1), NOW).action is None, "repeats don't change that"
+    assert back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 2.1), NOW).action is not None
 
 
 def test_it_stops_without_a_young_position_and_goes_on_with_one() -> None:
     back = flight()
-    back.step(LIMITS, ANYWHERE, at(5.0, 0.0, 1.0), NOW)
+    back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.0), NOW)
     later = NOW + 60 * S
-    assert back.step(LIMITS, ANYWHERE, at(5.0, 0.0, 1.0, later - S), later) == ReturnDecision()
-    decided = back.step(LIMITS, ANYWHERE, at(5.0, 0.0, 1.0, later - 3 * S), later)
+    assert back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.0, later - S), later) == ReturnDecision()
+    decided = back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.0, later - 3 * S), later)
     assert (decided.refusal, decided.lasting) == (Refusal.WRONG_STATE, False)
-    assert place(back.step(LIMITS, ANYWHERE, at(5.0, 0.0, 1.0, later), later)) == (5.0, 0.0, 2.1)
+    assert place(back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.0, later), later)) == (5.0, 0.0, 2.1)
 
 
 def stuck(back: ReturnFlight, x: float, seconds: float) -> ReturnDecision:
@@ -228,7 +265,7 @@ def stuck(back: ReturnFlight, x: float, seconds: float) -> ReturnDecision:
     decided = ReturnDecision()
     for tick in range(round(seconds * 10)):
         now_ns = NOW + tick * S // 10
-        decided = back.step(LIMITS, ANYWHERE, at(x, 0.0, 3.0, now_ns), now_ns)
+        decided = back.step(within(LIMITS, ANYWHERE), at(x, 0.0, 3.0, now_ns), now_ns)
         if not isinstance(decided.action, Position):
             break
     return decided
@@ -267,8 +304,7 @@ def away(bench: Bench, x: float = 5.0) -> App:
     pilot.command(Takeoff())
     bench.tick()
     assert pilot.last_feedback().start_position_m is None or pilot.last_feedback().start_position_m == (0.0, 0.0, 0.0)
-    bench.driver.report(state=FlightState.HOVERING, position_m=(x, 0.0, 1.0), altitude_m=1.0)
-    bench.tick()
+    bench.move((x, 0.0, 1.0), state=FlightState.HOVERING, altitude_m=1.0)
     bench.driver.told.clear()
     return pilot
 
@@ -276,7 +312,7 @@ def away(bench: Bench, x: float = 5.0) -> App:
 def fly_back(bench: Bench, each: Callable[[], object]) -> None:
     """Put the vehicle where the return wants it, until it lands."""
     for position in ((5.0, 0.0, 2.0), (2.0, 0.0, 2.0), (0.0, 0.0, 2.0)):
-        bench.driver.report(position_m=position, altitude_m=position[2])
+        bench.move(position, altitude_m=position[2])
         bench.run(0.04, each)
 
 

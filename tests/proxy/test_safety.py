@@ -11,14 +11,36 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.errors import ParameterError
-from skyloop.messages import AnyAction, Attitude, EventKind, Feedback, Hover, Refused, SetParameter, Value, Velocity
-from skyloop.proxy.core.safety import MARGIN_M, Safety, check_written, safety_of
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EventKind,
+    Feedback,
+    Hover,
+    Position,
+    Refusal,
+    Refused,
+    SetParameter,
+    Severity,
+    Takeoff,
+    Value,
+    Velocity,
+)
+from skyloop.proxy.core.airspace import MARGIN_M, Airspace, AirspaceSettings, Verdict
+from skyloop.proxy.core.limits import Limits
 from skyloop.stepping.rehearsal import Radio, rehearse
-from skyloop.zones import BOX, ROOM, ZONES, Box, Cylinder, parse_zones, space_of
-from tests.proxy.fake import Bench
+from skyloop.zones import BOX, ROOM, ZONES, Box, Cylinder, Space, Zone, check_written, parse_zones, space_of
+from tests.proxy.fake import ALL, Bench
 
-BOXED = Safety(Box((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0)), deceleration=1.0, reaction_s=0.3)
-PILLAR = Safety(None, (Cylinder(2.0, 0.0, 0.5, 0.0, 2.0),))
+BOX_M = Box((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0))
+
+
+def walled(box: Box | None, *zones: Zone) -> Airspace:
+    return Airspace(AirspaceSettings(space=Space(None, box, zones), deceleration=1.0, reaction_s=0.3))
+
+
+BOXED = walled(BOX_M)
+PILLAR = walled(None, Cylinder(2.0, 0.0, 0.5, 0.0, 2.0))
 NOW = 10 * NS_PER_S
 
 
@@ -27,17 +49,17 @@ def at(x: float, y: float, z: float = 1.0, yaw: float = 0.0, **known: Any) -> Fe
     return Feedback(**fields)
 
 
-def clamp(safety: Safety, action: AnyAction, feedback: Feedback) -> tuple[Any, list[str]]:
-    allowed, clamps, known = safety.clamp(action, feedback, NOW)
+def clamp(safety: Airspace, action: AnyAction, feedback: Feedback) -> tuple[Any, list[str]]:
+    allowed, clamps, known = safety.between_walls(action, feedback, NOW)
     assert known
     return allowed, [one.limit for one in clamps]
 
 
 def test_far_from_all_walls_nothing_changes() -> None:
     action = Velocity(0.5, 0.5, 0.2, 1.0)
-    assert BOXED.clamp(action, at(0, 0, 1.5), NOW) == (action, (), True)
-    assert BOXED.clamp(action, at(0, 0, 1.5), NOW)[0] is action
-    assert BOXED.clamp(Hover(), at(5, 0), NOW)[0] == Hover()
+    assert BOXED.between_walls(action, at(0, 0, 1.5), NOW) == (action, (), True)
+    assert BOXED.between_walls(action, at(0, 0, 1.5), NOW)[0] is action
+    assert BOXED.between_walls(Hover(), at(5, 0), NOW)[0] == Hover()
 
 
 def test_the_speed_allowed_is_the_one_that_can_be_stopped() -> None:
@@ -97,7 +119,7 @@ def test_safety_are_gone_round() -> None:
     above = at(2.0, 0.0, 2.3)
     assert clamp(PILLAR, Velocity(up=-1.0), above)[0].up == pytest.approx(-PILLAR.allowed_speed(0.3, 0.3))
     assert clamp(PILLAR, Velocity(1.0), above)[1] == []
-    table = Safety(None, (Box((1.0, -1.0, 0.0), (2.0, 1.0, 0.8)),))
+    table = walled(None, Box((1.0, -1.0, 0.0), (2.0, 1.0, 0.8)))
     assert clamp(table, Velocity(2.0), at(0.7, 0.0, 0.5))[0].forward == pytest.approx(table.allowed_speed(0.3, 0.3))
     assert clamp(table, Velocity(1.0), at(1.2, 0.0, 0.5))[0].forward == pytest.approx(-0.2), "inside"
     assert clamp(table, Velocity(left=1.0), at(1.2, 0.0, 0.5))[0] == Velocity()
@@ -128,7 +150,7 @@ def test_a_tilt_is_turned_into_one_that_brakes() -> None:
     ],
 )
 def test_without_a_position_nothing_is_enforced(feedback: Feedback | None) -> None:
-    assert BOXED.clamp(Velocity(2.0), feedback, NOW) == (Velocity(2.0), (), False)
+    assert BOXED.between_walls(Velocity(2.0), feedback, NOW) == (Velocity(2.0), (), False)
 
 
 @given(
@@ -139,7 +161,7 @@ def test_without_a_position_nothing_is_enforced(feedback: Feedback | None) -> No
 def test_an_obedient_vehicle_never_leaves_the_box_nor_enters_the_zone(
     start: tuple[float, float, float], yaw: float, asked: list[tuple[float, float, float]]
 ) -> None:
-    safety = Safety(BOXED.box, (Cylinder(1.4, 0.0, 0.5, 0.0, 3.0), Box((-3.0, -3.0, 0.0), (-2.5, 3.0, 3.0))))
+    safety = walled(BOX_M, Cylinder(1.4, 0.0, 0.5, 0.0, 3.0), Box((-3.0, -3.0, 0.0), (-2.5, 3.0, 3.0)))
     x, y, z = start
     for forward, left, up in asked:
         for _ in range(15):
@@ -152,6 +174,128 @@ def test_an_obedient_vehicle_never_leaves_the_box_nor_enters_the_zone(
             assert -2.001 <= y <= 2.001
             assert -0.001 <= z <= 3.001
             assert math.hypot(x - 1.4, y) > 0.499
+
+
+def against_the_net(
+    by_attitude: bool, position_hz: int, gust: float, thick: float = 0.05, seconds: float = 30.0
+) -> float:
+    """How far east a vehicle with lag comes that pushes at a net at x = 2 m; positions are the same in between."""
+    safety, x, v, far, dt = walled(None, Box((2.0, -5.0, 0.0), (2.0 + thick, 5.0, 3.0))), 0.0, 0.0, 0.0, 0.02
+    for step in range(round(seconds / dt)):
+        if step % (50 // position_hz) == 0:
+            reported = x, v
+        now_ns = NOW + round(step * dt * NS_PER_S)
+        seen = at(reported[0], 0.0, captured_ns=now_ns, velocity_m_s=(reported[1], 0.0, 0.0))
+        asked = Attitude(pitch=0.2) if by_attitude else Velocity(2.0)
+        allowed = safety.judge(asked, seen, now_ns).action
+        if isinstance(allowed, Attitude):
+            pull = 9.80665 * math.tan(allowed.pitch) - 0.3 * v
+        else:
+            assert isinstance(allowed, Velocity)
+            pull = (allowed.forward - v) / 0.3
+        v += (pull + (gust if 10.0 <= step * dt < 10.6 else 0.0)) * dt
+        x += v * dt
+        far = max(far, x)
+    return far
+
+
+@pytest.mark.parametrize("gust", [0.0, 1.5])
+@pytest.mark.parametrize("position_hz", [50, 5, 2, 1])
+@pytest.mark.parametrize("by_attitude", [False, True], ids=["velocity", "attitude"])
+def test_nothing_comes_through_a_thin_zone(by_attitude: bool, position_hz: int, gust: float) -> None:
+    """Behind its middle, a net was left on the far side: 5 cm by velocity and 20 cm by attitude were flown through."""
+    assert against_the_net(by_attitude, position_hz, gust) < 2.0 + (0.3 if gust else 0.0)
+
+
+def test_a_vehicle_in_a_zone_is_led_back_to_the_side_that_it_came_from() -> None:
+    """A gust brings it beyond the middle of a zone: it must not leave on the far side."""
+    zone = walled(None, Box((1.0, -5.0, 0.0), (2.0, 5.0, 3.0)))
+    clamp(zone, Velocity(1.0), at(0.9, 0.0))
+    assert clamp(zone, Velocity(1.0), at(1.8, 0.0))[0] == Velocity(-0.5)
+    assert clamp(zone, Velocity(-1.0), at(1.8, 0.0))[0] == Velocity(-1.0)
+    zone.observe(at(1.8, 0.0, captured_ns=NOW + 5 * NS_PER_S))  # not seen for long: it may have been carried
+    assert clamp(zone, Velocity(1.0), at(1.8, 0.0))[0] == Velocity(1.0)
+
+
+def test_a_position_that_does_not_change_while_it_flies_is_as_old_as_it_is() -> None:
+    """Positions of up to a second counted as new, as the rest of the sample was: at 2 m/s, 2 m were flown blind."""
+
+    def seen(late_s: float, moves: float) -> Feedback:
+        return at(0.0, 0.0, captured_ns=NOW + round(late_s * NS_PER_S), velocity_m_s=(moves, 0.0, 0.0))
+
+    for moves, late_s, expected in ((1.0, 0.0, 0.3), (1.0, 0.8, 1.1), (0.0, 0.8, 0.3)):  # it rests in the last
+        boxed = walled(BOX_M)
+        boxed.observe(seen(0.0, moves))
+        new = seen(late_s, moves)
+        allowed, _, known = boxed.between_walls(Velocity(2.0), new, new.captured_ns)
+        assert known
+        assert isinstance(allowed, Velocity)
+        most = boxed.allowed_speed(2.0 - moves * late_s, expected)
+        assert allowed.forward == pytest.approx(most - 0.5 * max(0.0, moves - most)), "where it may be by now"
+    boxed = walled(BOX_M)
+    boxed.observe(seen(0.0, 1.0))
+    old = seen(2.2, 1.0)
+    braked, _, known = boxed.between_walls(Velocity(2.0), old, old.captured_ns)
+    assert known
+    assert isinstance(braked, Velocity)
+    assert braked.forward < 0.0, "it may be outside by now"
+    assert boxed.judge(Position(1.0, 0.0, 1.0), old, old.captured_ns, new=True) == Verdict(), (
+        "it stops until it is known"
+    )
+
+
+def test_a_hover_above_a_lowered_ceiling_comes_down() -> None:
+    airspace, altitude, steps = Airspace(), 7.4, 0
+    assert airspace.judge(Hover(), None, NOW).action == Hover()
+    assert airspace.judge(Hover(), at(0, 0, 5.2, altitude_m=5.2), NOW) == Verdict(Hover())
+    while isinstance(sink := airspace.judge(Hover(), at(0, 0, altitude, altitude_m=altitude), NOW).action, Velocity):
+        assert -1.0 <= sink.up <= -0.2
+        altitude += sink.up / 32
+        steps += 1
+    assert altitude == pytest.approx(5.15, abs=0.05)
+    assert steps < 32 * 6
+
+
+def test_a_hover_above_a_lowered_ceiling_does_not_sink_into_a_zone() -> None:
+    """It sank 0.96 m deep into a zone that was below it, and nobody was told."""
+    people = Box((-1.5, -1.5, 0.0), (1.5, 1.5, 1.8))
+    airspace = Airspace(AirspaceSettings(Limits(altitude=1.0), Space(zones=(people,))))
+    z, told, last = 2.4, set[str](), Verdict()
+    for _ in range(32 * 10):
+        last = airspace.judge(Hover(), at(0.0, 0.0, z, altitude_m=z), NOW)
+        told |= {clamp.limit for clamp in last.clamps}
+        z += last.action.up / 32 if isinstance(last.action, Velocity) else 0.0
+    assert 1.8 < z < 2.0
+    assert told == {"limits.altitude", ZONES}
+    assert last.action == Hover(), "it stays above it"
+
+
+def test_a_ceiling_is_not_lowered_into_a_zone_below_the_vehicle(bench: Bench) -> None:
+    """A vehicle with a ceiling of its own sank to it by itself, 0.96 m deep into a zone, whatever was commanded."""
+    pilot = bench.airborne()
+    pilot.ask(SetParameter(ZONES, "people: box -1.5 -1.5 0 1.5 1.5 1.8", pilot.lease))
+    bench.driver.report(position_m=(0.0, 0.0, 2.4), yaw_rad=0.0, altitude_m=2.4)
+    refused = pilot.ask(SetParameter("limits.altitude", 1.0, pilot.lease))
+    assert isinstance(refused, Refused)
+    assert "limits.altitude can't be 1 m now: the vehicle would have to sink to 1 m, and" in refused.message
+    assert "people: box" in refused.message
+    assert bench.proxy.handler.checks.airspace.settings.limits.altitude == 5.0
+    for altitude, place in ((2.0, (0.0, 0.0, 2.4)), (1.0, (0.0, 3.0, 2.4))):
+        bench.driver.report(position_m=place)
+        pilot.ask(SetParameter("limits.altitude", altitude, pilot.lease))
+        assert bench.proxy.handler.checks.airspace.settings.limits.altitude == altitude
+
+
+def test_no_take_off_in_a_zone_or_into_one() -> None:
+    over, around = Box((-1.0, -1.0, 0.5), (1.0, 1.0, 2.0)), Box((3.0, -1.0, -1.0), (5.0, 1.0, 2.0))
+    airspace = walled(None, over, around)
+    for place in (at(0.0, 0.0, 0.0), at(4.0, 0.0, 0.0)):
+        verdict = airspace.judge(Takeoff(), place, NOW, new=True)
+        assert (verdict.action, verdict.refusal) == (None, Refusal.OUT_OF_RANGE)
+        assert "no-fly zone" in verdict.why
+    assert airspace.judge(Takeoff(), at(2.0, 0.0, 0.0), NOW, new=True).action == Takeoff()
+    assert airspace.judge(Takeoff(), at(4.0, 0.0, 1.95), NOW, new=True).action == Takeoff(), "it stands on it"
+    assert airspace.judge(Takeoff(), None, NOW, new=True).action == Takeoff(), "a vehicle may not know its position"
 
 
 def test_safety_as_they_are_written() -> None:
@@ -199,19 +343,17 @@ def test_nothing_is_looked_at_unless_it_is_asked_for() -> None:
     values: dict[str, float] = {
         f"{BOX}.{axis}_{end}": far for axis in "xyz" for end, far in (("low", -1e4), ("high", 1e4))
     }
-    values |= {"safety.deceleration": 2.0, "safety.reaction_s": 0.1}
 
-    def safety(zones: str = "", room: str = "", **walls: float) -> Safety | None:
+    def space(zones: str = "", room: str = "", **walls: float) -> Space:
         number = (values | {f"{BOX}.{wall}": at for wall, at in walls.items()}).__getitem__
-        return safety_of(number, space_of(number, {ZONES: zones, ROOM: room}.__getitem__))
+        return space_of(number, {ZONES: zones, ROOM: room}.__getitem__)
 
-    assert safety() is None
-    assert safety(room="box -1 -1 0 1 1 2") is None, "a room refuses places and shortens nothing"
-    only = safety("cylinder 0 0 1 0 1")
-    assert only == Safety(None, (Cylinder(0.0, 0.0, 1.0, 0.0, 1.0),), 2.0, 0.1)
-    boxed = safety(z_low=0.3)
-    assert boxed is not None
-    assert boxed.box == Box((-1e4, -1e4, 0.3), (1e4, 1e4, 1e4))
+    assert not space().walled
+    assert not space(room="box -1 -1 0 1 1 2").walled, "a room refuses places and shortens nothing"
+    only = space("cylinder 0 0 1 0 1")
+    assert only.walled
+    assert only == Space(None, None, (Cylinder(0.0, 0.0, 1.0, 0.0, 1.0),))
+    assert space(z_low=0.3).box == Box((-1e4, -1e4, 0.3), (1e4, 1e4, 1e4))
 
 
 @pytest.mark.parametrize(
@@ -258,6 +400,80 @@ def test_the_proxy_enforces_what_is_written_and_tells(bench: Bench) -> None:
     write(f"{BOX}.x_high", 10_000.0)
     pilot.command(Velocity(1.5))
     assert bench.driver.told[-1] == Velocity(1.5)
+
+
+def test_thin_zones_are_kept_clear_of_as_if_they_were_thicker_and_that_is_told(bench: Bench) -> None:
+    pilot = bench.airborne()
+    thin = Space(zones=parse_zones("net: box 1 -5 0 1.05 5 3; mast: cylinder 3 3 0.02 0 0.1; box 5 5 0 6 6 3"))
+    net, mast, thick = thin.barriers
+    assert net == Box((0.775, -5.0, 0.0), (1.275, 5.0, 3.0), "net")
+    assert isinstance(mast, Cylinder)
+    assert (mast.radius, mast.low, mast.high) == pytest.approx((0.25, -0.2, 0.3))
+    assert thick is thin.zones[2]
+    assert [str(zone) for zone in thin.thin] == ["net: box 1 -5 0 1.05 5 3", "mast: cylinder 3 3 0.02 0 0.1"]
+    assert "kept clear of as if it were 0.5 m thick" in thin.problem_at((0.8, 0.0, 1.0))
+    pilot.ask(SetParameter(ZONES, "net: box 1 -5 0 1.05 5 3", pilot.lease))
+    pilot.ask(SetParameter("limits.speed", 1.0, pilot.lease))
+    (event,) = pilot.told(EventKind.VEHICLE_MESSAGE)
+    assert event.severity is Severity.WARNING
+    assert event.data["reason"] == "thin_zones"
+    assert "net: box 1 -5 0 1.05 5 3" in event.text
+
+
+def test_a_refused_take_off_leaves_the_vehicle_where_it_stands(bench: Bench) -> None:
+    pilot = bench.pilot()
+    pilot.ask(SetParameter(ZONES, "box -1 -1 0.5 1 1 2", pilot.lease))
+    bench.driver.report(position_m=(0.0, 0.0, 0.0), yaw_rad=0.0, altitude_m=0.0)
+    pilot.command(Takeoff())
+    assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
+    assert bench.driver.told == []
+
+
+def test_each_step_of_the_software_autopilot_is_judged_and_what_stops_it_is_told() -> None:
+    """A wall that stopped a ``go_to`` was told to nobody, and a take-off went through the upper wall of the box."""
+    with Bench(ALL - {"position", "takeoff", "hover", "land", "attitude"}) as bench:
+        pilot = bench.pilot()
+        pilot.ask(SetParameter(f"{BOX}.z_high", 0.7, pilot.lease))
+        bench.driver.report(position_m=(0.0, 0.0, 0.6), yaw_rad=0.0, altitude_m=0.6, velocity_m_s=(0.0, 0.0, 0.4))
+        pilot.command(Takeoff())
+        bench.tick()
+        rising = bench.driver.told[-1]
+        assert isinstance(rising, Velocity)
+        assert rising.up < 0.2
+        (event,) = pilot.told(EventKind.COMMAND_CLAMPED)
+        assert (event.data["limit"], event.app) == (BOX, "pilot")
+
+
+def test_walls_that_stop_a_vehicle_on_its_way_to_a_place_are_told() -> None:
+    with Bench(ALL - {"position"}) as bench:
+        pilot = bench.airborne()
+        pilot.ask(SetParameter(ZONES, "pillar: cylinder 2 0 0.5 0 3", pilot.lease))
+        bench.driver.report(position_m=(0.0, 2.0, 1.0), yaw_rad=0.0, altitude_m=1.0)
+        pilot.command(Position(4.0, 2.0, 1.0))
+        bench.tick()
+        assert pilot.told(EventKind.COMMAND_CLAMPED) == []
+        bench.move((1.4, 0.0, 1.0), velocity_m_s=(0.0, 0.0, 0.0))  # blown there by the wind
+        pilot.command(Position(4.0, 2.0, 1.0), repeat=True)
+        bench.tick()
+        events = pilot.told(EventKind.COMMAND_CLAMPED)
+        assert [event.data["limit"] for event in events] == [ZONES]
+        assert pilot.refusals() == []
+
+
+@pytest.mark.parametrize(
+    ("action", "farthest"), [(Velocity(2.0), 2.0), (Attitude(pitch=0.2), 2.15)], ids=["velocity", "attitude"]
+)
+def test_the_simulated_drone_does_not_come_through_a_net(action: Velocity | Attitude, farthest: float) -> None:
+    """A no-fly zone of 5 cm was flown through at default settings; 0.3 m of overshoot by attitude are documented."""
+    with rehearse("sim://?world=empty&cameras=none&wind=0.5", radio=Radio(seed=1)) as drone:
+        drone.config[ZONES] = "net: box 2 -50 0 2.05 50 50"
+        drone.takeoff()
+        seen: list[float] = []
+        drone.on_feedback(lambda f: seen.append(float((f.native or {})["truth.x"])))  # type: ignore[arg-type]
+        end_ns = drone.feedback().captured_ns + 10 * NS_PER_S
+        while drone.next_feedback().captured_ns < end_ns:
+            drone.command(action)
+        assert 1.5 < max(seen) < farthest
 
 
 @pytest.mark.parametrize(

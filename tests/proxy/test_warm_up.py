@@ -74,6 +74,6 @@ def test_a_tick_that_comes_back_after_the_end_keeps_nothing_warm(bench: Bench) -
     bench.airborne()
     bench.tick()
     assert asked[-1] > 0.0
-    bench.proxy.abandon("its driver hangs")
+    bench.proxy.end(reason="its driver hangs", hangs=True)
     bench.tick()
     assert asked[-1] == 0.0

@@ -336,6 +336,19 @@ def test_a_drone_that_is_closed_first(fly: Fly, tmp_path: Path) -> None:
     assert files.is_complete(path)
 
 
+def test_in_a_fork_a_recording_is_left_to_the_parent(fly: Fly, tmp_path: Path) -> None:
+    drone, path = fly(), tmp_path / "flight.mcap"
+    with skyloop.record(drone, path, min_free_mb=0) as recorder:
+        until_has(path, "/alpha/feedback")
+        engine = recorder._backend
+        assert isinstance(engine, Engine)
+        engine.forked()
+        recorder.close()
+        assert recorder.state.value == "recording", "its file was not closed"
+        engine._ended_ns = None  # the parent's
+    assert files.is_complete(path)
+
+
 def test_gaps_in_numbers() -> None:
     gaps = Gaps()
     for number in (5, 6, 9, 1, 2, 4):

@@ -65,7 +65,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeVehicle]:
     proxy.start()
     monkeypatch.setattr("skyloop.ros.bridge.dial_by_name", lambda name: server.dial)
     yield vehicle
-    proxy.stop()
+    proxy.end()
 
 
 @pytest.fixture
@@ -249,6 +249,37 @@ def test_velocities_do_not_end_a_landing(rig: Rig) -> None:
     pilot.close()  # and nothing ends the landing at the end
     topics.subscriptions["cmd_vel"](twist(x=0.5))
     assert sent == ["velocity"]
+
+
+def test_a_velocity_that_was_checked_before_a_landing_is_sent_before_it(rig: Rig) -> None:
+    """The thread of the topic lost the processor between the check and the sending: the landing must wait for it."""
+    from skyloop.ros.pilot import Pilot
+
+    order: list[str] = []
+    sending, go_on = threading.Event(), threading.Event()
+
+    def velocity(**_: float) -> None:
+        sending.set()
+        assert go_on.wait(WAIT_S)
+        order.append("velocity")
+
+    names = ("takeoff", "hover", "return_to_start", "emergency_stop", "release_authority")
+    drone: Any = SimpleNamespace(
+        land=lambda: order.append("land"), velocity=velocity, **dict.fromkeys(names, lambda: None)
+    )
+    topics: Any = Node("topics", "", [])
+    services: Any = Node("services", "", [])
+    Pilot(topics, services, drone, None, Frames("one"), priority=None, timeout_s=0.5)  # type: ignore[arg-type]
+    flying = threading.Thread(target=topics.subscriptions["cmd_vel"], args=(twist(x=0.5),))
+    flying.start()
+    assert sending.wait(WAIT_S)
+    landing = threading.Thread(target=services.call, args=("land",))
+    landing.start()
+    landing.join(0.05)
+    go_on.set()
+    flying.join()
+    landing.join()
+    assert order == ["velocity", "land"]
 
 
 def test_stamped_velocities_of_others_or_of_long_ago_are_ignored(rig: Rig) -> None:

@@ -52,6 +52,14 @@ def test_a_refusal_is_told_with_its_reason() -> None:
         join(session(refused), "alpha", RUN, layout.new_id())
 
 
+def test_an_answer_that_did_not_come_in_time_is_no_refusal() -> None:
+    """A router answers a question that has timed out with an error; the application must ask again."""
+    late = SimpleNamespace(err=SimpleNamespace(payload=Payload(b"Timeout")), ok=None)
+    with pytest.raises(NoAnswerError, match="found on the network but did not answer"):
+        join(session(late), "alpha", RUN, layout.new_id())
+    assert join(session(late, welcome(RUN)), "alpha", RUN, layout.new_id()) is not None
+
+
 def test_somebody_who_answers_in_its_place_is_named_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
     def accept(_request: JoinRequest, _welcome: packets.Welcome) -> None:
         raise LinkError("its proof is wrong")

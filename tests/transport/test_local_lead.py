@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 
 import pytest
@@ -179,3 +181,17 @@ def test_what_a_handler_of_a_signal_raises_reaches_who_waits_and_the_connection_
     pair.send(b"two")
     wait_until(lambda: pair.here.packets == [b"one", b"two"], "the receiving thread goes on")
     assert pair.here.closings == []
+
+
+def test_the_end_of_a_fork_leaves_the_connection_to_the_parent(pair: Pair) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads, from Python 3.12 on
+        child = os.fork()
+    if child == 0:
+        sent = pair.client.send(b"from a fork")
+        pair.client.close()
+        os._exit(int(sent))
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0, "the fork can send nothing"
+    pair.send(b"still there")
+    wait_until(lambda: pair.here.packets == [b"still there"], "the parent's connection goes on")
+    assert pair.there.left == []

@@ -93,7 +93,13 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
                 abandoned(result)  # type: ignore[arg-type]
 
     threading.Thread(target=work, name="skyloop-aio", daemon=True).start()
-    return await future
+    try:
+        return await future
+    except asyncio.CancelledError:
+        # Cancelled in the very round of the loop in which the result came: nobody else will ever see it.
+        if future.done() and not future.cancelled() and future.exception() is None and abandoned is not None:
+            threading.Thread(target=abandoned, args=(future.result(),), daemon=True).start()
+        raise
 
 
 class Opening(ABC, Generic[Opened]):

@@ -50,7 +50,7 @@ class Vehicle:
         self._vehicle.show(sent_ns, image)
 
     def close(self) -> None:
-        self._proxy.stop()
+        self._proxy.end()
 
 
 class Listening:

@@ -132,7 +132,7 @@ def _lead(
         raise UsageError(f"several workers need one proxy: skyloop proxy {drone} --name alpha, then --drone alpha")
     due = time.monotonic() + LINE_EVERY_S
     with Group(child_command(_arguments(settings, target, drone, seconds)), workers, _print) as group:
-        while (ended := group.look()) is None:
+        while (ended := group.code) is None:
             time.sleep(_LOOK_S)
             status = group.status
             if time.monotonic() >= due and status is not None:

@@ -237,7 +237,9 @@ class AuthorityTracker:
             return self._set(replace(self.status, position=position, expected_wait_s=expected))
         if event.kind is EventKind.AUTHORITY_DECLINED and ours:
             self.declined = event.text
-        if not ours or not self.held or _whole(data.get("lease")) < self.status.lease:
+        lease = _whole(data.get("lease"))
+        late = self.status.state == "preempted" and lease == self._lease  # feedback told of the next holder before
+        if not ours or not (late or (self.held and lease >= self.status.lease)):
             return False
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
             return self._lost(str(data.get("by", "")) or None)
@@ -258,6 +260,9 @@ class AuthorityTracker:
             )
         if self.held:
             newer = feedback.lease > self.status.lease
+            until_ns = self.status.until_ns
+            if newer and until_ns is not None and feedback.captured_ns >= until_ns:
+                return self.given_back()  # its time is over, and the event that says so was lost or is late
             nobody = not feedback.lease and now_ns - self._granted_ns > self.SETTLE_NS
             return (newer or nobody) and self._lost(feedback.owner if feedback.lease else None)
         if self.status.state in ("queued", "preempted"):

@@ -55,9 +55,10 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(20.0),
     Land: nanoseconds(60.0),
-    EmergencyStop: nanoseconds(2.0),
+    EmergencyStop: nanoseconds(8.0),  # the driver goes on for 10 s: a late repeat must not press it again
     ResetEmergency: nanoseconds(2.0),
 }
+_UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that could not be sent for so long is not sent later
 
 
 class Unsent(NamedTuple):
@@ -108,15 +109,22 @@ class CommandSchedule:
         self._sent_intent = 0
         self._due_ns = 0
         self._failsafe = Failsafe.NONE
+        self._reset_asked_ns: int | None = None  # while a stop was under way
 
     def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
         """Make ``action`` the set-point of the application; return the number of this intent.
+
+        Ask :meth:`may_ask` before.
 
         Args:
             action: The action.
             now_ns: On this process's clock.
             automatic: The application did not ask for it itself.
         """
+        resets = isinstance(action, ResetEmergency)
+        self._reset_asked_ns = now_ns if resets and self.stopping else None
+        if self._reset_asked_ns is not None:
+            return self.intent
         stops = type(action) is Hover and type(self.action) is not Hover
         self.action, self.over = action, None
         self.intent += 1
@@ -127,6 +135,26 @@ class CommandSchedule:
         else:
             self._due_ns = max(now_ns, self.open_ns)
         return self.intent
+
+    @property
+    def stopping(self) -> bool:
+        """Whether an emergency stop is under way, which nothing but another may replace; see :meth:`may_ask`."""
+        return isinstance(self.action, EmergencyStop)
+
+    def may_ask(self, action: AnyAction) -> bool:
+        """Return whether the application may command this now.
+
+        An emergency stop is repeated until the vehicle shows it, or for 8 s: nothing else of this application is sent
+        meanwhile, or one lost packet would end it while sticks are held. ``Idle`` withdraws one that was never sent. A
+        reset is sent once the stop has shown, if that is soon.
+        """
+        if not self.stopping or isinstance(action, EmergencyStop | ResetEmergency):
+            return True
+        return isinstance(action, Idle) and not self._is_sent
+
+    @property
+    def _is_sent(self) -> bool:
+        return self.intent == self._sent_intent
 
     @property
     def open_ns(self) -> int:
@@ -145,8 +173,8 @@ class CommandSchedule:
         if self._decays(now_ns):
             self.action, self.automatic = _HOVER, True
         elif self._expired(now_ns):
-            self.action = _IDLE
-        if self.intent != self._sent_intent:
+            self.action, self.owed = _IDLE, None
+        if not self._is_sent:
             self._sent_intent, self._new_sent_ns = self.intent, now_ns
             self._due_ns = now_ns + self._first_ns
             return self.action
@@ -159,8 +187,7 @@ class CommandSchedule:
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
         """Note that there was no room for what :meth:`next` returned: set-points follow anyway, a landing may not."""
-        stops = self.owed is not None and type(self.owed.action) is EmergencyStop
-        if not _is_periodic(action) and not stops:
+        if not _is_periodic(action):
             self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
@@ -168,7 +195,7 @@ class CommandSchedule:
         owed = self.owed
         if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > self._keep_ns:
             return None
-        return owed if _is_periodic(action) or type(owed.action) is EmergencyStop else None
+        return owed if _is_periodic(action) else None
 
     def decayed(self, before: AnyAction) -> bool:
         """Return whether the set-point ``before`` has decayed to hover because the application made no call."""
@@ -194,7 +221,9 @@ class CommandSchedule:
             and feedback.state in done_in
             and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
         ):
-            self.action = _IDLE
+            self.action, reset_ns = _IDLE, self._reset_asked_ns
+            if reset_ns is not None and now_ns - reset_ns <= _AT_MOST_NS[ResetEmergency]:
+                self.ask(ResetEmergency(), now_ns)
         if feedback.failsafe is not self._failsafe:
             self._failsafe = feedback.failsafe
             if feedback.failsafe is not Failsafe.NONE:
@@ -203,8 +232,7 @@ class CommandSchedule:
     def clear(self, fate: Fate) -> None:
         """Drop the set-point, which ``fate`` ended here. An emergency stop stays."""
         self._end(Outcome(0, self.intent, fate, Refusal.NOT_FRESH, ENDINGS[fate]))
-        if self.owed is not None and type(self.owed.action) is not EmergencyStop:
-            self.owed = None
+        self.owed = None
 
     def _end(self, outcome: Outcome) -> None:
         if self.over is None:
@@ -231,6 +259,8 @@ class CommandSchedule:
 
     def _expired(self, now_ns: int) -> bool:
         longest_ns = _AT_MOST_NS.get(type(self.action))
+        if self.stopping and not self._is_sent:
+            longest_ns = _UNSENT_STOP_NS
         return longest_ns is not None and now_ns - self._asked_ns > longest_ns
 
 

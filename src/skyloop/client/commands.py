@@ -19,6 +19,7 @@ from skyloop.messages import (
     AnswerTakeover,
     AnyAction,
     AnyReply,
+    Attitude,
     AuthorityGranted,
     AuthorityQueued,
     Command,
@@ -27,6 +28,8 @@ from skyloop.messages import (
     EventKind,
     Fate,
     Feedback,
+    Hover,
+    Idle,
     Land,
     Outcome,
     Position,
@@ -36,6 +39,7 @@ from skyloop.messages import (
     RequestAuthority,
     ReturnToStart,
     Role,
+    Velocity,
     encode,
 )
 from skyloop.messages.command import SET_POINTS
@@ -53,6 +57,8 @@ _LATER_NS: Final = 1_000_000_000
 LANDING: Final = (Land, EmergencyStop)
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 _REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: so ended, the next set-point is most likely refused, too
+#: What a program sends again and again: that one of them is not sent is no error.
+_STREAMED: Final = (Idle, Hover, Velocity, Attitude)
 
 
 class CommandSender:
@@ -140,6 +146,11 @@ class CommandSender:
         with self._lock:
             self.barred = True
 
+    @property
+    def stopping(self) -> bool:
+        """Whether an emergency stop is under way: it is repeated, and nothing else is sent."""
+        return self._schedule.stopping
+
     def flown_by_person(self) -> None:
         """Require a person's presence from now on; see :meth:`present_until`.
 
@@ -196,10 +207,11 @@ class CommandSender:
 
         Returns:
             The number of the intent; and False if it can't be sent now, because the link is down or the authority is
-            still awaited.
+            still awaited, or because an emergency stop of this application has not shown yet.
 
         Raises:
             ClosedError: After :meth:`bar`.
+            RefusedError: If such a stop keeps back what is to be done once, or what is to be sent ``now``.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
                 with ``now`` also while the authority is still awaited.
             LinkError: With ``now`` while the link is down.
@@ -221,6 +233,11 @@ class CommandSender:
                 raise self._not_ours(action)
             if stop and self._role is Role.OBSERVER:
                 raise self._not_ours(action)
+            if not self._schedule.may_ask(action):
+                if now or not isinstance(action, _STREAMED):
+                    text = f"{action.name} was not sent: the emergency stop of this application has not shown yet"
+                    raise RefusedError(text, code=Refusal.WRONG_STATE)
+                return self._schedule.intent, False
             intent = self._schedule.ask(action, now_ns, automatic=automatic)
             if not may_send or not self._connection.connected:
                 if now:
@@ -363,6 +380,7 @@ class CommandSender:
             When to call again at the latest [ns].
         """
         last_request, stalled, due_ns = None, False, now_ns + _LATER_NS
+        unshown = False
         with self._lock:
             authority, present = self._authority, self.is_present(now_ns)
             asks = self._ask_now or (authority.status.state == "none" and not authority.pending)
@@ -370,15 +388,20 @@ class CommandSender:
                 self._ask_now = False
                 last_request = authority.last_request
                 authority.asked(last_request)
-            if (authority.held and present) or isinstance(self._schedule.action, EmergencyStop):
+            stopping = self._schedule.stopping
+            if (authority.held and present) or stopping:
                 if self._schedule.due_ns <= now_ns:
                     stalled = self._decay(now_ns)
+                    unshown = stopping and not self._schedule.stopping
                 due_ns = self._schedule.due_ns
         if last_request is not None:
             self._connection.ask(last_request, self._answered, ANSWER_S)
         if stalled:
             text = "the application made no call for too long: its set-point decayed to hover"
             self._emit(EventKind.FAILSAFE, text, step="hover", reason="stalled")
+        if unshown:
+            text = "the emergency stop is no longer sent: the vehicle has not shown it, and may fly"
+            self._emit(EventKind.VEHICLE_MESSAGE, text, reason="stop_given_up")
         return due_ns
 
     # Inside ----------------------------------------------------------------------------------------------------

@@ -202,6 +202,12 @@ class ProxyConnection:
             notifier.wait_for(lambda: self.closing, 0.02)
         raise ClosedError("this drone was closed")
 
+    def forked(self) -> None:
+        """Send nothing, wait for nothing: the session belongs to the parent process."""
+        self.closing = True
+        self._session, self.transmit = None, _nowhere
+        self.state, self.reason = LinkState.CLOSED, "the connection belongs to the parent process"
+
     # For the supervisor ----------------------------------------------------------------------------------------
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import secrets
 import threading
 import time
@@ -11,6 +12,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final, Literal, Protocol, TypedDict
 
+from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
 from skyloop.client.channels import Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
@@ -63,11 +65,11 @@ Access = Literal["pilot", "observe"]
 OnExit = Literal["land", "hover"]
 LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
+STOP_S: Final = 2.0  #: how long closing waits for an emergency stop to show
 DOWN: Final = frozenset({FlightState.LANDED})
 _ENDED: Final = EndedSessions()  #: of all drones of this process
 LANDING_S: Final = 20.0  #: how long a landing is waited for
 OTHERS_S: Final = 1.0  #: within which feedback says who took a vehicle whose landing was refused
-STOPPING_S: Final = 2.0  #: how long an emergency stop is repeated
 RETURN_S: Final = 180.0  #: how long a return that the proxy began is waited for
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _SINKING: Final = (*_ENDED_IN, FlightState.LANDING)
@@ -148,6 +150,7 @@ class DroneCore:
         self.app = app
         self.role = Role.PILOT if access == "pilot" else Role.OBSERVER
         self.closed = False
+        self._why_closed = "this drone was closed: connect again"
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
         self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
@@ -182,6 +185,7 @@ class DroneCore:
             begin=scheduler.begin,
         )
         connection.subscribe(EVENTS)
+        leave_to_parent(self)
 
     # Beginning and end -------------------------------------------------------------------------------------------
 
@@ -236,6 +240,7 @@ class DroneCore:
         """
         if self.closed:
             return
+        self._finish_stop()
         self.closed = True
         try:
             if self.connection.connected:
@@ -256,6 +261,15 @@ class DroneCore:
     def ending(self) -> bool:
         """Whether the end of the flight has begun, or it is closed."""
         return self.closed or self.commands.barred
+
+    def forked(self) -> None:
+        """Leave the vehicle and the connection to the parent process; in a child made by ``os.fork``."""
+        if not self.closed:
+            self.closed = True
+            self._why_closed = (
+                f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect here as well"
+            )
+            self.connection.forked()
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
         """Hover, or land, because the library finds that it has to: the only place where it does so by itself.
@@ -301,6 +315,8 @@ class DroneCore:
         Returns:
             What went wrong; None if nothing did.
         """
+        if self.closed:  # also in a fork, where somebody may have held the locks
+            return None
         self.commands.bar()
         with self._end:
             try:
@@ -313,13 +329,12 @@ class DroneCore:
         self, reason: str, report: Callable[[str], object] = _silent, *, land: bool = True
     ) -> SkyloopError | None:
         """Land what this application flies and wait until it has landed, or let it go; see :meth:`end_flight`."""
+        self._finish_stop()
         feedback = self.state.newest
         if not self._flies():
             if feedback is not None and feedback.state.airborne and (whose := self._others_hands()):
                 report(f"{whose}: the drone is left to it")
             return None
-        if type(self.commands.newest) is EmergencyStop:  # nothing takes its place until it shows, or is given up
-            self.state.notifier.wait_for(lambda: type(self.commands.newest) is not EmergencyStop, STOPPING_S)
         try:
             if not land:
                 self.let_go(reason)
@@ -355,7 +370,7 @@ class DroneCore:
     def check_open(self) -> None:
         """Raise :class:`ClosedError` after :meth:`close`."""
         if self.closed:
-            raise ClosedError("this drone was closed: connect again")
+            raise ClosedError(self._why_closed)
 
     def check_may_wait(self) -> None:
         """Raise :class:`UsageError` on the receiving thread."""
@@ -369,6 +384,11 @@ class DroneCore:
         if link.vehicle is not LinkState.UP:
             words += [f"the vehicle's link is {link.vehicle.value}", link.reason, link.remedy]
         return NoAnswerError(": ".join(filter(None, words)))
+
+    def _finish_stop(self) -> None:
+        """Wait, for 2 s at most, until an emergency stop has shown: it would end with the connection."""
+        if self.connection.connected and not self.connection.receiving:
+            self.state.notifier.wait_for(lambda: not self.commands.stopping, STOP_S)
 
     def _known(self) -> bool:
         """Whether feedback has come and the link's state was judged."""
@@ -426,6 +446,8 @@ class DroneCore:
         if welcome is not None and not welcome.capabilities.actions:
             why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
             raise UnsupportedError(f"{action.name} is not possible: {why_not}")
+        if type(action) is EmergencyStop and welcome is not None and action.name not in welcome.capabilities.actions:
+            raise UnsupportedError("emergency_stop is not possible: the vehicle cannot stop its motors")
         if welcome is not None and type(action) in LATER_ACTIONS:
             _check_knows(welcome.capabilities, action)
 

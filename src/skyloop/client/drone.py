@@ -112,8 +112,9 @@ class Drone:
     Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
     it is sent at once and repeated at ``rate_hz`` until the next one. Each command but :meth:`takeoff` and :meth:`land`
     returns True if it was handed to the transport now, and False if it could not be because the link is down or the
-    authority is still awaited; it is then sent when both are there, if it is less than half a second old. Every command
-    raises:
+    authority is still awaited; it is then sent when both are there, if it is less than half a second old. Set-points
+    (velocity, attitude, place) also return False while the proxy is known to refuse them, as on the ground or when
+    somebody else flies the vehicle; the events say why. Every command raises:
 
     - :class:`AuthorityError` while another application holds the authority or none was requested,
     - :class:`UsageError` for numbers that are not finite,
@@ -294,13 +295,18 @@ class Drone:
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover.
 
+        While this waits, a take-off for which the vehicle is not ready yet is commanded again, twice a second. A call
+        that fails, a time-out and Ctrl-C included, ends the take-off: the vehicle hovers if it is in the air, else it
+        stays on the ground. Without ``wait`` a take-off that is refused is over.
+
         Args:
             wait: Wait until the vehicle hovers or flies; else only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
             NoAnswerError: If the vehicle does not hover in time; names its state and, if known, the reason.
-            RefusedError: If the proxy refuses to take off in the present state.
+            RefusedError: If the proxy refuses to take off in the present state, or the vehicle lands or disarms before
+                it hovers, whoever made it.
             UnsupportedError: If the vehicle can't take off.
             LinkError: Without ``wait``, if the link is down; the vehicle does not take off later either.
             AuthorityError: If the authority is not held, or another application takes it over meanwhile.
@@ -394,7 +400,7 @@ class Drone:
         (``Feedback.origin``), latitude and longitude may be given instead; they are converted when this is called.
         ArduPilot and PX4 fly there natively, elsewhere the proxy does it by velocity. Unlike a velocity it does not
         decay when the application falls silent: the vehicle stops there. The place is held until the next command, also
-        after a time-out. Nothing keeps it away from obstacles.
+        after a time-out; after Ctrl-C, or a cancelled task, the vehicle hovers. Nothing keeps it away from obstacles.
 
         Args:
             x: East [m].
@@ -467,17 +473,27 @@ class Drone:
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
 
-        Needs no authority, only ``access="pilot"``.
+        Needs no authority, only ``access="pilot"``. It is sent at once and repeated until the vehicle shows it
+        (``FlightState.EMERGENCY``), or for 8 s: then it is given up, with an event (``vehicle_message``, reason
+        ``stop_given_up``). Nothing else of this connection is sent meanwhile: :meth:`velocity`, :meth:`hover` and the
+        like return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over
+        several connections has to silence the others itself. A stop that could not be sent for 2 s is not sent later.
+
+        Returns:
+            False if it can't be sent now, because the link is down.
 
         Raises:
             AuthorityError: If this application only observes.
-            UnsupportedError: If the vehicle takes no commands.
+            UnsupportedError: If the vehicle can't stop its motors, or takes no commands.
             ClosedError: If the drone was closed.
         """
         return self._core.command(EmergencyStop())
 
     def reset_emergency(self) -> bool:
-        """Leave the emergency state, on the ground."""
+        """Leave the emergency state, on the ground.
+
+        One that is asked for while a stop of this application has not shown is sent once it has, within 2 s.
+        """
         return self._core.command(ResetEmergency())
 
     def send_external_pose(

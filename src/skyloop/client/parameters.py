@@ -6,6 +6,7 @@ import numbers
 import threading
 from collections.abc import Callable, Iterator, Mapping
 
+import msgspec
 import numpy as np
 
 from skyloop.client.authority import AuthorityTracker
@@ -24,6 +25,7 @@ from skyloop.messages import (
     Refusal,
     Refused,
     SetParameter,
+    Severity,
     Value,
 )
 
@@ -34,38 +36,63 @@ _NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusa
 
 
 class Restorer:
-    """Writes parameters once more that the application wrote before the proxy was lost."""
+    """Writes parameters again after the proxy was restarted, and with that forgot what the application wrote.
+
+    Only values, never momentary parameters, and only if nobody else can have written since: a lost link alone changes
+    nothing at the proxy, and other pilots' newer values stay. Leases are numbered from 1 in each run of the proxy, so a
+    gap between two of our own shows that another application held the authority, and may have written, in between.
+    """
 
     def __init__(self, connection: ProxyConnection, emit: Emit) -> None:
         self._connection = connection
         self._emit = emit
         self._lock = threading.Lock()
         self._written: dict[str, Value] = {}
-        self._restore = False  #: the connection on which they were written was lost
+        self._run_id = 0
+        self._lease = 0  # the last of our own in this run
+        self._missed = False  # events were missed since that lease: the connection was lost
+        self._restore = False  # the proxy was restarted since the values were written
 
-    def written(self, name: str, value: Value) -> None:
+    def written(self, parameter: Parameter) -> None:
         """Note what the application has written."""
-        with self._lock:
-            self._written[name] = value
+        if not parameter.momentary:
+            with self._lock:
+                self._written[parameter.name] = parameter.value
 
-    def disconnected(self) -> None:
-        """Note that the proxy may have lost what was written."""
-        self._restore = True
+    def overwritten(self, name: str) -> None:
+        """Note that another application has written this parameter."""
+        with self._lock:
+            self._written.pop(name, None)
+
+    def connected(self, run_id: int) -> None:
+        """Note a new connection, to this run of the proxy."""
+        with self._lock:
+            self._missed = True
+            if run_id != self._run_id:
+                self._restore = self._run_id != 0
+                self._run_id, self._lease = run_id, 0
 
     def granted(self, lease: int) -> None:
-        """Write once more what a lost connection may have undone, now that the authority is held. Does not wait."""
-        if not self._restore:
-            return
-        self._restore = False
+        """Write what a restarted proxy has forgotten, now that the authority is held. Does not wait."""
         with self._lock:
-            written = dict(self._written)
-        for name, value in written.items():
-            self._connection.ask(SetParameter(name, value, lease), self._restored(name, value), ANSWER_S)
+            others, self._lease = self._missed and lease != self._lease + 1, lease
+            restore, written = self._restore, dict(self._written)
+            self._missed = self._restore = False
+            if others:
+                self._written.clear()
+        if restore and others and written:
+            names = ", ".join(sorted(written))
+            text = f"the proxy was restarted and others have flown since: {names} not written again, set them if needed"
+            self._emit(EventKind.PARAMETER_CHANGED, text, Severity.WARNING, reason="others")
+        elif restore:
+            for name, value in written.items():
+                self._connection.ask(SetParameter(name, value, lease), self._restored(name, value), ANSWER_S)
 
     def _restored(self, name: str, value: Value) -> Callable[[AnyReply | LinkError], None]:
         def done(answer: AnyReply | LinkError) -> None:
             if isinstance(answer, LinkError):
-                self._restore = True  # lost again: retried with the next grant
+                with self._lock:
+                    self._restore = True  # lost again: retried with the next grant
             elif isinstance(answer, Refused):
                 text = f"{name} could not be set to {value!r} again: {answer.message}"
                 self._emit(EventKind.PARAMETER_CHANGED, text, name=name, reason=answer.code.value)
@@ -77,8 +104,9 @@ class Config(Mapping[str, Value]):
     """Parameters as a mapping from name to value, each access one request to the proxy.
 
     ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority.
-    What was written is written again after the proxy was lost, is back, and has granted the authority again. Every
-    method waits for the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
+    After a restart of the proxy, which forgets them, the values that were written are written again with the next grant
+    of the authority, unless another application held it in between. Momentary parameters, such as a flip, never are.
+    Every method waits for the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
     """
 
     def __init__(self, connection: ProxyConnection, authority: AuthorityTracker, restorer: Restorer) -> None:
@@ -107,7 +135,7 @@ class Config(Mapping[str, Value]):
         answer = self._call(name, lambda: SetParameter(_name(name), plain, self._authority.status.lease))
         if not isinstance(answer, ParameterValue):
             raise LinkError(f"the proxy answered the writing of {name} with {type(answer).__name__}")
-        self._restorer.written(name, plain)
+        self._restorer.written(msgspec.structs.replace(answer.parameter, value=plain))
 
     def describe(self, name: str) -> Parameter:
         """Return all that is known of a parameter: type, unit, range, default, value, description.

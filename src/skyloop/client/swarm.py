@@ -566,7 +566,8 @@ class Swarm:
             return {}
         self._closed = True
         for drone in self._drones.values():
-            drone._core.commands.bar()  # all before the first lands
+            if not drone.closed:
+                drone._core.commands.bar()  # all before the first lands
         return _problems(self._drones, lambda drone: drone._core.end_flight())
 
     def close(self) -> None:

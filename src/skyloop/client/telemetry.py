@@ -301,12 +301,12 @@ class Receiver:
             if camera.name not in state.channels:
                 state.channels[camera.name] = state.video(camera)
         state.results.restart()
+        self._restorer.connected(welcome.run_id)
         self._commands.connected(welcome.app_id, welcome.run_id)
         state.on_welcome.publish(welcome)
 
     def disconnected(self, reason: str) -> None:  # noqa: ARG002  (link_changed publishes it)
         """Drop the authority and the set-point; ``reason`` is published by :meth:`link_changed`."""
-        self._restorer.disconnected()
         self._commands.disconnected()
         self._keep_warm(False)
 
@@ -384,6 +384,8 @@ class Receiver:
     def event(self, event: Event, now_ns: int) -> None:
         """Keep and publish an event."""
         self._state.recent.append(event)
+        if event.kind is EventKind.PARAMETER_CHANGED and event.data.get("app_id") != self._commands.app_id:
+            self._restorer.overwritten(str(event.data.get("name")))
         self._commands.event(event, now_ns)
         self._state.on_event.publish(event)
         self._state.notifier.notify()

@@ -197,6 +197,7 @@ def parameter_values(parameter: Parameter) -> dict[str, Any]:
         "default": None if parameter.default is None else _value(parameter.default),
         "choices": [_value(choice) for choice in parameter.choices],
         "read_only": parameter.read_only,
+        "momentary": parameter.momentary,
         "description": parameter.description,
     }
 

@@ -13,8 +13,8 @@ from skyloop.cockpit.values import Json, number, vector
 from skyloop.errors import NoAnswerError, ParameterError
 from skyloop.messages import Position
 from skyloop.messages.world import WORLD, WorldGeometry, decode_world
+from skyloop.proxy.core.airspace import Airspace, AirspaceSettings
 from skyloop.proxy.core.limits import Limits
-from skyloop.proxy.core.places import decide_place
 from skyloop.zones import FAR_M, Box, Space, Zone, space_of
 
 if TYPE_CHECKING:
@@ -65,8 +65,8 @@ def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
         return math.inf if value is None else value
 
     limits = Limits(limit("tilt"), limit("climb"), limit("yaw_rate"), limit("speed"), limit("altitude"))
-    decision = decide_place(Position(*place), limits, space_from(read), _newest(drone), drone.now_ns, new=True)
-    return {"problem": decision.why}
+    airspace = Airspace(AirspaceSettings(limits, space_from(read)))
+    return {"problem": airspace.judge(Position(*place), _newest(drone), drone.now_ns, new=True).why}
 
 
 def space_from(read: Callable[[str], Value | None]) -> Space:

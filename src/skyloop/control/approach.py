@@ -10,6 +10,7 @@ from skyloop.clock import seconds
 from skyloop.control.follow import FollowMarker
 from skyloop.control.follow_law import FollowSettings, Mode
 from skyloop.control.heading import AlongPath, LookAt
+from skyloop.control.limiting import clamped
 from skyloop.control.path import Circle
 from skyloop.control.path_following import FollowPath
 from skyloop.errors import UsageError
@@ -153,7 +154,7 @@ class OrbitMarker(FollowMarker):
         if abs(law.station_rad) >= self._reach and law.station_rad * self._rate > 0.0:
             self._rate = -self._rate
             self.turns += 1
-        law.station_rad = max(-self._reach, min(self._reach, law.station_rad + law.station_rate_rad_s * dt_s))
+        law.station_rad = clamped(law.station_rad + law.station_rate_rad_s * dt_s, self._reach)
         super().on_frame(frame)
 
 

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from skyloop.clock import seconds
+from skyloop.control.airframe import Array, Part, VelocityLaw
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.fuzzy import FuzzyController, Rule, triangles
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped
-from skyloop.control.target import Odometry
+from skyloop.control.limiting import SetpointLimits, clamped
 from skyloop.errors import UsageError
-from skyloop.messages import Feedback, Polyline, Text, Velocity
+from skyloop.messages import Polyline, Text
 from skyloop.messages.annotation import Colour, Shape
 from skyloop.messages.geometry import wrap_angle
 from skyloop.vision import BlobDetector, BlobSighting
@@ -74,7 +74,7 @@ class AvoidSettings:
     acceleration_m_s2: float = 2.0
 
 
-class AvoidLaw:
+class AvoidLaw(VelocityLaw):
     """Computes velocities from sightings of obstacles. Pure: times are on the proxy's clock [ns].
 
     Attributes:
@@ -90,21 +90,15 @@ class AvoidLaw:
             settings: None are the defaults.
         """
         self.settings = s = settings or AvoidSettings()
+        super().__init__(SetpointLimits(acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
         self.phase = AvoidPhase.CLEAR
         self.ahead_m = 0.0  #: how far it has come
         self._distance_m = distance_m
         self._rules = avoidance()
-        self._odometry = Odometry()
-        self._begin: np.typing.NDArray[np.float64] | None = None
+        self._begin: Array | None = None
         self._yaw = 0.0
         self._seen: list[BlobSighting] = []
         self._beside: dict[float, int] = {}  # side (1 left, -1 right): when something was last seen there
-        self._limiter = SetpointLimiter(SetpointLimits(acceleration_m_s2=s.acceleration_m_s2))
-        self._last_ns: int | None = None
-
-    def feedback(self, feedback: Feedback) -> None:
-        """Update with the vehicle's newest state."""
-        self._odometry.add(feedback)
 
     def see(self, seen: list[BlobSighting], captured_ns: int) -> None:
         """Update with the obstacles that are in a frame.
@@ -118,18 +112,15 @@ class AvoidLaw:
             if one.width_rad > self.settings.avoiding_rad and abs(one.bearing_rad) > 0.25:
                 self._beside[math.copysign(1.0, one.bearing_rad)] = captured_ns
 
-    def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now. All zero until the vehicle's motion is known, and at the end."""
-        s, motion = self.settings, self._odometry.at(now_ns)
-        if motion is None:
-            return Velocity()
+    def _setpoint(self, now_ns: int) -> Array:
+        s, motion = self.settings, self._motion(now_ns)
         if self._begin is None:
             self._begin, self._yaw = motion.position, motion.yaw
         way = motion.position - self._begin
         self.ahead_m = float(way[0] * math.cos(self._yaw) + way[1] * math.sin(self._yaw))
         if self.ahead_m >= self._distance_m:
             self.phase = AvoidPhase.ARRIVED
-            return Velocity()
+            return np.zeros(4)
         widest = self._seen[0] if self._seen else None
         near = widest is not None and widest.width_rad > s.avoiding_rad
         self.phase = AvoidPhase.AVOIDING if near else AvoidPhase.CLEAR
@@ -138,9 +129,7 @@ class AvoidLaw:
             share = -s.back_share  # blocked ahead and to both sides: back off
         wanted = np.array([s.speed_m_s * share, s.aside_m_s * aside])
         turn = clamped(s.yaw_gain * wrap_angle(self._yaw - motion.yaw), 1.0)
-        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
-        self._last_ns = now_ns
-        return self._limiter.step(np.array([*wanted, -0.8 * way[2], turn]), dt_s)
+        return np.array([*wanted, -0.8 * way[2], turn])
 
     def _share(self) -> float:
         """Return the share of the speed ahead: the wider an obstacle ahead looks, the less."""

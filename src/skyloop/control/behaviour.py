@@ -7,8 +7,9 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
 from skyloop.clock import nanoseconds
+from skyloop.control.airframe import AirframeLaw
 from skyloop.control.controller import Controller
-from skyloop.errors import UnknownNameError, UsageError
+from skyloop.errors import AuthorityError, UnknownNameError, UsageError
 from skyloop.messages import Attitude, CameraInfo, EventKind, Feedback, Severity, Velocity
 from skyloop.messages.annotation import Shape
 
@@ -33,7 +34,8 @@ class Behaviour(Controller):
 
     Each frame is searched (:meth:`look`), the law computes a set-point, :meth:`steer` sends it, and what was found is
     drawn as annotations. Changes of :attr:`phase` are published as events. The vehicle must be airborne when
-    :meth:`run` is called; when frames stop for more than :data:`BLIND_S` it hovers.
+    :meth:`run` is called; when frames stop for more than :data:`BLIND_S`, or the law does not know what it needs of
+    the vehicle's motion, it hovers, and an event says so.
 
     Subclasses define :meth:`look`, :attr:`phase`, and in :attr:`losses` the phases without sight of the target.
 
@@ -41,6 +43,7 @@ class Behaviour(Controller):
         name: Source of the annotations, and prefix of the events' text.
         done: Whether the behaviour reached its end.
         blind: Whether no frames arrive, and the vehicle hovers for that reason.
+        problem: What the law has to know and does not, so that the vehicle hovers; empty for nothing.
     """
 
     name = "behaviour"  #: source of its annotations, and prefix of its events' text
@@ -61,6 +64,7 @@ class Behaviour(Controller):
         self.camera = camera
         self.done = False  #: the behaviour reached its end
         self.blind = False  #: no frames arrive, and the vehicle hovers
+        self.problem = ""  #: what the law has to know and does not, and the vehicle hovers
         self._law = law
         self._mounting = camera_info(drone, camera)
         self._frame_ns: int | None = None  # capture of the newest frame
@@ -109,10 +113,25 @@ class Behaviour(Controller):
         Args:
             now_ns: On the proxy's clock.
         """
-        wanted = self._law.step(now_ns)
+        law = self._law
+        wanted = law.step(now_ns)
         self._report_phase()
-        if not self.done:
-            self.steer(wanted)
+        if self.done:
+            return
+        problem = law.problem if isinstance(law, AirframeLaw) and law.airframe.feedback is not None else ""
+        if problem != self.problem:
+            self.problem = problem
+            text = f"{problem}: hovering" if problem else "the vehicle's motion is known again: flying on"
+            self.emit(text, Severity.WARNING if problem else Severity.INFO)
+        try:
+            if problem:
+                self.drone.hover()
+            else:
+                self.steer(wanted)
+        except AuthorityError:
+            if isinstance(law, AirframeLaw):
+                law.pause()  # others fly it now
+            raise
 
     def steer(self, wanted: Velocity | Attitude) -> None:
         """Send a set-point to the vehicle.
@@ -126,7 +145,7 @@ class Behaviour(Controller):
             self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def finish(self, text: str, severity: Severity = Severity.INFO) -> None:
-        """End the behaviour: publish an event, hover, and let :meth:`run` return.
+        """End the behaviour for good: publish an event, hover, and let :meth:`run` return.
 
         Args:
             text: What was achieved; the event's text after the name.
@@ -135,7 +154,7 @@ class Behaviour(Controller):
         self.done = True
         self.emit(text, severity)
         self.drone._core.let_go(text)
-        self.stop()
+        self._end()
 
     def emit(self, text: str, severity: Severity = Severity.INFO) -> None:
         """Emit an event to this application's event subscribers.

@@ -4,7 +4,8 @@ Yaw keeps the target in the middle of the image, the distance is kept along the 
 controlled apart from both: the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli ("Vision based GPS-denied
 object tracking and following for unmanned aerial vehicles", SSRR 2013), here on estimated metres, so that gains do not
 depend on the lens or the size, with the target's velocity fed forward. A vehicle that does not report its own velocity
-is flown by its attitude, to the same velocity, against one that comes by dead reckoning (:mod:`.dead_reckoning`).
+is flown by its attitude, to the same velocity, against one that comes by dead reckoning
+(:class:`.airframe.TiltVelocity`).
 """
 
 from __future__ import annotations
@@ -19,14 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.control.airframe import DRAG_PER_S, Motion
 from skyloop.control.chase_settings import ChaseSettings
-from skyloop.control.dead_reckoning import DRAG_PER_S
 from skyloop.control.filters import LowPass
-from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.control.response import Predicted, ResponseSettings, VelocityResponse
-from skyloop.control.target import Motion
 from skyloop.control.target_estimate import TargetEstimator, TargetState
-from skyloop.messages import Attitude, Feedback, Velocity
+from skyloop.messages import Attitude, Feedback, Vector, Velocity
 from skyloop.messages.geometry import wrap_angle
 
 Array = NDArray[np.float64]
@@ -97,7 +97,9 @@ class ChaseLaw:
         self.off_m: float | None = None
         self.held_by = ""
         self._heading: float | None = None  # in which the target moved when it last did
-        self._begin: Array | None = None
+        self._out = np.zeros(2)  # where it is, from where it began
+        self._was_at: Array | None = None  # in odometry axes, at the last step
+        self._begin: Array | None = None  # in world axes; None: its position was not known yet
         self._height: float | None = None
         self._since_ns: int | None = None  # when the search began
         self._direction = 1.0
@@ -120,6 +122,7 @@ class ChaseLaw:
         *,
         candidate: TargetState | None = None,
         relative: bool = False,
+        position: Vector | None = None,
     ) -> Velocity | Attitude:
         """Compute the set-point for now.
 
@@ -131,14 +134,15 @@ class ChaseLaw:
             seen_ns: When it was last in view for certain, or perhaps; None: never.
             others: Who else was seen lately, and is kept clear of.
             candidate: Somebody who may be the lost target, and is looked at.
-            relative: The vehicle does not report its velocity (see :mod:`.dead_reckoning`): the set-point is an
-                attitude.
+            relative: The vehicle does not report its velocity (see :class:`.airframe.TiltVelocity`): the set-point is
+                an attitude.
+            position: Where it is now, world axes [m]; None: not known, and the leash is by the velocity, added up.
         """
         s = self.settings
-        dt_s = 0.0 if self._last_ns is None else max(0.0, min(0.2, seconds(now_ns - self._last_ns)))
+        dt_s = 0.0 if self._last_ns is None else within(seconds(now_ns - self._last_ns), 0.0, 0.2)
         self._last_ns = now_ns
         own = motion.moved_to(now_ns)
-        self._begin = own.position[:2] if self._begin is None else self._begin
+        self._note_way(own, position)
         if self._height is None and altitude_m is not None:
             self._height = altitude_m
         if self._since_ns is None:
@@ -169,11 +173,17 @@ class ChaseLaw:
             horizontal = _not_towards(horizontal, state.foot[:2] - ahead.position[:2])
         for other in others:
             horizontal = horizontal + self._clear_of(other, ahead, horizontal)
+        horizontal = self._leashed(self._out + ahead.position[:2] - own.position[:2], horizontal)
         return self._steer(shortened(horizontal, s.speed_m_s), turn, state, now)
 
     def feedback(self, feedback: Feedback) -> None:
         """Update the model of the vehicle's response with its newest state; a vehicle without velocity has none."""
         self._response.add(feedback)
+
+    def pause(self) -> None:
+        """Restart from the vehicle's own velocity, because others flew it, or its motion was not known."""
+        self._limiter, self._last_ns = None, None
+        self._response.pause()
 
     def _ahead(self, motion: Motion, now_ns: int, predicted: Predicted | None) -> Motion:
         """Return the motion at which a set-point that is sent now finds the vehicle, with all that is under way."""
@@ -284,7 +294,7 @@ class ChaseLaw:
         else:
             wanted = wanted + aside * self._round(state, sight, across)
         wanted = wanted + self._evading(own, state)
-        return self._leashed(own, self._kept_off(wanted, state, sight, across))
+        return self._kept_off(wanted, state, sight, across)
 
     def _soon(self, state: TargetState, at_ns: int) -> Array:
         """Return the target's velocity as it will be when the vehicle has taken it up, (2,) [m/s]."""
@@ -330,7 +340,7 @@ class ChaseLaw:
         The nearest pass counts, by the velocity that it has or that it is about to take up. The less certain it is
         where the other is, who is out of view perhaps, the farther off it stays, and reckons with a stop.
         """
-        uncertain_m = max(0.0, min(_UNCERTAIN_M, other.place_m - _SURE_M))
+        uncertain_m = within(other.place_m - _SURE_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m
         here = own.position[:2] - other.foot[:2]
         moves = (other.velocity, np.zeros(2)) if uncertain_m > 0.0 else (other.velocity,)
@@ -354,12 +364,21 @@ class ChaseLaw:
         allowed = _stoppable(gap, self.settings) if gap > 0.0 else 2.0 * gap
         return wanted if closing <= allowed else wanted - sight * (closing - allowed)
 
-    def _leashed(self, own: Motion, wanted: Array) -> Array:
-        """Take away what would lead farther out than the leash."""
+    def _note_way(self, own: Motion, position: Vector | None) -> None:
+        """Note how far it is from where it began: the velocity drifts, the position does not."""
+        here = own.position[:2]
+        self._out = self._out + (np.zeros(2) if self._was_at is None else here - self._was_at)
+        self._was_at = here
+        if position is not None:
+            known = np.array(position[:2])
+            self._begin = known - self._out if self._begin is None else self._begin
+            self._out = known - self._begin
+
+    def _leashed(self, out: Array, wanted: Array) -> Array:
+        """Take away what would lead farther out than the leash; ``out``, (2,) [m]: where it is from where it began."""
         leash = self.settings.leash_m
-        if leash is None or self._begin is None:
+        if leash is None:
             return wanted
-        out = own.position[:2] - self._begin
         length = float(np.hypot(*out))
         if length < 0.1:
             return wanted
@@ -380,8 +399,8 @@ class ChaseLaw:
         if state is not None:
             reach = math.tan(s.steep_rad) * state.range_m
             middle = float(state.middle[2])
-            height = max(middle - reach, min(middle + reach, height))
-        height = max(s.lowest_m, min(s.highest_m, height))
+            height = within(height, middle - reach, middle + reach)
+        height = within(height, s.lowest_m, s.highest_m)
         return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
 
     def _by_attitude(self, own: Motion, wanted: Array, up: float, turn: float) -> Attitude:

@@ -22,8 +22,8 @@ class ChaseSettings:
         bearing_rad: Where to be as seen from the target, counter-clockwise from the direction in which it moves: 0 is
             ahead of it, π behind, π/2 on its left. None: on whichever side it is.
         orbit_m_s: Speed round the target, counter-clockwise from above if above 0.
-        leash_m: Farthest horizontal distance from where it began; it stays there, turning. None: no leash. Needs the
-            vehicle's velocity.
+        leash_m: Farthest horizontal distance from where it began; it stays there, turning, whoever comes near. None: no
+            leash. By the vehicle's position; while that is not known, by its velocity, whose error adds up.
         height_m: Above the ground; None: the height at the start.
         lowest_m: Above the ground.
         highest_m: Above the ground.

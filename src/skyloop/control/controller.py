@@ -71,6 +71,7 @@ class Controller:
         """Store the drone; no callback is called before :meth:`run`."""
         self.drone = drone
         self._stopped = threading.Event()
+        self._ended = False  # for good
         self._inbox: Mailboxes | None = None
 
     # To be overridden ------------------------------------------------------------------------------------------
@@ -118,12 +119,18 @@ class Controller:
         if inbox is not None:
             inbox.notifier.notify()
 
+    def _end(self) -> None:
+        """Stop for good: a later :meth:`run` returns at once."""
+        self._ended = True
+        self.stop()
+
     def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
         """Call the callbacks until the time is over, ``until()`` is true, :meth:`stop` is called or the drone closes.
 
         An exception in a callback, Ctrl-C and ``sys.exit()`` make an airborne vehicle hover, if this client flies it,
         and are raised from here. An :class:`AuthorityError` because another client took over does not end the run:
-        :meth:`on_authority` is called instead.
+        :meth:`on_authority` is called instead. A ready-made controller that has reached its end flies no second time:
+        its next run returns at once.
 
         Args:
             seconds: How long to run, 0 or more; None sets no limit.
@@ -149,7 +156,8 @@ class Controller:
             processors=self.processors,
             max_age_s=self.result_max_age_s,
         )
-        self._stopped.clear()
+        if not self._ended:
+            self._stopped.clear()
         try:
             with inbox:
                 self._inbox = inbox

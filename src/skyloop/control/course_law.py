@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.control.airframe import Motion, Part, VelocityLaw
 from skyloop.control.detour import Point, Wall, detour
 from skyloop.control.gate_law import Axis, GatePhase
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
-from skyloop.control.target import Motion, Odometry
-from skyloop.messages import Feedback, Velocity
+from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
+from skyloop.messages import Feedback
 from skyloop.messages.geometry import wrap_angle
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ class CourseSettings:
     plan_s: float = 0.4  #: between two plans of the way
 
 
-class CourseLaw:
+class CourseLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
 
     Attributes:
@@ -108,6 +108,11 @@ class CourseLaw:
             settings: None are the defaults.
         """
         self.settings = s = settings or CourseSettings()
+        super().__init__(
+            SetpointLimits(s.cruise_m_s * 1.3, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2),
+            Part.VELOCITY,
+            Part.HEIGHT,
+        )
         self.phase, self.axis = GatePhase.SEARCHING, Axis(0.0, 0.0, 0.0)
         self.way: list[Point] = []
         self.stuck: str | None = None
@@ -116,12 +121,7 @@ class CourseLaw:
         self._shift_m = s.start_m
         self._poles = [_Spot(np.array(pole[:2]) + self._shift[:2], pole, s) for pole in poles]
         self._number = 0
-        self._odometry = Odometry()
         self._lift: float | None = None  # of the ground's altitude over the odometry's
-        self._limiter = SetpointLimiter(
-            SetpointLimits(s.cruise_m_s * 1.3, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2)
-        )
-        self._last_ns: int | None = None
         self._planned_ns: int | None = None
         self._waiting_ns: int | None = None
         self._view = 0  # from which place the gate is looked at
@@ -152,13 +152,19 @@ class CourseLaw:
             heading = self._gates[number].heading_rad
             self._heading = np.array([math.cos(heading), math.sin(heading)])
 
+    def forget(self) -> None:
+        """Count on the map no more than at the start, and look at the gate again."""
+        self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
+        if self.phase is not GatePhase.PASSED:
+            self._begin_gate(self._number)
+
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
-        self._odometry.add(feedback)
-        newest = self._odometry.newest
-        if newest is None or feedback.altitude_m is None:
+        super().feedback(feedback)
+        newest, altitude = self.airframe.newest, self.airframe.altitude_m(feedback.captured_ns)
+        if newest is None or altitude is None:
             return
-        lift = feedback.altitude_m - float(newest.position[2])
+        lift = altitude - float(newest.position[2])
         self._lift = lift if self._lift is None else self._lift + 0.1 * (lift - self._lift)
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
@@ -171,10 +177,10 @@ class CourseLaw:
             captured_ns: Capture of the frame.
             trust: How sure the normal is, 0 to 1.
         """
-        motion = self._motion(captured_ns)
-        if motion is None or self._number >= len(self._gates) or at_capture.pitch_rad is None:
+        found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
+        if found is None or self._lift is None or self._number >= len(self._gates):
             return
-        to_level = at_capture.rotation
+        motion, to_level = self._motion(captured_ns), found[1]
         distance = float(np.linalg.norm(position))
         across = (to_level @ normal)[:2]
         across = across / max(1e-6, float(np.linalg.norm(across)))
@@ -202,10 +208,10 @@ class CourseLaw:
             at_capture: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
         """
-        motion = self._motion(captured_ns)
-        if motion is None or at_capture.pitch_rad is None or not self._poles:
+        found = self.airframe.at_capture(at_capture, captured_ns, top)
+        if found is None or self._lift is None or not self._poles:
             return
-        ray = at_capture.rotation @ top
+        motion, ray = self._motion(captured_ns), found[1] @ top
         level = float(np.linalg.norm(ray[:2]))
         if level < 1e-6:
             return
@@ -215,23 +221,10 @@ class CourseLaw:
         if sightings[nearest].deviations < _SURE:
             self._poles[nearest].update(sightings[nearest])
 
-    def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now. All zero until the vehicle's motion is known, and where it can't go on."""
-        motion = self._motion(now_ns)
-        if motion is None or self._number >= len(self._gates):
-            return Velocity()
-        wanted = self._wanted(motion.moved_to(now_ns + nanoseconds(self.settings.lead_s)), now_ns)
-        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
-        self._last_ns = now_ns
-        return self._limiter.step(wanted, dt_s)
-
-    def _motion(self, at_ns: int) -> Motion | None:
+    def _motion(self, at_ns: int) -> Motion:
         """Return the vehicle's motion, its height above the ground."""
-        motion = self._odometry.at(at_ns)
-        if motion is None or self._lift is None:
-            return None
-        place = motion.position + np.array([0.0, 0.0, self._lift])
-        return Motion(motion.at_ns, place, motion.velocity, motion.yaw, motion.yaw_rate)
+        motion = super()._motion(at_ns)
+        return replace(motion, position=motion.position + np.array([0.0, 0.0, self._lift or 0.0]))
 
     def _nominal(self, number: int) -> Array:
         place: Array = np.array(self._gates[number][:3]) + self._shift
@@ -242,9 +235,11 @@ class CourseLaw:
         place: Array = self._nominal(number) if newest is None else newest.position
         return place
 
-    def _wanted(self, own: Motion, now_ns: int) -> Array:
-        """Return forward, left, up [m/s] and yaw rate [rad/s]; sets the phase."""
+    def _setpoint(self, now_ns: int) -> Array:
         s = self.settings
+        if self._number >= len(self._gates):
+            return np.zeros(4)
+        own = self._motion(now_ns).moved_to(now_ns + nanoseconds(s.lead_s))
         gate, ahead = self._gate_at(self._number), self._heading
         left = np.array([-ahead[1], ahead[0]])
         offset = own.position - gate
@@ -443,5 +438,5 @@ def _nearest(place: Array, wall: Wall) -> Point:
     (x, y), (u, v) = wall.begin, wall.end
     along, aside = u - x, v - y
     share = ((float(place[0]) - x) * along + (float(place[1]) - y) * aside) / max(along**2 + aside**2, 1e-12)
-    share = max(0.0, min(1.0, share))
+    share = within(share, 0.0, 1.0)
     return x + share * along, y + share * aside

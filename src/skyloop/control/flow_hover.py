@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.control.airframe import AirframeLaw, Part
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import GRAVITY_M_S2, clamped, shortened
+from skyloop.control.pid import Gains, VectorPi
 from skyloop.errors import UsageError
-from skyloop.messages import Attitude, Feedback, Points, Text
+from skyloop.messages import Attitude, Points, Text
 from skyloop.messages.annotation import Colour, Shape
 from skyloop.messages.geometry import wrap_angle
 from skyloop.vision.flow import GroundTracker
@@ -69,7 +71,7 @@ class _Kept:
     place: Array = field(default_factory=lambda: np.zeros(2))
 
 
-class FlowLaw:
+class FlowLaw(AirframeLaw):
     """Computes attitudes from horizontal positions. Pure: times are on the proxy's clock [ns].
 
     A PID of each axis: acceleration by position, velocity and the integral of the position. The velocity comes from a
@@ -82,19 +84,19 @@ class FlowLaw:
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
         """Initialise the law."""
-        self.settings = settings or FlowSettings()
+        super().__init__(Part.ATTITUDE, Part.HEIGHT)
+        self.settings = s = settings or FlowSettings()
         self.phase = FlowPhase.WAITING
         self.off_m: float | None = None  #: estimated distance from the position to hold; None while it is not known
+        self._loop = VectorPi(Gains(p=s.gain, i=s.integral), 2, most=0.5 * s.tilt_rad * GRAVITY_M_S2)
         self._filter = ConstantVelocityFilter(2, intensity_m2_s3=0.5, speed_m_s=0.5, gate=math.inf)
-        self._integral = np.zeros(2)
         self._kept: _Kept | None = None
-        self._newest: Feedback | None = None
         self._seen_ns: int | None = None
-        self._last_ns: int | None = None
 
-    def feedback(self, feedback: Feedback) -> None:
-        """Update attitude and height; velocity and position are not used."""
-        self._newest = feedback
+    def pause(self) -> None:
+        """Restart without an integral."""
+        super().pause()
+        self._loop.reset()
 
     def see(self, place: Array, captured_ns: int) -> None:
         """Update with a position; the first one, and the first after a second without, becomes the one to hold.
@@ -103,39 +105,39 @@ class FlowLaw:
             place: Where the vehicle was at the capture, (2,) [m], along yaw 0 and to its left.
             captured_ns: Capture of the frame.
         """
-        newest = self._newest
-        if newest is None or newest.yaw_rad is None or newest.altitude_m is None:
+        newest, altitude = self.airframe.feedback, self.airframe.altitude_m(captured_ns)
+        if newest is None or newest.yaw_rad is None or altitude is None or not np.isfinite(place).all():
             return
         if self._seen_ns is None or seconds(captured_ns - self._seen_ns) > 1.0:
             self._filter.start(place, 0.02, captured_ns)
-            self._kept = _Kept(newest.yaw_rad, newest.altitude_m, np.asarray(place, np.float64))
+            self._kept = _Kept(newest.yaw_rad, altitude, np.asarray(place, np.float64))
         else:
             self._filter.update(place, 0.02, captured_ns)
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
         """Compute the set-point for now: level while the position is not known."""
-        s, newest = self.settings, self._newest
-        dt_s = 0.0 if self._last_ns is None else min(0.2, seconds(now_ns - self._last_ns))
-        self._last_ns = now_ns
-        if self._seen_ns is None or self._kept is None or newest is None:
+        s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
+        if self._seen_ns is None or self._kept is None:
             return Attitude()
-        if seconds(now_ns - self._seen_ns) > s.fresh_s or newest.yaw_rad is None or newest.altitude_m is None:
-            self.phase, self.off_m = FlowPhase.LOST, None
+        altitude, yaw = self._altitude, None if newest is None else newest.yaw_rad
+        if not ready or altitude is None or yaw is None or seconds(now_ns - self._seen_ns) > s.fresh_s:
+            self.phase, self.off_m, self._last_ns = FlowPhase.LOST, None, None
             return Attitude()
         self.phase = FlowPhase.HOLDING
         ahead = self._filter.at(now_ns + nanoseconds(s.lead_s))
         off = self._kept.place - ahead.position
         self.off_m = float(np.linalg.norm(self._kept.place - self._filter.at(now_ns).position))
-        self._integral = shortened(self._integral + s.integral * off * dt_s, 0.5 * s.tilt_rad * GRAVITY_M_S2)
-        wanted = shortened(s.gain * off - s.damping * ahead.velocity + self._integral, s.tilt_rad * GRAVITY_M_S2)
-        c, si = math.cos(newest.yaw_rad), math.sin(newest.yaw_rad)
+        asked = self._loop.step(off, min(0.2, self._since_s(now_ns))) - s.damping * ahead.velocity
+        wanted = shortened(asked, s.tilt_rad * GRAVITY_M_S2)
+        self._loop.applied(asked, wanted)
+        c, si = math.cos(yaw), math.sin(yaw)
         forward, left = c * wanted[0] + si * wanted[1], c * wanted[1] - si * wanted[0]
         return Attitude(
             roll=-math.atan2(left, GRAVITY_M_S2),
             pitch=math.atan2(forward, GRAVITY_M_S2),
-            climb=clamped(s.height_gain * (self._kept.altitude - newest.altitude_m), 0.5),
-            yaw_rate=clamped(s.yaw_gain * wrap_angle(self._kept.yaw - newest.yaw_rad), 1.0),
+            climb=clamped(s.height_gain * (self._kept.altitude - altitude), 0.5),
+            yaw_rate=clamped(s.yaw_gain * wrap_angle(self._kept.yaw - yaw), 1.0),
         )
 
 

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.airframe import Motion, Part, VelocityLaw
+from skyloop.control.kalman import ConstantVelocityFilter
+from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
 from skyloop.control.search import TurningSearch
-from skyloop.control.target import Motion, Odometry, TargetFilter
-from skyloop.messages import Feedback, Velocity
+from skyloop.messages import Feedback
 from skyloop.messages.geometry import wrap_angle
 
 Array = NDArray[np.float64]
@@ -58,7 +59,7 @@ class FollowSettings:
     highest_m: float = 2.2
 
 
-class FollowLaw:
+class FollowLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
 
     Attributes:
@@ -71,7 +72,9 @@ class FollowLaw:
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
         """Initialise the law."""
-        self.settings = settings or FollowSettings()
+        self.settings = s = settings or FollowSettings()
+        limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
+        super().__init__(limits, Part.VELOCITY)
         self.mode = Mode.SEARCHING
         #: Where to be around the marker: angle from straight before its face, counter-clockwise from above [rad];
         #: and how fast that changes [rad/s].
@@ -79,20 +82,14 @@ class FollowLaw:
         self.station_rate_rad_s = 0.0
         self.off_m: float | None = None  #: of distance and height together, as of the last step; None while searching
         self.aside_rad: float | None = None  #: where it is, the same way; None while the face is not known
-        self._odometry = Odometry()
         self._target = TargetFilter()
         self._face: Array | None = None  # which way the marker looks, horizontal part, odometry axes
         self._seen_ns: int | None = None
-        self._altitude: float | None = None
-        s = self.settings
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
-        self._limiter = SetpointLimiter(SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2))
-        self._last_ns: int | None = None  # time of the last step
 
-    def feedback(self, feedback: Feedback) -> None:
-        """Update with the vehicle's newest state."""
-        self._odometry.add(feedback)
-        self._altitude = feedback.altitude_m
+    def forget(self) -> None:
+        """Forget where the marker was."""
+        self._target, self._seen_ns = TargetFilter(), None
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting. Ignored while the vehicle's attitude or motion is not known.
@@ -104,10 +101,10 @@ class FollowLaw:
             captured_ns: Capture of the frame.
             trust: How sure the normal is, 0 to 1.
         """
-        motion = self._odometry.at(captured_ns)
-        if motion is None or at_capture.roll_rad is None or at_capture.pitch_rad is None or at_capture.yaw_rad is None:
+        found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
+        if found is None:
             return
-        to_level = at_capture.rotation
+        motion, to_level = found
         distance = float(np.linalg.norm(position))
         # A corner's error of a fixed fraction of a pixel moves the range by a share that grows with its square.
         self._target.see(motion.position + to_level @ position, 0.015 + 0.01 * distance**2, captured_ns)
@@ -116,27 +113,23 @@ class FollowLaw:
         self._face = face if self._face is None else (1 - weight) * self._face + weight * face
         self._seen_ns = captured_ns
 
-    def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now. All zero until the vehicle's motion is known."""
-        motion = self._odometry.at(now_ns)
-        if motion is None:
-            return Velocity()
+    def _setpoint(self, now_ns: int) -> Array:
+        motion = self._motion(now_ns)
         ahead = motion.moved_to(now_ns + nanoseconds(self.settings.lead_s))
         unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
         if unseen_s > self.settings.recovering_s:
             self.mode, self.off_m = Mode.SEARCHING, None
-            wanted = self._search.step(motion.yaw, self._altitude)
-        else:
-            self.mode = Mode.FOLLOWING if unseen_s <= self.settings.following_s else Mode.RECOVERING
-            wanted = self._follow(ahead, unseen_s)
-            self._search.restart(turning=wanted[3])
-        return self._smooth(wanted, now_ns)
+            return self._search.step(motion.yaw, self._altitude)
+        self.mode = Mode.FOLLOWING if unseen_s <= self.settings.following_s else Mode.RECOVERING
+        wanted = self._follow(ahead, unseen_s)
+        self._search.restart(turning=float(wanted[3]))
+        return wanted
 
     def _follow(self, own: Motion, unseen_s: float) -> Array:
         """Return wanted forward, left, up [m/s] and yaw rate [rad/s] while the target is known."""
         s = self.settings
         # Translation fades out within a second after the marker is lost; turning goes on.
-        fade = max(0.0, min(1.0, 1.0 - (unseen_s - s.following_s)))
+        fade = within(1.0 - (unseen_s - s.following_s), 0.0, 1.0)
         place, speed = self._target.at(own.at_ns)
         speed = speed * fade
         offset = place - own.position
@@ -175,8 +168,49 @@ class FollowLaw:
             up = min(0.0, up) if self._altitude > s.highest_m else up
         return clamped(up, s.climb_m_s)
 
-    def _smooth(self, wanted: Array, now_ns: int) -> Velocity:
-        """Limit how fast the set-point changes."""
-        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
-        self._last_ns = now_ns
-        return self._limiter.step(wanted, dt_s)
+
+class TargetFilter:
+    """Position and velocity of a point that is seen now and then: a filter that restarts after a jump."""
+
+    def __init__(self) -> None:
+        self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.1, speed_m_s=0.7, gate=math.inf)
+
+    def see(self, position: Array, deviation_m: float, at_ns: int) -> None:
+        """Update with a measured position. One that is older than the last is ignored.
+
+        After two seconds unseen, or when the target is more than a metre (and five deviations) off, the filter
+        restarts.
+
+        Args:
+            position: Shape (3,) [m].
+            deviation_m: Standard deviation of each component.
+            at_ns: When it was measured.
+        """
+        newest = self._filter.newest
+        if newest is None or self._jumped(position, deviation_m, at_ns):
+            self._filter.start(position, deviation_m, at_ns)
+        else:
+            self._filter.update(position, deviation_m, at_ns)
+
+    def at(self, at_ns: int, *, longest_s: float = 1.0) -> tuple[Array, Array]:
+        """Predict the target's motion.
+
+        Args:
+            at_ns: The time to predict for.
+            longest_s: How far the last estimate is extrapolated at most.
+
+        Returns:
+            Position (3,) [m] and velocity (3,) [m/s].
+
+        Raises:
+            UsageError: The target was never seen.
+        """
+        estimate = self._filter.at(at_ns, longest_s=longest_s)
+        return estimate.position, estimate.velocity
+
+    def _jumped(self, position: Array, deviation_m: float, at_ns: int) -> bool:
+        expected = self._filter.at(at_ns)
+        unseen_s = 0.0 if self._filter.newest is None else seconds(at_ns - self._filter.newest.at_ns)
+        spread = expected.covariance[0, 0] + deviation_m**2
+        off = float(np.linalg.norm(position - expected.position))
+        return unseen_s > 2.0 or (unseen_s >= 0.0 and off > max(1.0, 5 * math.sqrt(spread)))

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skyloop.control.limiting import within
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.messages.geometry import rotation_from_euler
 
@@ -191,7 +192,7 @@ def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
         for j in range(i + 1, len(a)):
             begin, change = a[i] - a[j], (b[i] - b[j]) - (a[i] - a[j])
             moved = float(change @ change)
-            at = min(1.0, max(0.0, -float(begin @ change) / moved)) if moved > 0.0 else 0.0
+            at = within(-float(begin @ change) / moved, 0.0, 1.0) if moved > 0.0 else 0.0
             distance = float(np.linalg.norm(begin + at * change))
             if distance < nearest.distance_m:
                 nearest = Approach(distance, i, j)

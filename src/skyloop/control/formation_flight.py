@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skyloop.control.formation import Places, assign, closest_approach, kept_apart, places, solver
+from skyloop.control.limiting import within
 from skyloop.control.waypoint import Waypoint, WaypointSettings, lacking, reached, velocity_to
 from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import AnyAction, Feedback, Vector, Velocity
@@ -290,7 +291,7 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
 
 def _minimum_jerk(share: float) -> tuple[float, float]:
     """Return distance and speed on a path of length 1 flown in time 1, at rest at both ends (Flash and Hogan 1985)."""
-    t = min(1.0, max(0.0, share))
+    t = within(share, 0.0, 1.0)
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t), 30.0 * t * t * (1.0 - t) ** 2
 
 

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.control.airframe import Part, VelocityLaw
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import SetpointLimits, clamped, shortened
 from skyloop.control.search import TurningSearch
-from skyloop.control.target import Motion, Odometry
-from skyloop.messages import Feedback, Velocity
+from skyloop.messages import Feedback
 from skyloop.messages.geometry import wrap_angle
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ class Axis(NamedTuple):
     above_m: float
 
 
-class GateLaw:
+class GateLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
 
     Attributes:
@@ -88,13 +88,10 @@ class GateLaw:
     def __init__(self, settings: GateSettings | None = None) -> None:
         """Initialise the law."""
         self.settings = s = settings or GateSettings()
+        super().__init__(SetpointLimits(s.speed_m_s, s.climb_m_s, acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
         self.phase = GatePhase.SEARCHING
         self.axis: Axis | None = None  #: as of the last step
-        self._odometry = Odometry()
-        self._altitude: float | None = None
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
-        self._limiter = SetpointLimiter(SetpointLimits(s.speed_m_s, s.climb_m_s, acceleration_m_s2=s.acceleration_m_s2))
-        self._last_ns: int | None = None
         self._gate = _new_filter()
         self._way: Array | None = None  # through the gate, horizontal unit vector
         self._seen_ns: int | None = None
@@ -105,14 +102,15 @@ class GateLaw:
         Args:
             turning: Which way to search first; positive is counter-clockwise.
         """
-        self.phase, self.axis = GatePhase.SEARCHING, None
-        self._gate, self._way, self._seen_ns = _new_filter(), None, None
+        self.phase = GatePhase.SEARCHING
+        self.forget()
         self._search.restart(turning=turning)
 
-    def feedback(self, feedback: Feedback) -> None:
-        """Update with the vehicle's newest state."""
-        self._odometry.add(feedback)
-        self._altitude = feedback.altitude_m
+    def forget(self) -> None:
+        """Forget where the gate is, unless it is passed."""
+        if self.phase is not GatePhase.PASSED:
+            self.phase = GatePhase.SEARCHING
+        self._gate, self._way, self._seen_ns, self.axis = _new_filter(), None, None, None
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting.
@@ -127,10 +125,10 @@ class GateLaw:
             captured_ns: Capture of the frame.
             trust: How sure the normal is, 0 to 1.
         """
-        motion = self._odometry.at(captured_ns)
-        if motion is None or at_capture.roll_rad is None or at_capture.pitch_rad is None or at_capture.yaw_rad is None:
+        found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
+        if found is None:
             return
-        to_level = at_capture.rotation
+        motion, to_level = found
         distance = float(np.linalg.norm(position))
         if not self._gate.update(motion.position + to_level @ position, 0.02 + 0.006 * distance**2, captured_ns):
             return
@@ -139,20 +137,11 @@ class GateLaw:
         self._way = way if self._way is None else (1.0 - weight) * self._way + weight * way
         self._seen_ns = captured_ns
 
-    def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now. All zero until the vehicle's motion is known."""
-        motion = self._odometry.at(now_ns)
-        if motion is None:
-            return Velocity()
-        ahead = motion.moved_to(now_ns + nanoseconds(self.settings.lead_s))
-        wanted = self._wanted(ahead, now_ns)
-        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
-        self._last_ns = now_ns
-        return self._limiter.step(wanted, dt_s)
-
-    def _wanted(self, own: Motion, now_ns: int) -> Array:
-        """Return forward, left, up [m/s] and yaw rate [rad/s]; sets the phase."""
+    def _setpoint(self, now_ns: int) -> Array:
         s = self.settings
+        own = self._motion(now_ns).moved_to(now_ns + nanoseconds(s.lead_s))
+        if self.phase is GatePhase.PASSED:
+            return np.zeros(4)
         if self._seen_ns is None or self._way is None:
             return self._search.step(own.yaw, self._altitude)
         unseen_s = seconds(now_ns - self._seen_ns)
@@ -167,7 +156,7 @@ class GateLaw:
         if self.phase is GatePhase.PASSED:
             return np.zeros(4)
         if self.phase is GatePhase.SEARCHING:
-            self._forget()
+            self.forget()
             return self._search.step(own.yaw, self._altitude)
         bearing = math.atan2(-offset[1], -offset[0])
         look = heading if self.phase is GatePhase.PASSING else bearing
@@ -207,9 +196,6 @@ class GateLaw:
         off = math.hypot(axis.aside_m, axis.above_m)
         share = clamped(1.5 - off / (s.aligned_m + s.cone * left_m), 1.0)
         return max(0.0, share) * min(s.cruise_m_s, 0.1 + 0.9 * left_m)
-
-    def _forget(self) -> None:
-        self._gate, self._way, self._seen_ns, self.axis = _new_filter(), None, None, None
 
 
 def _new_filter() -> ConstantVelocityFilter:

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
+from skyloop.control.airframe import Part, VelocityLaw
 from skyloop.control.behaviour import Behaviour, camera_info
 from skyloop.control.interaction import levelled, servo
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits
+from skyloop.control.limiting import SetpointLimits
 from skyloop.control.search import TurningSearch
 from skyloop.errors import UsageError
-from skyloop.messages import CameraInfo, Feedback, Polyline, Text, Velocity
+from skyloop.messages import CameraInfo, Feedback, Polyline, Text
 from skyloop.messages.annotation import Colour, Shape
 from skyloop.poses import mounting_rotation
 from skyloop.vision import MarkerDetector
@@ -66,7 +67,7 @@ class ServoSettings:
                 raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
 
 
-class ImageServoLaw:
+class ImageServoLaw(VelocityLaw):
     """Computes velocities from points in the image. Pure: times are on the proxy's clock [ns].
 
     Attributes:
@@ -90,6 +91,10 @@ class ImageServoLaw:
         """
         mounting_rotation(camera)  # raises now, and not in flight
         s = self.settings = settings or ServoSettings()
+        limits = SetpointLimits(
+            s.speed_m_s, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2, climb_acceleration_m_s2=2.0
+        )
+        super().__init__(limits, Part.ATTITUDE)
         self.phase = ServoPhase.SEARCHING
         self.error = math.inf  #: root mean square of the points' distances from where they are wanted, plane at z = 1
         self._camera = camera
@@ -97,19 +102,7 @@ class ImageServoLaw:
         self._depth_m = depth_m
         self._velocity = np.zeros(4)
         self._seen_ns: int | None = None
-        self._last_ns: int | None = None
-        self._yaw: float | None = None
-        self._flown: Array | None = None  # forward, left, up [m/s]
-        self._altitude: float | None = None
         self._search = TurningSearch(s.search_rad_s)
-        self._limiter = SetpointLimiter(
-            SetpointLimits(s.speed_m_s, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2, climb_acceleration_m_s2=2.0)
-        )
-
-    def feedback(self, feedback: Feedback) -> None:
-        """Update with the vehicle's newest state."""
-        self._yaw, self._altitude = feedback.yaw_rad, feedback.altitude_m
-        self._flown = None if feedback.velocity_m_s is None else np.asarray(feedback.velocity_m_s)
 
     def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
         """Update with the points of a frame.
@@ -122,10 +115,12 @@ class ImageServoLaw:
             at_capture: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
         """
-        if at_capture.roll_rad is None or at_capture.pitch_rad is None:
+        self.airframe.add(at_capture)
+        roll, pitch = at_capture.roll_rad, at_capture.pitch_rad
+        if roll is None or pitch is None or not np.isfinite([roll, pitch, *np.ravel(points)]).all():
             return
         try:
-            level = levelled(points, self._camera, at_capture.roll_rad, at_capture.pitch_rad)
+            level = levelled(points, self._camera, roll, pitch)
         except UsageError:
             return
         self.error = math.sqrt(float(((level - self._wanted) ** 2).sum(axis=1).mean()))
@@ -135,25 +130,22 @@ class ImageServoLaw:
         self._velocity = servo(level, self._wanted, depths, self._camera, self.settings.gain)
         self._seen_ns = captured_ns
 
-    def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now."""
-        s = self.settings
+    def _setpoint(self, now_ns: int) -> Array:
+        s, feedback = self.settings, self.airframe.feedback
         unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
         wanted = np.zeros(4)
         if unseen_s <= s.fresh_s:
             self.phase, wanted = ServoPhase.SERVOING, self._velocity.copy()
             self._search.restart(turning=float(wanted[3]))
-            if self._flown is not None:
-                wanted[:3] += s.velocity_gain * (wanted[:3] - self._flown)
+            if feedback is not None and feedback.velocity_m_s is not None:
+                wanted[:3] += s.velocity_gain * (wanted[:3] - feedback.velocity_m_s)
         elif unseen_s <= s.holding_s:
             self.phase = ServoPhase.HOLDING
         else:
             self.phase = ServoPhase.SEARCHING
-            if self._yaw is not None:
-                wanted = self._search.step(self._yaw, self._altitude)
-        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
-        self._last_ns = now_ns
-        return self._limiter.step(wanted, dt_s)
+            if feedback is not None and feedback.yaw_rad is not None:
+                wanted = self._search.step(feedback.yaw_rad, self._altitude)
+        return wanted
 
 
 class ImageServo(Behaviour):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
+from skyloop.control.limiting import within
 from skyloop.errors import UsageError
 
 Array = NDArray[np.float64]
@@ -156,7 +157,7 @@ class ConstantVelocityFilter:
         last = self._estimate
         if last is None:
             raise UsageError("the target was never seen")
-        dt = max(0.0, min(longest_s, seconds(at_ns - last.at_ns)))
+        dt = within(seconds(at_ns - last.at_ns), 0.0, longest_s)
         if dt == 0.0:
             return last
         n = self._n

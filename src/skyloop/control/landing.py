@@ -82,10 +82,11 @@ class LandOnMarker(Behaviour):
     def on_feedback(self, feedback: Feedback) -> None:
         """Update the law and send its set-point; once it is down, wait until the vehicle reports that it has landed."""
         if self.phase is LandingPhase.DOWN:
+            self._landing_law.feedback(feedback)  # others may take over and fly it from here
             if feedback.state is FlightState.LANDED and not self.done:
                 self.done = True
                 self.emit("standing on the marker")
-                self.stop()
+                self._end()
             return
         super().on_feedback(feedback)
         if self._frame_ns is not None and not self.blind and not self.done:

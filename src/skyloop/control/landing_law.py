@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.control.airframe import AirframeLaw, Motion, Part
 from skyloop.control.landing_settings import LandingSettings
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.control.response import Predicted, VelocityResponse
 from skyloop.control.spiral import SpiralSearch
-from skyloop.control.target import Motion, Odometry
 from skyloop.control.turning import TurnEstimate, TurningTargetFilter
 from skyloop.messages import Feedback, Velocity
 from skyloop.messages.geometry import rotation_from_euler
@@ -40,6 +40,7 @@ _LATEST_S = 0.1  # for which a turn goes on as in the feedback next to a frame
 _REACTION_S = 0.25  # for which a difference of velocity counts: the vehicle takes it out within this time
 _JUST = 0.999  # of a limit: turned into body axes, a speed may be longer by the last digit
 _MOVES_M_S = 0.1  # what is slower has no direction that could turn
+_FRESH_S = 0.2  # greatest age of the motion by which it counts as down
 _GIVEN_UP_CLIMB_S = 4.0  # a vehicle without an altimeter climbs for so long
 
 
@@ -66,7 +67,7 @@ class _Relative:
     touching_off: float  #: how far off the vehicle would touch if it went down now [m]
 
 
-class LandingLaw:
+class LandingLaw(AirframeLaw):
     """Computes velocities from feedback and sightings; the motors are to stop at :attr:`phase` DOWN.
 
     Times are on the proxy's clock [ns].
@@ -81,14 +82,13 @@ class LandingLaw:
 
     def __init__(self, settings: LandingSettings | None = None) -> None:
         """Initialise the law."""
+        super().__init__(Part.ATTITUDE, Part.VELOCITY)
         self.settings = s = settings or LandingSettings()
         self.phase = LandingPhase.SEARCHING
         self.height_m: float | None = None  #: of the feet over the marker, as of the last step
         self.off_m: float | None = None  #: horizontally from the marker's centre, as of the last step
         self.aborted = 0  #: touch-downs that were aborted so far
-        self._odometry = Odometry()
         self._response = VelocityResponse(s.response)
-        self._altitude: float | None = None
         self._target = TurningTargetFilter()
         self._past: deque[TurnEstimate] = deque()
         self._seen_ns: int | None = None
@@ -98,7 +98,6 @@ class LandingLaw:
         self._search = SpiralSearch(s.search_lane_m, s.search_speed_m_s, s.search_largest_m)
         self._place: Array | None = None  # where it waits
         self._committed_ns: int | None = None
-        self._last_ns: int | None = None
         limits = SetpointLimits(
             s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2, climb_acceleration_m_s2=s.climb_acceleration_m_s2
         )
@@ -114,15 +113,35 @@ class LandingLaw:
         """Whether it has given up and reached the height at which it is safe to hover."""
         if self._gave_up_ns is None:
             return False
-        if self._altitude is None:
+        altitude = self.airframe.altitude_m(now_ns)
+        if altitude is None:
             return seconds(now_ns - self._gave_up_ns) > _GIVEN_UP_CLIMB_S
-        return self._altitude > self.settings.search_height_m - 0.3
+        return altitude > self.settings.search_height_m - 0.3
 
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
-        self._odometry.add(feedback)
-        self._response.add(feedback)
-        self._altitude = feedback.altitude_m
+        super().feedback(feedback)
+        if self.airframe.feedback is not None:
+            self._response.add(self.airframe.feedback)
+
+    def pause(self) -> None:
+        """Restart from rest with the search for the marker; who was down may have been flown elsewhere."""
+        super().pause()
+        self._limiter.reset(Velocity())
+        self._response.pause()
+        self.forget()
+        if self.phase is LandingPhase.DOWN:
+            self.phase = LandingPhase.SEARCHING
+
+    def forget(self) -> None:
+        """Forget where the marker is; who is down, or gave up, stays so."""
+        self._target, self._seen_ns, self._committed_ns = TurningTargetFilter(), None, None
+        self._place, self._searching_ns = None, None
+        self._past.clear()
+        self._search.restart()
+        if self.phase not in (LandingPhase.DOWN, LandingPhase.GIVEN_UP):
+            self.phase = LandingPhase.SEARCHING
+        self.height_m = self.off_m = None
 
     def see(self, position: Array, at_capture: Feedback, captured_ns: int) -> None:
         """Update with a sighting. Ignored while the vehicle's attitude or motion is not known.
@@ -132,12 +151,13 @@ class LandingLaw:
             at_capture: Feedback with the attitude at the capture; if it is from before, its turn goes on.
             captured_ns: Capture of the frame.
         """
-        motion = self._odometry.at(captured_ns)
-        if motion is None or at_capture.roll_rad is None or at_capture.pitch_rad is None or at_capture.yaw_rad is None:
+        found = self.airframe.at_capture(at_capture, captured_ns, position)
+        if found is None:
             return
-        turning = np.asarray(at_capture.angular_velocity_rad_s or (0.0, 0.0, 0.0))
+        motion, rotation = found
+        turning = np.nan_to_num(at_capture.angular_velocity_rad_s or (0.0, 0.0, 0.0))
         turned = turning * clamped(seconds(captured_ns - at_capture.captured_ns), _LATEST_S)
-        place = motion.position + at_capture.rotation @ rotation_from_euler(*turned.tolist()) @ position
+        place = motion.position + rotation @ rotation_from_euler(*turned.tolist()) @ position
         s, sweep_m_s = self.settings, float(np.linalg.norm(np.cross(turning, position)))
         deviation = s.sight_m + s.sight_share * float(np.linalg.norm(position)) + s.sight_s * sweep_m_s
         unseen_s = self._unseen_s(captured_ns)
@@ -152,10 +172,12 @@ class LandingLaw:
             self._past.popleft()
 
     def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now. All zero until the vehicle's motion is known, and when it is down."""
-        newest, ahead = self._odometry.newest, self._response.predict(now_ns)
-        if newest is None or ahead is None or self.phase is LandingPhase.DOWN:
+        """Compute the set-point for now. All zero while the vehicle's motion is not known, and when it is down."""
+        if self.phase is LandingPhase.DOWN or not self._ready(now_ns):
             return Velocity()
+        newest, ahead = self.airframe.newest, self._response.predict(now_ns)
+        assert newest is not None
+        assert ahead is not None
         if self._began_ns is None:
             self._began_ns = now_ns
         own = _then(newest, ahead)
@@ -165,10 +187,8 @@ class LandingLaw:
         self.phase = self._next_phase(relative, now_ns)
         acceleration, up = self._wanted(own, relative, now_ns)
         velocity = shortened(self._response.setpoint(acceleration, ahead), _JUST * self.settings.speed_m_s)
-        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
-        self._last_ns = now_ns
         up = self._allowed(up + self.settings.climb_gain * (up - float(own.velocity[2])))
-        wanted = self._limiter.step(np.array([*velocity, up, self._turn(own)]), dt_s)
+        wanted = self._limiter.step(np.array([*velocity, up, self._turn(own)]), self._since_s(now_ns))
         self._response.sent(np.array([wanted.forward, wanted.left]), now_ns)
         forward, left = own.to_body(np.array([wanted.forward, wanted.left]))
         return Velocity(forward=forward, left=left, up=wanted.up, yaw_rate=wanted.yaw_rate)
@@ -204,7 +224,7 @@ class LandingLaw:
             return LandingPhase.GIVEN_UP
         late = seconds(now_ns - (self._began_ns or now_ns)) > s.give_up_s
         if self._committed_ns is not None and relative is not None:
-            if relative.height <= s.touch_m:
+            if relative.height <= s.touch_m and self.airframe.age_s(Part.VELOCITY, now_ns) <= _FRESH_S:
                 return LandingPhase.DOWN
             if not self._misses(relative, now_ns):
                 return LandingPhase.COMMITTED
@@ -300,7 +320,7 @@ class LandingLaw:
         """Limit a climb [m/s]; towards the ceiling it slows down, as the proxy would do it."""
         most = self.settings.climb_m_s
         room = math.inf if self._altitude is None else max(0.0, self.settings.ceiling_m - self._altitude)
-        return max(-most, min(most, room, up))
+        return within(up, -most, min(most, room))
 
     def _to_search_height(self) -> float:
         if self._altitude is None:

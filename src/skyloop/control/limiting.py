@@ -1,4 +1,7 @@
-"""Limits of numbers, vectors and set-points: of their size, and of how fast they change. Pure."""
+"""Limits of numbers, vectors and set-points: of their size, and of how fast they change. Pure.
+
+NaN passes none of them: it counts as 0, or as the number of the range that is nearest to 0.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +20,22 @@ GRAVITY_M_S2 = 9.80665  #: standard gravity
 _LONGEST_STEP_S = 0.2  # a longer pause gives no right to a larger step
 
 
+def within(value: float, low: float, high: float) -> float:
+    """Return the nearest value from ``low`` to ``high``; NaN counts as 0."""
+    return max(low, min(high, 0.0 if math.isnan(value) else value))
+
+
 def clamped(value: float, longest: float) -> float:
-    """Return the nearest value within ±``longest``."""
-    return max(-longest, min(longest, value))
+    """Return the nearest value within ±``longest``; NaN counts as 0."""
+    return within(value, -longest, longest)
 
 
 def shortened(vector: Array, longest: float) -> Array:
-    """Return a vector (n,) of the same direction whose length is at most ``longest``."""
+    """Return a vector (n,) of the same direction, at most ``longest``; zero if a component is not finite."""
     length = math.sqrt(float(vector @ vector))
-    return vector if length <= longest else vector * (longest / length)
+    if length <= longest and length < math.inf:
+        return vector
+    return vector * (longest / length) if length < math.inf else np.zeros_like(vector)
 
 
 def lowered(own: float, limits: Mapping[str, Value], name: str, less: float = 0.0) -> float:
@@ -74,11 +84,11 @@ class SetpointLimiter:
         """Limit the next set-point.
 
         Args:
-            wanted: Forward, left, up [m/s] and yaw rate [rad/s], shape (4,).
+            wanted: Forward, left, up [m/s] and yaw rate [rad/s], shape (4,); what is not finite counts as 0.
             dt_s: Time since the last call; counts as 0.2 s at most, so that a pause does not allow a larger step.
         """
-        limits, dt = self.limits, max(0.0, min(_LONGEST_STEP_S, dt_s))
-        result = np.asarray(wanted, dtype=np.float64).copy()
+        limits, dt = self.limits, within(dt_s, 0.0, _LONGEST_STEP_S)
+        result = np.nan_to_num(np.asarray(wanted, dtype=np.float64), posinf=0.0, neginf=0.0)
         result[:2] = shortened(result[:2], limits.speed_m_s)
         result[2] = clamped(float(result[2]), limits.climb_m_s)
         result[3] = clamped(float(result[3]), limits.turn_rad_s)

@@ -13,6 +13,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skyloop.control.limiting import within
 from skyloop.control.motion_profile import MotionProfile
 from skyloop.errors import MissingExtraError, UsageError
 
@@ -70,7 +71,7 @@ class FunctionPath:
         Raises:
             UsageError: The function does not return three finite numbers.
         """
-        return _point(self._position(self._within(t_s)))
+        return _point(self._position(within(t_s, 0.0, self.duration_s)))
 
     def velocity(self, t_s: float) -> Array:
         """Return the velocity at a time [s], shape (3,) [m/s]; 0 before the start and from the end on.
@@ -82,11 +83,8 @@ class FunctionPath:
             return np.zeros(3)
         if self._velocity is not None:
             return _point(self._velocity(t_s))
-        before, after = self._within(t_s - _DIFFERENCE_S), self._within(t_s + _DIFFERENCE_S)
+        before, after = (within(t_s + d, 0.0, self.duration_s) for d in (-_DIFFERENCE_S, _DIFFERENCE_S))
         return (self.position(after) - self.position(before)) / (after - before)
-
-    def _within(self, t_s: float) -> float:
-        return max(0.0, min(self.duration_s, t_s))
 
 
 class Polyline:
@@ -301,7 +299,7 @@ class Spline:
 
     def position(self, t_s: float) -> Array:
         """Return the position at a time [s], shape (3,) [m]."""
-        return np.asarray(self._curve(max(0.0, min(self.duration_s, t_s))), dtype=np.float64)
+        return np.asarray(self._curve(within(t_s, 0.0, self.duration_s)), dtype=np.float64)
 
     def velocity(self, t_s: float) -> Array:
         """Return the velocity at a time [s], shape (3,) [m/s]."""

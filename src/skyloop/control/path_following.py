@@ -17,8 +17,8 @@ from skyloop.control.path import Path, Polyline
 from skyloop.control.path_law import PathLaw, PathSettings
 from skyloop.control.position import Fix, PositionSource, fix_of
 from skyloop.control.waypoint import Waypoint, lacking
-from skyloop.errors import UsageError
-from skyloop.messages import EventKind, Feedback, Severity, Vector
+from skyloop.errors import AuthorityError, UsageError
+from skyloop.messages import EventKind, Feedback, Severity, Vector, Velocity
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -60,7 +60,7 @@ class _PathFlyer(Controller):
         super().__init__(drone)
         if not 0.0 < max_age_s < math.inf:
             raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds above 0")
-        self.settings = settings or PathSettings()
+        self.settings = (settings or PathSettings()).within(dict(drone.config.items()))
         self.error = TrackingError()  #: distance from where it should have been, as the position source has it
         self.done = False  #: the whole path was flown
         self.lost = False  #: the position is not known now, and the vehicle hovers
@@ -88,7 +88,7 @@ class _PathFlyer(Controller):
         fix = fix_of(feedback) if self._source is None else self._source()
         if self._source is None and fix is None and self._law is None:
             raise UsageError(f"it can't fly a path: {lacking(feedback)}; or give the controller a source of positions")
-        if fix is None or feedback.captured_ns - fix.at_ns > self._max_age_ns:
+        if fix is None or not fix.finite or feedback.captured_ns - fix.at_ns > self._max_age_ns:
             self._lose()
             return
         if self.lost:
@@ -99,7 +99,7 @@ class _PathFlyer(Controller):
         wanted = self._law.step(fix)
         self._look(self._law, fix)
         if not self.done:
-            self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
+            self._send(wanted)
 
     def _begin(self, fix: Fix) -> PathLaw:
         """Return the law for the first fix."""
@@ -112,7 +112,7 @@ class _PathFlyer(Controller):
     def _finish(self) -> None:
         self.done = True
         self.drone._core.let_go("the path is flown")
-        self.stop()
+        self._end()
 
     def _lose(self) -> None:
         if not self.lost:
@@ -121,6 +121,15 @@ class _PathFlyer(Controller):
         if self._law is not None:
             self._law.pause()
         self.drone._core.let_go("the position is not known")
+
+    def _send(self, action: Velocity) -> None:
+        """Send a set-point; while others have the authority the law pauses."""
+        try:
+            self.drone.command(action)
+        except AuthorityError:
+            if self._law is not None:
+                self._law.pause()
+            raise
 
 
 class FollowPath(_PathFlyer):

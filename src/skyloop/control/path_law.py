@@ -1,7 +1,7 @@
 """The law that keeps a vehicle on a path: position in, velocities out. Pure: no clock, no thread.
 
-The path's own velocity is fed forward, ahead by what the vehicle needs to take it up, and PI loops on the position
-remove the rest: the integral is for wind and for a velocity that the vehicle measures wrong (Åström and Hägglund,
+The path's own velocity is fed forward, ahead by what the vehicle needs to take it up, and a PI loop on the position
+removes the rest: the integral is for wind and for a velocity that the vehicle measures wrong (Åström and Hägglund,
 "Advanced PID Control", ISA 2006, chapter 5). A measured position is compared with the path at the time of the
 measurement, so that its delay is no error.
 """
@@ -9,24 +9,26 @@ measurement, so that its delay is no error.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
 from skyloop.control.heading import YawMode
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits, lowered, within
 from skyloop.control.path import Path
-from skyloop.control.pid import Gains, Pid
+from skyloop.control.pid import Gains, VectorPi
 from skyloop.control.position import Fix
 from skyloop.errors import UsageError
-from skyloop.messages import Velocity
+from skyloop.messages import Value, Velocity
 from skyloop.messages.geometry import wrap_angle
 
 Array = NDArray[np.float64]
 _LONGEST_STEP_S = 0.5  # a longer gap between two fixes does not move the path on by more
 _MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
+_SHARE = 0.5  # of the greatest speed, for the integral at most: there is no wind to fly against beyond that
 _AHEAD_S = 0.1  # interval over which the rate of the wanted yaw is computed
 
 
@@ -38,7 +40,8 @@ class PathSettings:
         UsageError: A number is out of its range.
     """
 
-    gains: Gains = field(default_factory=lambda: Gains(p=1.6, i=0.15))  #: by position error [1/s, 1/s²]
+    #: Of the position error [1/s, 1/s²]; without a derivative, in place of which there is ``velocity_gain``.
+    gains: Gains = field(default_factory=lambda: Gains(p=1.6, i=0.15))
     #: Share of the velocity's error, where the velocity is known, that is asked for on top: a vehicle whose own loop is
     #: soft takes it up sooner, and gusts push it less far.
     velocity_gain: float = 1.0
@@ -59,6 +62,26 @@ class PathSettings:
             allowed = "a finite number, 0 or more" if name in _MAY_BE_ZERO else "a finite number above 0"
             if not 0.0 <= value < math.inf or (value == 0.0 and name not in _MAY_BE_ZERO):
                 raise UsageError(f"{name} is {value!r} and must be {allowed}")
+        if self.gains.d > 0.0:
+            raise UsageError(f"gains.d is {self.gains.d!r} and must be 0: velocity_gain damps")
+
+    def within(self, limits: Mapping[str, Value]) -> PathSettings:
+        """Return these settings within the limits of a drone: what it does not fly would wind up the integral.
+
+        Args:
+            limits: ``limits.speed``, ``limits.climb`` and ``limits.yaw_rate``, as in ``drone.config``; one that is
+                missing limits nothing.
+        """
+        own = self.limits
+        return replace(
+            self,
+            limits=replace(
+                own,
+                speed_m_s=lowered(own.speed_m_s, limits, "limits.speed"),
+                climb_m_s=lowered(own.climb_m_s, limits, "limits.climb"),
+                turn_rad_s=lowered(own.turn_rad_s, limits, "limits.yaw_rate"),
+            ),
+        )
 
 
 class PathLaw:
@@ -82,8 +105,9 @@ class PathLaw:
         self.off_m = 0.0  #: distance from where it should have been, as of the last fix
         self._path = path
         self._yaw = yaw
-        self._loops = [Pid(self.settings.gains) for _ in range(3)]
-        self._limiter = SetpointLimiter(self.settings.limits)
+        limits = self.settings.limits
+        self._loop = VectorPi(self.settings.gains, 3, most=_SHARE * limits.speed_m_s)
+        self._limiter = SetpointLimiter(limits)
         self._last: Fix | None = None
         self._wanted_yaw: float | None = None
         self._turning = 0.0  # of the wanted yaw [rad/s]
@@ -110,8 +134,10 @@ class PathLaw:
             self._yaw = yaw
 
     def pause(self) -> None:
-        """Restart set-points from rest, because the vehicle was made to hover meanwhile."""
+        """Restart from rest and without an integral, because the vehicle hovers, or others fly it; the path waits."""
         self._limiter.reset(Velocity())
+        self._loop.reset()
+        self._last = None
 
     def there(self, fix: Fix) -> bool:
         """Whether the path is over and the vehicle within the acceptance radius of its end, at the wanted yaw."""
@@ -120,19 +146,20 @@ class PathLaw:
         return self.over and self._off(fix) <= s.near_m and abs(turned) <= s.near_rad
 
     def step(self, fix: Fix) -> Velocity:
-        """Compute the set-point for a fix. One that is not newer than the last does not advance the path."""
+        """Compute the set-point for a fix. One that is not newer than the last does not advance the path.
+
+        One with numbers that are not finite pauses the flight.
+        """
+        if not fix.finite:
+            self.pause()
+            return Velocity()
         dt_s = 0.0 if self._last is None else max(0.0, seconds(fix.at_ns - self._last.at_ns))
         self._last = fix
         self._go_on(min(dt_s, _LONGEST_STEP_S), self._off(fix))
         self.off_m = self._off(fix)
         target, _ = self.target
         ahead = self._path.velocity(self.time_s + self.settings.lead_s)
-        wanted = np.array(
-            [
-                loop.step(float(to), at, dt_s, float(feed))
-                for loop, to, at, feed in zip(self._loops, target, fix.position_m, ahead, strict=True)
-            ]
-        )
+        wanted = ahead + self._loop.step(target - fix.position_m, min(dt_s, _LONGEST_STEP_S))
         if fix.velocity_m_s is not None:
             wanted += self.settings.velocity_gain * (wanted - fix.velocity_m_s)
         c, s = math.cos(fix.yaw_rad), math.sin(fix.yaw_rad)
@@ -141,8 +168,7 @@ class PathLaw:
             np.array([c * wanted[0] + s * wanted[1], c * wanted[1] - s * wanted[0], wanted[2], turn]), dt_s
         )
         asked = (c * velocity.forward - s * velocity.left, s * velocity.forward + c * velocity.left, velocity.up)
-        for loop, applied in zip(self._loops, asked, strict=True):
-            loop.applied(applied)
+        self._loop.applied(wanted, np.array(asked))
         return velocity
 
     def _off(self, fix: Fix) -> float:
@@ -150,7 +176,7 @@ class PathLaw:
 
     def _go_on(self, dt_s: float, off_m: float) -> None:
         """Advance the path's time, slower beyond the leash, and not at all from twice the leash on."""
-        share = max(0.0, min(1.0, 2.0 - off_m / self.settings.leash_m))
+        share = within(2.0 - off_m / self.settings.leash_m, 0.0, 1.0)
         self.time_s = min(self._path.duration_s, self.time_s + share * dt_s)
 
     def _turn(self, fix: Fix) -> float:

@@ -1,8 +1,9 @@
-"""A PID controller of one number. Pure: the time step is an argument.
+"""A PID controller of one number, and a PI controller of a vector. Pure: the time step is an argument.
 
 Åström and Hägglund, "Advanced PID Control", ISA 2006: the derivative acts on the measurement and through a filter
 (section 3.3), what a limit takes off is fed back into the integral (back-calculation, section 3.5), and new gains do
-not make the output jump, because the integral term, not the integral, is kept (section 3.6).
+not make the output jump, because the integral term, not the integral, is kept (section 3.6). The vector's integral
+grows only as far as limits after the loop don't take off what it asks for (conditional integration, section 3.5).
 """
 
 from __future__ import annotations
@@ -10,10 +11,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from skyloop.control.filters import LowPass, gain
-from skyloop.control.limiting import clamped
+from skyloop.control.limiting import clamped, shortened, within
 from skyloop.errors import UsageError
 from skyloop.messages.geometry import wrap_angle
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +125,10 @@ class Pid:
             feed_forward: Is added to the output before the limits.
 
         Returns:
-            The output, within ``low`` and ``high`` and the rate limit.
+            The output, within ``low`` and ``high`` and the rate limit; as before where an argument is not finite.
         """
+        if not all(map(math.isfinite, (set_point, measured, feed_forward, dt_s))):
+            return 0.0 if self._output is None else self._output
         g = self._gains
         error = self._difference(set_point, measured)
         if self._measured is not None and dt_s > 0.0:
@@ -128,7 +136,7 @@ class Pid:
             self._integral += g.i * error * dt_s
         self._measured, self._error, self._dt_s = measured, error, dt_s
         self._unlimited = feed_forward + g.p * error + self._integral - g.d * (self._slope.value or 0.0)
-        limited = max(self._low, min(self._high, self._unlimited))
+        limited = within(self._unlimited, self._low, self._high)
         if self._output is not None and self._rate < math.inf:
             nearer = self._output + clamped(limited - self._output, self._rate * max(0.0, dt_s))
             # The sum is rounded, and may be a last bit beyond the limit that it goes to.
@@ -166,3 +174,43 @@ class Pid:
 
     def _difference(self, to: float, back: float) -> float:
         return wrap_angle(to - back) if self._angle else to - back
+
+
+class VectorPi:
+    """A PI loop of a vector. Its integral grows only by what is really applied, and not at all in a pause.
+
+    Attributes:
+        integral: The integral term, (n,), in units of the output.
+    """
+
+    def __init__(self, gains: Gains, dimensions: int, *, most: float = math.inf) -> None:
+        """Initialise the loop.
+
+        Args:
+            gains: Their derivative and ``tracking_s`` are not used.
+            dimensions: Of the vector.
+            most: Greatest length of the integral term.
+        """
+        self.gains = gains
+        self._most = most
+        self._before = self.integral = np.zeros(dimensions)
+
+    def step(self, error: Array, dt_s: float) -> Array:
+        """Return the output (n,) for an error (n,) that lasted for ``dt_s`` [s]; report :meth:`applied` after it."""
+        self._before = self.integral
+        self.integral = shortened(self.integral + self.gains.i * error * dt_s, self._most)
+        return self.gains.p * error + self.integral
+
+    def applied(self, asked: Array, applied: Array) -> None:
+        """Take back by how much the integral grew, along the axes in which less was applied than was asked for.
+
+        Args:
+            asked: All that was asked for with the last output in it, (n,).
+            applied: What limits left of it, (n,).
+        """
+        wound_up = (applied - asked) * (self.integral - self._before) < 0.0
+        self.integral = np.where(wound_up, self._before, self.integral)
+
+    def reset(self) -> None:
+        """Restart without an integral, because others flew, or what was measured is too old."""
+        self._before = self.integral = np.zeros_like(self.integral)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-from skyloop.control.target import Odometry
+from skyloop.control.airframe import Airframe
 from skyloop.messages import Feedback, Vector
 
 if TYPE_CHECKING:
@@ -20,6 +20,11 @@ class Fix(NamedTuple):
     position_m: Vector  #: [m]
     yaw_rad: float  #: counter-clockwise from x [rad]
     velocity_m_s: Vector | None = None  #: in world axes [m/s], if it is known
+
+    @property
+    def finite(self) -> bool:
+        """Whether all its numbers are finite."""
+        return all(map(math.isfinite, (*self.position_m, self.yaw_rad, *(self.velocity_m_s or ()))))
 
 
 #: Returns the newest known position, None while it is not known; must not block.
@@ -57,7 +62,7 @@ class DeadReckoning:
             begin: Where it is now, x and y [m].
         """
         self._begin = begin
-        self._odometry = Odometry()
+        self._airframe = Airframe()
         self._newest: Fix | None = None
         self._listener = drone.on_feedback(self._take, inline=True)
 
@@ -70,8 +75,8 @@ class DeadReckoning:
         self._listener.cancel()
 
     def _take(self, feedback: Feedback) -> None:
-        self._odometry.add(feedback)
-        motion = self._odometry.newest
+        self._airframe.add(feedback)
+        motion = self._airframe.newest
         if motion is None or motion.at_ns != feedback.captured_ns:
             return  # nothing new, or nothing of use
         east, north, up = motion.position.tolist()

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.filters import gain
-from skyloop.control.limiting import GRAVITY_M_S2, shortened
+from skyloop.control.limiting import GRAVITY_M_S2, shortened, within
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler
@@ -115,6 +115,11 @@ class VelocityResponse:
             self._correct((self._lean + lean) / 2, velocity, seconds(feedback.captured_ns - before_ns))
             self._lean = lean
 
+    def pause(self) -> None:
+        """Forget the set-points that are under way, because others flew the vehicle; and the trim, learnt by them."""
+        self._setpoints.clear()
+        self._trim = np.zeros(2)
+
     def sent(self, velocity: Array, now_ns: int) -> None:
         """Note a velocity set-point (2,) [m/s] that is sent now."""
         self._setpoints.append((now_ns + nanoseconds(self.settings.delay_s), np.asarray(velocity, dtype=np.float64)))
@@ -124,7 +129,7 @@ class VelocityResponse:
         if self._at_ns is None:
             return None
         end_ns = now_ns + nanoseconds(self.settings.delay_s)
-        horizon_s = max(0.0, min(_LONGEST_PREDICTION_S, seconds(end_ns - self._at_ns)))
+        horizon_s = within(seconds(end_ns - self._at_ns), 0.0, _LONGEST_PREDICTION_S)
         steps = max(1, round(horizon_s / _STEP_S))
         dt = horizon_s / steps
         moved, velocity, lean = np.zeros(2), self._velocity, self._lean

@@ -104,7 +104,7 @@ class FlyRoute(Controller):
             self._carry_out(law.pause(refused))
         self._carry_out(law.update(feedback, feedback.captured_ns))
         if law.over:
-            self.stop()
+            self._end()
         elif self._logged_ns is None or feedback.captured_ns - self._logged_ns >= nanoseconds(_LOG_S):
             self._logged_ns = feedback.captured_ns
             self.drone.log.array(WAYPOINTS, [one.position for one in law.route.waypoints[law.index :]])

@@ -82,6 +82,7 @@ class RouteLaw:
         self._goals: list[RouteWaypoint] = list(route.waypoints)
         self._step = 0  # the action that is done at the waypoint
         self._arrived = False  # at the waypoint: its actions have begun
+        self._skipped_all = False  # while paused: what is left is its end
         self._since_ns: int | None = None  # when the present action began
         self._deadline_ns: int | None = None
         self._photo: str | None = None  # what became of the photo: empty for saved; None: not known yet
@@ -127,14 +128,16 @@ class RouteLaw:
         return [Command(Hover()), self._tell("paused", why or "as asked")]
 
     def resume(self) -> list[Effect]:
-        """Fly on, straight to the waypoint that comes next."""
+        """Fly on, straight to the waypoint that comes next; to the route's end if all were left out."""
         if self.state is not RouteState.PAUSED:
             return []
+        if self._skipped_all:
+            return [self._tell("resumed", "to its end"), *self._finish()]
         return [self._tell("resumed", f"to {self._what()}"), *self._fly()]
 
     def skip(self) -> list[Effect]:
-        """Leave the present waypoint out; a paused route stays paused."""
-        if self.over or self.state is RouteState.READY:
+        """Leave the present waypoint out; a paused route stays paused, also where none is left."""
+        if self.over or self.state is RouteState.READY or self._skipped_all:
             return []
         told = self._tell("skipped", self._what())
         return [told, *self._next(fly=self.is_under_way)]
@@ -234,6 +237,10 @@ class RouteLaw:
         if self.index < len(self._goals):
             return self._fly() if fly else []
         self.index = len(self._goals) - 1
+        self._skipped_all = not fly
+        return self._finish() if fly else []
+
+    def _finish(self) -> list[Effect]:
         self.state = RouteState.DONE
         return [Command(Hover() if self.route.end == "hover" else Land()), self._tell("done", self.route.end)]
 

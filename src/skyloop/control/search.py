@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.control.limiting import clamped
+from skyloop.control.limiting import clamped, within
 from skyloop.messages.geometry import wrap_angle
 
 Array = NDArray[np.float64]
@@ -67,6 +67,6 @@ class TurningSearch:
             self._base = altitude if self._base is None else self._base
             sweep = int(self._turned / (2 * math.pi))
             goal = self._base + self._heights[sweep % len(self._heights)]
-            goal = max(self._lowest, min(self._highest, goal))
+            goal = within(goal, self._lowest, self._highest)
             up = clamped(0.8 * (goal - altitude), 0.4)
         return np.array([0.0, 0.0, up, self._direction * self._rate])

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
+from skyloop.control.limiting import within
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
 
@@ -343,7 +344,7 @@ def _innovation(view: BoxView, camera: Camera, state: Array, radius_m: float) ->
     dx, dy = float(state[0] - eye[0]), float(state[1] - eye[1])
     distance = max(_NEAREST_M, math.hypot(dx, dy))
     ux, uy = dx / distance, dy / distance
-    height = math.exp(min(5.0, max(-4.0, float(state[5]))))
+    height = math.exp(within(float(state[5]), -4.0, 5.0))
     off = view.azimuth - math.atan2(dy, dx)
     rows = [math.atan2(math.sin(off), math.cos(off))]
     jacobian = [[-uy / distance, ux / distance, 0.0, 0.0, 0.0, 0.0]]

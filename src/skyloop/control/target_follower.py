@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
+from skyloop.control.airframe import AirframeLaw, Part
 from skyloop.control.chase_law import LOSSES, ChaseLaw, FollowMode, TargetPhase
 from skyloop.control.chase_settings import ChaseSettings
-from skyloop.control.dead_reckoning import Tilting, TiltVelocity
-from skyloop.control.target import Odometry
 from skyloop.control.target_estimate import TargetEstimator, Traits
 from skyloop.control.target_finder import Sighting, TargetFinder
 from skyloop.control.target_view import Camera, predicted_box
@@ -41,7 +40,6 @@ _OTHER: Final[Colour] = (150, 150, 150)
 _TRACE_S: Final = 4.0
 _TRACE_EACH_S: Final = 0.2
 _FEET_M: Final = 0.08  # below the body's centre: what heights above the ground are measured from
-_STALE_S: Final = 0.5  # the vehicle's motion is not known for longer: it is held
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +60,7 @@ class FollowStatus:
     problem: str = ""  #: what keeps it from being followed as wanted; empty for nothing
 
 
-class TargetFollower:
+class TargetFollower(AirframeLaw):
     """Follows one target. Call it from one thread.
 
     Attributes:
@@ -107,16 +105,12 @@ class TargetFollower:
             raise UsageError(f"to follow any {class_name!r} a detector is needed: give detector=…, or a box")
         if box is not None and not all(np.isfinite(part) for part in box):
             raise UsageError(f"the box is {box!r} and must be of finite numbers")
+        super().__init__(Part.ATTITUDE, Part.VELOCITY)
         self._law = ChaseLaw(settings, FollowMode(mode))
         self._camera = camera
         self._detector = detector
         self._box, self._class_name, self._traits = box, class_name, traits
         self._finder: TargetFinder | None = None
-        self._odometry = Odometry()
-        self._newest: Feedback | None = None
-        self._relative = False
-        self._tilting = Tilting()
-        self._reckoning = TiltVelocity()
         self._seen_ns: int | None = None  # capture of the last frame that showed the target, or may have
         self._sighting = Sighting(None, None)
         self._view: Camera | None = None  # of the newest frame
@@ -163,15 +157,21 @@ class TargetFollower:
 
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
-        self._newest = feedback
-        self._tilting.add(feedback)
         if self._finder is None:
-            self._relative = feedback.velocity_m_s is None
-        if self._relative:
-            feedback = msgspec.structs.replace(feedback, velocity_m_s=self._reckoning.step(feedback))
-        self._odometry.add(feedback)
-        if not self._relative:
-            self._law.feedback(feedback)
+            self.airframe.by_tilt = feedback.velocity_m_s is None
+        super().feedback(feedback)
+        if not self._relative and self.airframe.feedback is not None:
+            self._law.feedback(self.airframe.feedback)
+
+    def pause(self) -> None:
+        """Restart set-points from rest; the target is kept."""
+        super().pause()
+        self._law.pause()
+
+    @property
+    def _relative(self) -> bool:
+        """Whether the vehicle reports no velocity: it is flown by attitude."""
+        return self.airframe.by_tilt
 
     def look(self, frame: Frame) -> list[Shape]:
         """Find the target in the next frame. The first call starts with the box that was given.
@@ -183,7 +183,8 @@ class TargetFollower:
             UsageError: The first box does not fit into the image, or the camera's intrinsics are not known.
         """
         state = frame.feedback
-        motion = self._odometry.at(frame.captured_ns)
+        # A vehicle whose velocity is not known any more hovers where it was last.
+        motion = self.airframe.at(frame.captured_ns) or self.airframe.newest
         if state is None or motion is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
         if frame.intrinsics is None:
@@ -195,7 +196,7 @@ class TargetFollower:
         rates = (0.0, 0.0)
         if state.angular_velocity_rad_s is None and state.yaw_rad is not None:
             # No gyroscope, so attitude comes seldom, and images bear the time of their arrival.
-            rates = motion.yaw_rate, self._tilting.rate_rad_s
+            rates = motion.yaw_rate, self.airframe.tilt_rate_rad_s
             if frame.captured_ns > state.captured_ns:
                 state = msgspec.structs.replace(state, yaw_rad=motion.yaw)
         size = (frame.shape[1], frame.shape[0])
@@ -225,7 +226,7 @@ class TargetFollower:
             captured_ns: Of that frame.
         """
         if self._finder is not None:
-            ground = self._newest is not None and self._newest.altitude_m is not None
+            ground = self.airframe.feedback is not None and self.airframe.feedback.altitude_m is not None
             if self._finder.detected(detections, captured_ns, ground=ground):
                 self._seen_ns = max(captured_ns, self._seen_ns or 0)
 
@@ -234,19 +235,19 @@ class TargetFollower:
 
         A vehicle that does not report its velocity is flown by attitude.
         """
-        motion, newest = self._odometry.at(now_ns), self._newest
-        if motion is None or newest is None or seconds(now_ns - newest.captured_ns) > _STALE_S:
+        if not self._ready(now_ns):
             return Attitude() if self._relative else Velocity()
         finder = self._finder
         return self._law.step(
             now_ns,
-            motion,
-            newest.altitude_m,
+            self._motion(now_ns),
+            self._altitude,
             self._estimator,
             self._seen_ns,
             () if finder is None else finder.others(now_ns),
             candidate=None if finder is None else finder.candidate(now_ns),
             relative=self._relative,
+            position=self.airframe.position_m(now_ns),
         )
 
     @property
@@ -277,6 +278,8 @@ class TargetFollower:
         )
 
     def _problem(self) -> str:
+        if self.problem:
+            return self.problem
         if self._sighting.contested:
             return "something like it is where it should be"
         return "at the end of the leash" if self._law.held_by else ""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.kalman import ConstantVelocityFilter, Estimate
+from skyloop.control.limiting import within
 from skyloop.errors import UsageError
 
 Array = NDArray[np.float64]
@@ -209,7 +210,7 @@ class TurningTargetFilter:
 
     def predicted(self, last: TurnEstimate, at_ns: int, *, longest_s: float = math.inf) -> TurnEstimate:
         """Predict the motion from any estimate of this filter; see :meth:`at`."""
-        left_s = max(0.0, min(longest_s, seconds(at_ns - last.at_ns)))
+        left_s = within(seconds(at_ns - last.at_ns), 0.0, longest_s)
         steps = math.ceil(left_s / _STEP_S)
         for _ in range(steps):
             last = self._moved(last, left_s / steps)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from skyloop.control.limiting import clamped
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, Vector, Velocity
 from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
@@ -63,9 +64,10 @@ class WaypointSettings:
 
 def lacking(feedback: Feedback) -> str:
     """Return why a vehicle can't be flown to a position and what helps, or an empty string if it can."""
-    if feedback.position_m is None:
+    if feedback.position_m is None or not all(map(math.isfinite, feedback.position_m)):
         return f"{NO_POSITION}: {POSITION_SOURCES}"
-    return "the vehicle does not report its yaw" if feedback.yaw_rad is None else ""
+    yaw = feedback.yaw_rad
+    return "" if yaw is not None and math.isfinite(yaw) else "the vehicle does not report its yaw"
 
 
 def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> Velocity:
@@ -93,7 +95,7 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
         forward=share * (c * east + si * north),
         left=share * (c * north - si * east),
         up=math.copysign(_approach(abs(up), s.climb_m_s, s), up),
-        yaw_rate=max(-s.turn_rad_s, min(s.turn_rad_s, s.yaw_gain * yaw)),
+        yaw_rate=clamped(s.yaw_gain * yaw, s.turn_rad_s),
     )
 
 

@@ -1,7 +1,8 @@
 """The control socket of a host: what ``skyloop host add``, ``remove`` and ``status`` ask it.
 
-One request and one answer for each connection, in JSON. The socket ``NAME.host`` lies beside those of the proxies, and
-who may connect to them may use it: the host's user, the superuser, and members of the group that it was given.
+One request and one answer for each connection, in JSON, cut into packets. The socket ``NAME.host`` lies beside those of
+the proxies, and who may connect to them may use it: the host's user, the superuser, and members of the group it was
+given.
 """
 
 from __future__ import annotations
@@ -30,10 +31,12 @@ from skyloop.host.vehicle import VehicleStatus, reason_of
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
 
-MAX_REQUEST: Final = 1 << 16  #: bytes
+MAX_REQUEST: Final = 1 << 22  #: bytes, in packets of ``_CHUNK``
+MAX_PACKET: Final = 1 << 16  #: bytes
 MAX_ANSWER: Final = 1 << 22  #: bytes
 ANSWERS_WITHIN_S: Final = 60.0  #: of a request that lands a vehicle first
 _CHUNK: Final = 1 << 15
+_AGAIN_S: Final = 0.1  # until a connection is accepted again that could not be
 _SLOW_S: Final = 2.0  # for the other end to take or to send a packet
 _log = logging.getLogger(__name__)
 
@@ -102,6 +105,7 @@ class ControlServer:
         self._listener: Socket | None = None
         self._inode = 0
         self._thread: threading.Thread | None = None
+        self._ended = threading.Event()
 
     def start(self) -> None:
         """Begin.
@@ -121,6 +125,7 @@ class ControlServer:
         listener, self._listener = self._listener, None
         if listener is None or self._thread is None:
             return
+        self._ended.set()
         listener.hang_up()
         self._thread.join()
         self._directory.remove(self._name, self._inode)
@@ -129,10 +134,15 @@ class ControlServer:
         while self._listener is not None:
             try:
                 accepted, _ = listener.accept()
-            except OSError:
-                continue  # the end, or a caller that is gone
+            except OSError:  # the end, a caller that is gone, or no descriptor is left: not asked for all the time
+                self._ended.wait(_AGAIN_S)
+                continue
             sock = Socket(accepted.detach())
-            threading.Thread(target=self._serve, args=(sock,), name="skyloop-host-request", daemon=True).start()
+            try:
+                threading.Thread(target=self._serve, args=(sock,), name="skyloop-host-request", daemon=True).start()
+            except RuntimeError as error:  # no thread is to be had, for a moment
+                _log.warning("a request is not answered: %s", error)
+                sock.hang_up()
 
     def _serve(self, sock: Socket) -> None:
         set_timeout(sock, socket.SO_RCVTIMEO, _SLOW_S)
@@ -140,9 +150,7 @@ class ControlServer:
         try:
             answer = self._answer(sock)
             if answer is not None:
-                packet = msgspec.json.encode(answer)
-                for first in range(0, len(packet), _CHUNK):
-                    sock.send(packet[first : first + _CHUNK], socket.MSG_NOSIGNAL)
+                _send(sock, msgspec.json.encode(answer))
         except OSError as error:
             _log.info("an answer was not taken: %s", error)
         sock.hang_up()
@@ -151,11 +159,21 @@ class ControlServer:
         """Return the answer to what comes; None for one who asks nothing, as who only looks who listens here."""
         if not may_connect(sock, self._directory.gid):
             return Answer(error=f"{credentials(sock)} may not use the host {self._name!r}", kind="RefusedError")
-        packet = sock.recv(MAX_REQUEST + 1)
-        if not packet:
+        received = bytearray()
+        while len(received) <= MAX_REQUEST and (packet := sock.recv(MAX_PACKET)):
+            received += packet
+            if len(packet) != _CHUNK:  # the last one
+                break
+            with suppress(msgspec.DecodeError, RecursionError):
+                _requests.decode(received)
+                break  # as long as one chunk by chance
+        if not received:
             return None
+        if len(received) > MAX_REQUEST:
+            text = f"the request is longer than {MAX_REQUEST} bytes: add fewer vehicles at a time"
+            return Answer(error=text, kind="RefusedError", code="malformed")
         try:
-            request = _requests.decode(packet[:MAX_REQUEST])
+            request = _requests.decode(received)
         except (msgspec.DecodeError, RecursionError) as error:
             return Answer(error=f"the request is not understood: {error}", kind="RefusedError", code="malformed")
         try:
@@ -166,6 +184,12 @@ class ControlServer:
         except Exception as error:  # noqa: BLE001  the host goes on, and who asked gets an answer
             _log.exception("a request failed")
             return Answer(error=f"the host failed: {error!r}", kind="RefusedError", code="failed")
+
+
+def _send(sock: Socket, text: bytes) -> None:
+    """Send a request or an answer, in as many packets as it takes."""
+    for first in range(0, len(text), _CHUNK):
+        sock.send(text[first : first + _CHUNK], socket.MSG_NOSIGNAL)
 
 
 def running_hosts(group: str | None = None) -> list[str]:
@@ -215,7 +239,7 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     received = bytearray()
     try:
         with suppress(BrokenPipeError):  # who is refused is answered and hung up on before having asked
-            sock.send(msgspec.json.encode(request), socket.MSG_NOSIGNAL)
+            _send(sock, msgspec.json.encode(request))
         while (packet := sock.recv(_CHUNK)) and len(received) < MAX_ANSWER:
             received += packet
     except BlockingIOError:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
 
 from skyloop.drivers.base import Driver, ServedLink
 from skyloop.drivers.registry import make_driver
@@ -16,7 +17,7 @@ from skyloop.host.fleet import VehicleSettings
 from skyloop.host.links import LinkThread
 from skyloop.host.own_process import OwnProcessVehicle
 from skyloop.host.ticker import Ticker
-from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, reason_of, within
+from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, of_proxy, reason_of
 from skyloop.host.watchdog import HANG_LOOKS, LOOK_S, STALL_LOOKS, SharedLoop, Watchdog
 from skyloop.host.workers import RequestWorkers
 from skyloop.messages import EventKind, Severity
@@ -99,8 +100,9 @@ class Host:
             if isinstance(error, SkyloopError):
                 raise
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
-        if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
-            with self._lock:
+        with self._lock:
+            # It may have been removed the moment it ran: what has ended is not ticked, see _forget.
+            if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None and vehicle.runs:
                 self._ticker.add(vehicle.proxy)
         return vehicle
 
@@ -159,31 +161,48 @@ class Host:
                 f"it all the same: skyloop host remove {name} --land",
                 code="flown",
             )
-        landed: list[bool] = []
-        within(lambda: landed.append(vehicle.land(timeout_s)), timeout_s + 1.0)
-        if landed != [True]:
+        proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
+        if not self._end(vehicle, timeout_s, "it was removed from its host", unless_flying=True):
             raise RefusedError(
                 f"{name} has not landed within {timeout_s:g} s and is not removed: it goes on to land and takes no "
                 "set-points any more; try again",
                 code="flying",
             )
-        status = vehicle.status()
-        self._end(vehicle, "it was removed from its host")
         with self._lock:
             if self.vehicles.get(name) is vehicle:
                 del self.vehicles[name]
         self.announce(f"removed {name}")
-        return status
+        return status if proxy is None else msgspec.structs.replace(status, **of_proxy(proxy))
 
-    def _end(self, vehicle: HostedVehicle, reason: str) -> None:
-        if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
-            self._untick(vehicle.proxy)
-        vehicle.stop(reason)
+    def _end(
+        self,
+        vehicle: HostedVehicle,
+        within_s: float,
+        reason: str,
+        hurry: Callable[[], bool] = lambda: False,
+        *,
+        unless_flying: bool = False,
+    ) -> bool:
+        proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
+        ended = vehicle.end(within_s, reason, hurry, unless_flying=unless_flying)
+        if ended and proxy is not None:
+            self._forget(proxy)
+        return ended
 
-    def _untick(self, proxy: Proxy) -> None:
-        for loop in list(self._loops):
-            if isinstance(loop, Ticker):
-                loop.remove(proxy)
+    def _forget(self, proxy: Proxy) -> None:
+        """Tick an ended proxy no more, and close the loops that were its own."""
+        with self._lock:
+            for loop in self._loops:
+                if isinstance(loop, Ticker):
+                    loop.remove(proxy)
+            over = [loop for loop in self._loops if loop.empty and not self._is_shared(loop)]
+            self._loops = [loop for loop in self._loops if loop not in over]
+        for loop in over:
+            loop.close()
+
+    def _is_shared(self, loop: SharedLoop) -> bool:
+        """Whether vehicles that come are served by this loop; else it was left to one whose driver has blocked."""
+        return loop in (self._reactor, self._ticker, self._links)
 
     def status(self) -> list[VehicleStatus]:
         """Return a row for each vehicle, also for those of the file that were not started."""
@@ -202,38 +221,33 @@ class Host:
             if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
                 vehicle.proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
 
-    def land(self, within_s: float, hurry: Callable[[], bool] = lambda: False) -> None:
-        """Land everything that flies, at the same time.
+    def close(
+        self,
+        reason: str = "the host was stopped",
+        within_s: float = 0.0,
+        hurry: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """End all flights and all proxies at the same time, and all threads that are not stuck. Idempotent.
 
         Args:
-            within_s: How long to wait [s].
-            hurry: Asked several times a second whether to wait no longer.
+            reason: Why, for people.
+            within_s: How long they may take to land [s].
+            hurry: Asked several times a second whether to wait for them no longer.
         """
         with self._lock:
             self._closing = True
-        deadline_s = time.monotonic() + within_s
-
-        def land(vehicle: HostedVehicle) -> None:
-            while not (vehicle.land(LOOK_S) or hurry()) and time.monotonic() < deadline_s:
-                pass
-
-        landing = {  # a thread of its own for each: a driver that hangs keeps no other vehicle in the air
-            vehicle: threading.Thread(target=land, args=(vehicle,), name="skyloop-host-land", daemon=True)
-            for vehicle in list(self.vehicles.values())
-        }
-        for thread in landing.values():
-            thread.start()
-        for vehicle, thread in landing.items():
-            while thread.is_alive() and vehicle.runs and not hurry() and time.monotonic() < deadline_s:
-                thread.join(LOOK_S)
-
-    def close(self, reason: str = "the host was stopped") -> None:
-        """End all proxies, which leaves what flies hovering, and all threads that are not stuck. Idempotent."""
-        with self._lock:
-            self._closing = True
             vehicles = list(self.vehicles.values())
-        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="skyloop-host-stop") as pool:
-            list(pool.map(lambda vehicle: self._end(vehicle, reason), vehicles))
+        ending = {  # a thread of its own for each: a driver that hangs keeps no other vehicle in the air
+            vehicle: threading.Thread(
+                target=self._end, args=(vehicle, within_s, reason, hurry), name="skyloop-host-end", daemon=True
+            )
+            for vehicle in vehicles
+        }
+        for thread in ending.values():
+            thread.start()
+        for vehicle, thread in ending.items():
+            while thread.is_alive() and vehicle.condition is not Condition.FAILED:
+                thread.join(LOOK_S)
         self._watchdog.close()
         for loop in self._loops:
             loop.close()
@@ -252,15 +266,14 @@ class Host:
         """Give all other vehicles of a loop another one."""
         with self._lock:
             new: SharedLoop
+            if not self._is_shared(loop):
+                return  # it is the vehicle's own since an earlier stall
             if isinstance(loop, Reactor) and isinstance(member, SharedLocalServer):
-                new = loop.split(member)
-                self._reactor = new if loop is self._reactor else self._reactor
+                new = self._reactor = loop.split(member)
             elif isinstance(loop, Ticker) and isinstance(member, Proxy):
-                new = loop.split(member)
-                self._ticker = new if loop is self._ticker else self._ticker
+                new = self._ticker = loop.split(member)
             elif isinstance(loop, LinkThread):
-                new = loop.split(member)
-                self._links = new if loop is self._links else self._links
+                new = self._links = loop.split(member)
             else:
                 return
             self._loops.append(new)
@@ -287,10 +300,11 @@ class Host:
         """End a vehicle whose driver does not work, on a thread of its own."""
 
         def end() -> None:
-            if vehicle.proxy is not None:
-                self._untick(vehicle.proxy)
+            proxy = vehicle.proxy
             if vehicle.fail(reason):
                 self.announce(f"failed {vehicle.settings.name}: {reason}")
+            if proxy is not None:
+                self._forget(proxy)
 
         threading.Thread(target=end, name="skyloop-host-fail", daemon=True).start()
 

@@ -65,6 +65,11 @@ class LinkThread:
             self._selector.register(link, selectors.EVENT_READ, link)
         self._wake()
 
+    @property
+    def empty(self) -> bool:
+        """Whether it serves no link."""
+        return not self._members
+
     def split(self, stuck: Any) -> LinkThread:
         """Leave this thread to the links of one vehicle, and return a new one that serves all others. Any thread."""
         with self._lock:

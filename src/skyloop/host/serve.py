@@ -75,7 +75,7 @@ def serve(
                 for change in poll():
                     announce(change)
                     host.publish_keys(change)
-        host.land(land_within_s, shutdown.hurry.is_set)
+        host.close(shutdown.reason, land_within_s, shutdown.hurry.is_set)
 
 
 class Answering:

@@ -55,6 +55,11 @@ class Ticker:
         with self._lock:
             return self._failures.pop(proxy, None) is not None
 
+    @property
+    def empty(self) -> bool:
+        """Whether it ticks no proxy."""
+        return not self._failures
+
     def split(self, stuck: Proxy) -> Ticker:
         """Leave this ticker to one proxy, and return a new one that ticks all others. Any thread."""
         with self._lock:

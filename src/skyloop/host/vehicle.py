@@ -88,12 +88,19 @@ class HostedVehicle(ABC):
         """Return its row."""
 
     @abstractmethod
-    def land(self, timeout_s: float) -> bool:
-        """Land it if it flies; return whether nothing of it flies any more."""
+    def end(
+        self,
+        within_s: float,
+        reason: str,
+        hurry: Callable[[], bool] = lambda: False,
+        *,
+        unless_flying: bool = False,
+    ) -> bool:
+        """End its flight and its proxy, as :meth:`skyloop.proxy.Proxy.end` does. Idempotent.
 
-    @abstractmethod
-    def stop(self, reason: str) -> None:
-        """End its proxy, which leaves what flies hovering. Idempotent."""
+        Returns:
+            Whether its proxy has ended; with ``unless_flying`` that is only where it has landed in time.
+        """
 
     @property
     def runs(self) -> bool:
@@ -145,8 +152,17 @@ class SharedVehicle(HostedVehicle):
         self._jobs = jobs
         self._network = network
         self._life = threading.Lock()  # guards starting, failing and stopping
+        self._settled = threading.Event()  # it runs, or has failed to start
+        self._settled.set()
 
     def start(self) -> None:
+        self._settled.clear()
+        try:
+            self._start()
+        finally:
+            self._settled.set()
+
+    def _start(self) -> None:
         settings = self.settings
         self.condition = Condition.STARTING
         driver = self._make(settings.address)
@@ -166,7 +182,7 @@ class SharedVehicle(HostedVehicle):
             self.proxy = None
             raise
         if hung:
-            proxy.abandon(f"its driver did not open within {OPEN_S:g} s")
+            proxy.end(reason=f"its driver did not open within {OPEN_S:g} s", hangs=True)
             raise DriverError(f"the driver of {settings.address} did not open within {OPEN_S:g} s: it hangs")
         self.started_s = time.monotonic()
         self.condition = Condition.RUNNING
@@ -201,23 +217,31 @@ class SharedVehicle(HostedVehicle):
             if proxy is None or self.condition is not Condition.RUNNING:
                 return False
             self.condition, self.failed = Condition.FAILED, reason
-        proxy.abandon(reason)
+        proxy.end(reason=reason, hangs=True)
         return True
 
-    def land(self, timeout_s: float) -> bool:
+    def end(
+        self,
+        within_s: float,
+        reason: str,
+        hurry: Callable[[], bool] = lambda: False,
+        *,
+        unless_flying: bool = False,
+    ) -> bool:
+        self._settled.wait(OPEN_S + 1.0)  # else it would go on to serve, with nobody who knows of it
         proxy = self.proxy
-        if proxy is None or self.condition is not Condition.RUNNING:
-            return True
-        return proxy.land(timeout_s)
-
-    def stop(self, reason: str) -> None:
+        if proxy is not None and self.condition is Condition.RUNNING:
+            patience_s = OPEN_S + (within_s if proxy.handler.airborne else 0.0)
+            call = partial(proxy.end, within_s, reason=reason, hurry=hurry, unless_flying=unless_flying)
+            if not within(call, patience_s):
+                _log.error("the driver of %s does not close: it is left alone", self.settings.name)
+            if unless_flying and not proxy.ended:
+                return False
         with self._life:
-            proxy, self.proxy = self.proxy, None
-            running = self.condition is Condition.RUNNING
+            self.proxy = None
             if self.condition is not Condition.FAILED:
                 self.condition = Condition.STOPPED
-        if proxy is not None and running and not within(lambda: proxy.stop(reason=reason), OPEN_S):
-            _log.error("the driver of %s does not close: it is left alone", self.settings.name)
+        return True
 
 
 def of_proxy(proxy: Proxy) -> dict[str, object]:

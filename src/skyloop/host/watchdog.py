@@ -25,6 +25,10 @@ class SharedLoop(Protocol):
     def entries(self) -> int:
         """How often that was set."""
 
+    @property
+    def empty(self) -> bool:
+        """Whether it serves nobody."""
+
     def close(self) -> None:
         """End the thread, unless it is stuck."""
 

@@ -28,6 +28,8 @@ class Fate(StrEnum):
     LINK = "link"
     FAILSAFE = "failsafe"
     OTHERS = "others"
+    SLEPT = "slept"
+    JUMPED = "jumped"
 
 
 #: The one list of what ends an intent, in words for people; ``docs/proxy.md`` has it, too.
@@ -43,6 +45,8 @@ ENDINGS: Final[dict[Fate, str]] = {
     Fate.LINK: "the link to the vehicle broke or came back, or the application's own was lost",
     Fate.FAILSAFE: "a failsafe took over",
     Fate.OTHERS: "somebody else took the vehicle",
+    Fate.SLEPT: "the proxy's computer slept",
+    Fate.JUMPED: "the vehicle's position jumped",
 }
 
 

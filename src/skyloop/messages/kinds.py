@@ -104,7 +104,7 @@ class EventKind(StrEnum):
     STATE_CHANGED = "state_changed"  #: flight state; data: before, after
     BATTERY_LOW = "battery_low"  #: data: battery
     EMERGENCY = "emergency"  #: motors cut; data: reason
-    PARAMETER_CHANGED = "parameter_changed"  #: data: name, value
+    PARAMETER_CHANGED = "parameter_changed"  #: data: name, value, app_id (who wrote it)
     DRIVER_ERROR = "driver_error"  #: the driver failed in some call; data: where
     COLLISION = "collision"  #: simulated vehicles: touched something; data: speed_m_s
     VEHICLE_MESSAGE = "vehicle_message"  #: text from the vehicle itself

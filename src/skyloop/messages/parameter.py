@@ -35,3 +35,4 @@ class Parameter(msgspec.Struct, frozen=True, array_like=True):
     choices: tuple[Value, ...] = ()  #: if not empty, the only values allowed
     read_only: bool = False
     description: str = ""
+    momentary: bool = False  #: writing it does something once, such as a flip: no value to be restored or repeated

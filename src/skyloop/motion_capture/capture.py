@@ -95,6 +95,7 @@ class MotionCapture:
         self._reported = dict.fromkeys(bodies, TrackState.WAITING)
         self._troubled = ""  # the trouble that was told last, until a frame comes
         self._calibrations: dict[str, Calibration] = {}
+        self._measured: dict[str, list[BodyPose]] = {}  # as the system sees them, for a calibration in progress
         self._poses: Channel[BodyPose] = Channel()
         self._events: Channel[TrackEvent] = Channel()
         self._listeners: list[Listener[Any]] = []
@@ -276,7 +277,7 @@ class MotionCapture:
     def calibrate(self, drone: Drone, *, heading: float = 0.0, seconds: float = REST_S) -> Calibration:
         """Measure the rotation between the tracked body's axes and the drone's, while it stands at rest on the ground.
 
-        From then on the poses of that body are the drone's.
+        From then on the poses of that body are the drone's; until it is found an earlier calibration stays in force.
 
         Args:
             drone: Its proxy's name must be one of ``bodies``.
@@ -292,11 +293,12 @@ class MotionCapture:
         self.wait(name)
         if drone.feedback().state.airborne:
             raise UsageError(f"{name} flies: a calibration needs it at rest on the ground")
-        poses: list[BodyPose] = []
-        self._calibrations.pop(name, None)
-        with self.on_pose(lambda pose: poses.append(pose) if pose.body == name else None, inline=True):
+        poses = self._measured[name] = []
+        try:
             if self._ended.wait(seconds):
                 self._check_open()
+        finally:
+            del self._measured[name]
         feedback = drone.feedback()
         found = calibrate(
             poses, roll=feedback.roll_rad or 0.0, pitch=feedback.pitch_rad or 0.0, yaw=feedback.yaw_rad, heading=heading
@@ -322,6 +324,9 @@ class MotionCapture:
 
     def _add(self, track: Track, captured_ns: int, seen: BodyPose) -> None:
         with self._changed:
+            measured = self._measured.get(track.body)
+            if measured is not None:
+                measured.append(seen)
             calibration = self._calibrations.get(track.body)
             seen = seen if calibration is None else calibration.apply(seen)
             pose = track.add(captured_ns, seen.position_m, seen.quaternion)

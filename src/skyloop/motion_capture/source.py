@@ -10,7 +10,7 @@ from typing import BinaryIO, Final, cast
 
 import msgspec
 
-from skyloop.child_process import ChildProcess
+from skyloop.child_process import ChildProcess, RestartingChild
 from skyloop.errors import LinkError, MissingExtraError
 from skyloop.motion_capture.address import System
 from skyloop.motion_capture.worker import MISSING, RawFrame, read
@@ -45,26 +45,31 @@ class ChildSource:
         Args:
             system: The system to connect to.
             take: Called with each frame, on the reading thread.
-            trouble: Called with a description when the child fails, on the reading thread.
+            trouble: Called with a description when the child fails, on one of its threads.
             command: The child's command line, before kind and settings.
         """
         self._system = system
         self._take = take
         self._trouble = trouble
-        self._command = command
-        self._child: ChildProcess | None = None
         self._received_s = 0.0
-        self._ended = threading.Event()
         self._first = threading.Event()
         self._failed: Exception | None = None
         self._last_words = ""  # the end of the last child's standard error
-        self._reader = threading.Thread(target=self._run, name="skyloop-mocap", daemon=True)
-        self._guard = threading.Thread(target=self._watch, name="skyloop-mocap-guard", daemon=True)
+        settings = msgspec.json.encode(system.configuration).decode()
+        self._runner = RestartingChild(
+            [*command, system.kind, settings],
+            name="skyloop-mocap",
+            read=self._read,
+            ended=self._child_ended,
+            started=self._child_started,
+            silent=lambda: time.monotonic() - self._received_s > SILENT_S,  # its native code would wait for ever
+            keep_errors=True,
+        )
 
     @property
     def pid(self) -> int | None:
         """Process id of the child; None before the first."""
-        return None if self._child is None else self._child.pid
+        return None if self._runner.child is None else self._runner.child.pid
 
     def start(self, timeout_s: float) -> None:
         """Start the child, and wait for the first frame.
@@ -76,8 +81,7 @@ class ChildSource:
             LinkError: No frame came within that time.
             MissingExtraError: The ``motioncapture`` package is not installed.
         """
-        self._reader.start()
-        self._guard.start()
+        self._runner.start()
         if not self._first.wait(timeout_s) or self._failed is not None:
             failed, last_words = self._failed, self._last_words
             self.close()
@@ -85,33 +89,17 @@ class ChildSource:
 
     def close(self) -> None:
         """End the child. Idempotent."""
-        self._ended.set()
-        self._kill()
-        for thread in (self._reader, self._guard):
-            if thread.ident is not None and thread is not threading.current_thread():
-                thread.join()
+        child = self._runner.request_stop()
+        if child is not None:
+            child.kill()  # the native code does not read its standard input
+        self._runner.stop()
 
     # --- threads ---
 
-    def _run(self) -> None:
-        while not self._ended.is_set():
-            code = self._listen()
-            if code == MISSING:
-                cause = self._last_words.removeprefix(": ")
-                self._failed = MissingExtraError(f"{self._system.kind} motion capture", "mocap", cause=cause)
-                self._first.set()
-                return
-            if not self._ended.is_set():
-                self._trouble(f"no data from {self._system.address}{self._last_words}; trying again")
-            self._ended.wait(AGAIN_S)
-
-    def _listen(self) -> int | None:
-        """Run one child from its start to its end; return its exit code."""
-        settings = msgspec.json.encode(self._system.configuration).decode()
+    def _child_started(self, _child: ChildProcess) -> None:
         self._received_s = time.monotonic() + FIRST_S - SILENT_S
-        child = self._child = ChildProcess([*self._command, self._system.kind, settings])
-        if self._ended.is_set():  # closed between two children
-            child.kill()
+
+    def _read(self, child: ChildProcess) -> None:
         try:
             while (frame := read(cast(BinaryIO, child.stdout))) is not None:
                 self._received_s = time.monotonic()
@@ -121,16 +109,14 @@ class ChildSource:
             self._trouble(f"{self._system.address}: {error}")
         finally:
             child.kill()
-            child.close()
-            self._last_words = f": {child.last_words}" if child.last_words else ""
-        return child.code
 
-    def _watch(self) -> None:
-        """Kill a child that has fallen silent: the native code would wait for ever."""
-        while not self._ended.wait(AGAIN_S):
-            if time.monotonic() - self._received_s > SILENT_S:
-                self._kill()
-
-    def _kill(self) -> None:
-        if self._child is not None:
-            self._child.kill()
+    def _child_ended(self, child: ChildProcess | None, ending: str) -> float | None:
+        words = ending if child is None else child.last_words
+        self._last_words = f": {words}" if words else ""
+        if child is not None and child.code == MISSING:
+            self._failed = MissingExtraError(f"{self._system.kind} motion capture", "mocap", cause=words)
+            self._first.set()
+            return None
+        if not self._runner.stopping:
+            self._trouble(f"no data from {self._system.address}{self._last_words}; trying again")
+        return AGAIN_S

@@ -13,9 +13,9 @@ from skyloop.messages import (
     AnyAction,
     Attitude,
     Capabilities,
+    Feedback,
     FlightState,
     Hover,
-    Idle,
     Land,
     Position,
     Refusal,
@@ -23,9 +23,8 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.proxy.core.autopilot import Autopilot, software_actions
+from skyloop.proxy.core.flight import STALE_NS, Changed, Flight
 from skyloop.proxy.publisher import VehiclePublisher
-
-_FLYING = (Takeoff, Hover, Attitude, Velocity, Position)
 
 
 class ActionExecutor:
@@ -34,12 +33,18 @@ class ActionExecutor:
     Args:
         driver: the vehicle's driver.
         capabilities: what it reported about the vehicle.
+        flight: what is known of the vehicle's flight.
         autopilot: the software autopilot; None for a vehicle that it adds nothing to.
         publisher: what the vehicle reported, and where the driver's failures are reported.
     """
 
     def __init__(
-        self, driver: Driver, capabilities: Capabilities, autopilot: Autopilot | None, publisher: VehiclePublisher
+        self,
+        driver: Driver,
+        capabilities: Capabilities,
+        flight: Flight,
+        autopilot: Autopilot | None,
+        publisher: VehiclePublisher,
     ) -> None:
         software = software_actions(capabilities.actions)
         self.native = frozenset(kind for kind, name in ACTION_NAMES.items() if name in capabilities.actions)
@@ -47,36 +52,37 @@ class ActionExecutor:
             kind for kind, name in ACTION_NAMES.items() if name in software
         }
         self.why_not = capabilities.why_not
+        self.flight = flight
         self.autopilot = autopilot
         #: Whether what the vehicle does on the way to a place must be checked: then the software autopilot flies there.
         self.guarded = False
         self._driver = driver
         self._vehicle = publisher
-        self._in_force: AnyAction = Idle()
-        self._had_feedback = False
 
     @property
     def state(self) -> FlightState:
         """The flight state now, which may be newer than the last feedback."""
-        return self._vehicle.state_of(self._vehicle.reported_state)
+        return self.flight.state(self._vehicle.reported_state)
 
     @property
     def airborne(self) -> bool:
         """Whether the vehicle flies, or may: one that never reports its state does from its first command on."""
-        return self.is_airborne(self.state)
+        return self.flight.flies(self.state)
 
-    def is_airborne(self, state: FlightState) -> bool:
-        """Return :attr:`airborne` for a flight state that was read."""
-        return state.airborne or (state is FlightState.UNKNOWN and isinstance(self._in_force, _FLYING))
+    def observe(self, now_ns: int) -> Changed | None:
+        """Look at the vehicle; return what has changed about whose flight it is."""
+        vehicle = self._vehicle
+        return self.flight.observe(vehicle.reported_state, self._driver.left_to(), now_ns, self._shown(now_ns))
+
+    def _shown(self, now_ns: int) -> Feedback | None:
+        """The newest sample, where it shows how the vehicle is now."""
+        feedback = self._vehicle.feedback_now if self._vehicle.link_up else None
+        return feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
 
     @property
     def stands(self) -> bool:
         """Whether the vehicle stands on the ground by its own word, whatever the software autopilot is about to do."""
         return self._vehicle.reported_state is FlightState.LANDED
-
-    def left_to(self) -> str:
-        """Return what others made of the vehicle since it was steered from here, as the driver observes it."""
-        return self._driver.left_to()
 
     def stop_autopilot(self) -> None:
         """Stop the software autopilot because others steer."""
@@ -105,7 +111,7 @@ class ActionExecutor:
                 raise RefusedError(str(error), code=Refusal.WRONG_STATE) from error
             self._start(action, now_ns)
             applied = action
-        self._in_force = applied
+        self.flight.sent(applied)
         return applied
 
     def fly_to(self, place: Position, now_ns: int) -> bool:
@@ -133,18 +139,28 @@ class ActionExecutor:
         else:
             return False
         if taken:
-            self._in_force = action
+            self.flight.sent(action)
         return taken
+
+    def leave(self, now_ns: int) -> None:
+        """Hover, for good: nothing is steered from here any more.
+
+        A vehicle that does not hover by itself is left at a standstill, as far as one set-point can.
+        """
+        if Hover in self.native or self.autopilot is None:
+            self.failsafe(Hover(), now_ns)
+            return
+        last: Velocity | Attitude = Velocity() if Velocity in self.native else Attitude()
+        try:
+            self._driver.apply(last)
+        except Exception as error:  # noqa: BLE001  it is reported, and there is nothing else to do
+            self._vehicle.driver_failed("failsafe", error)
 
     def step(self, now_ns: int) -> AnyAction | None:
         """Let the software autopilot steer, if it is on; returns what it made the driver apply."""
         if self.autopilot is None:
             return None
-        feedback = self._vehicle.feedback_now
-        if not self._had_feedback and feedback is not None and feedback.altitude_m is not None:
-            self._had_feedback = True
-            self.autopilot.on_first_feedback(feedback)
-        action = self.autopilot.step(now_ns, feedback, self._vehicle.reported_state)
+        action = self.autopilot.step(now_ns, self._shown(now_ns), self._vehicle.reported_state)
         if action is None:
             return None
         try:

@@ -1,7 +1,7 @@
 """The note of a flight that this proxy began, in a file: a proxy that was killed ends its own flight when it is back.
 
-Written when a flight becomes the proxy's, kept young while it lasts, removed when it is over or somebody else's. A note
-is believed for :data:`LIFE_S`: after that somebody else may have begun another flight.
+Written when a flight becomes the proxy's, kept young while it lasts, removed when it is over, somebody else's, or not
+looked for any more. A note is believed for :data:`LIFE_S`: after that somebody else may have begun another flight.
 """
 
 from __future__ import annotations
@@ -14,7 +14,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-LIFE_S: Final = 60.0  #: a supervisor starts a proxy again within seconds; nobody changes the pilot in that time
+from skyloop.clock import seconds
+from skyloop.proxy.core.flight import BELIEF_NS
+
+LIFE_S: Final = seconds(
+    BELIEF_NS
+)  #: a supervisor starts a proxy again within seconds, and nobody changes the pilot then
 KEEP_S: Final = 2.0  #: how often it is made young
 CLOSE_S: Final = 2.0  #: how long the end of a proxy waits for the file
 MAX_BYTES: Final = 4096  #: of an address; a longer file is none of ours
@@ -43,7 +48,7 @@ class FlightRecord:
         self.path = path
         self._vehicle = vehicle
         self._wall = wall
-        self._ours = False
+        self._ours: bool | None = None  # not known yet: the note stays as it is
         self._written = False
         self._failed = False
         self._closing = False
@@ -52,13 +57,18 @@ class FlightRecord:
 
     def believed(self) -> bool:
         """Return whether an earlier run of this proxy flew this vehicle a moment ago. Call before :meth:`start`."""
+        return self.left_s() > 0.0
+
+    def left_s(self) -> float:
+        """Return for how long the flight of an earlier run may still be found [s]; 0: there is none."""
         try:
             age_s = self._wall() - self.path.stat().st_mtime
             with self.path.open(encoding="utf-8") as file:
                 content = file.read(MAX_BYTES)
         except (OSError, ValueError):
-            return False
-        return content == self._vehicle and -1.0 <= age_s <= LIFE_S  # a clock is no better than that
+            return 0.0
+        believed = content == self._vehicle and -1.0 <= age_s <= LIFE_S  # a clock is no better than that
+        return LIFE_S - max(0.0, age_s) if believed else 0.0
 
     def start(self) -> None:
         """Start to write."""
@@ -98,6 +108,6 @@ class FlightRecord:
             beside.write_text(self._vehicle, encoding="utf-8")
             beside.replace(self.path)
             self._written = True
-        else:
+        elif self._ours is not None:
             self.path.unlink(missing_ok=True)
             self._written = False

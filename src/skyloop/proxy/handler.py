@@ -14,7 +14,9 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from skyloop.clock import Clock, nanoseconds, seconds
+import msgspec
+
+from skyloop.clock import NS_PER_S, Clock, nanoseconds, seconds
 from skyloop.errors import RefusedError
 from skyloop.messages import (
     AnswerTakeover,
@@ -28,6 +30,7 @@ from skyloop.messages import (
     EmergencyStop,
     Failsafe,
     Fate,
+    Feedback,
     FlightState,
     Hover,
     Idle,
@@ -40,6 +43,7 @@ from skyloop.messages import (
     Role,
     Takeoff,
     Takeover,
+    Velocity,
     encode,
 )
 from skyloop.messages.command import SET_POINTS
@@ -47,9 +51,10 @@ from skyloop.messages.numbers import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.authority_events import EventContext, authority_event
-from skyloop.proxy.core.command_checks import CommandChecks, Decision
+from skyloop.proxy.core.command_checks import CommandChecks
 from skyloop.proxy.core.failsafe import BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
+from skyloop.proxy.core.flight import Whose
 from skyloop.proxy.core.flight_events import (
     battery_event,
     clamped_event,
@@ -57,11 +62,14 @@ from skyloop.proxy.core.flight_events import (
     enforcement_event,
     failsafe_event,
     ownership_event,
+    position_jumped_event,
     refused_event,
+    slept_event,
     taken_event,
+    thin_zones_event,
 )
 from skyloop.proxy.core.intents import INSISTENT, TAKEOFF_NS, Intent
-from skyloop.proxy.core.ownership import Ownership, Whose
+from skyloop.proxy.core.limits import Clamp, Episodes
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.parameters import FlightSettings
@@ -69,12 +77,16 @@ from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.returning import ReturnSupervisor
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import COMMANDS, TransportServer
+from skyloop.zones import Space
 
 _LAND: Final = Land()
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
 _PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: what may be different with the next repeat
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
+#: So much more sleep of the computer than was known is one: shorter ones are not told from a delay.
+SLEEP_NS: Final = NS_PER_S // 4
+_NOTICED_M_S: Final = 0.05  #: a step of the software autopilot that is shortened by less is not worth telling
 
 
 class CommandHandler:
@@ -88,7 +100,7 @@ class CommandHandler:
         server: where echoes of commands are published.
         sessions: the connections, by the application's number; read here, changed by the proxy.
         clock: the proxy's clock [ns].
-        shared: whether others may fly the vehicle too.
+        slept: for how long the computer has slept, in all [ns].
     """
 
     def __init__(
@@ -101,18 +113,18 @@ class CommandHandler:
         server: TransportServer,
         sessions: Mapping[int, Session],
         clock: Clock,
-        shared: bool,
+        slept: Clock,
     ) -> None:
         self.authority = Authority()
         self.ladder = FailsafeLadder()
-        self.ownership = Ownership(shared=shared)
+        self.flight = executor.flight
         self.checks = CommandChecks(
-            self.authority, self.ladder, self.ownership, supported=executor.supported, why_not=executor.why_not
+            self.authority, self.ladder, self.flight, supported=executor.supported, why_not=executor.why_not
         )
         self._back = ReturnSupervisor(self.checks, self.ladder, executor, publisher)
         self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
         if executor.autopilot is not None:
-            executor.autopilot.guard = self.checks.guard
+            executor.autopilot.guard = self._guard_step
         self.warm_s = 0.0  #: how often the code is to be run on a dummy while the vehicle is piloted [s]; 0: never
         self._lock = threading.RLock()
         self._executor = executor
@@ -126,8 +138,12 @@ class CommandHandler:
         self._clock = clock
         self._pilot = "none"  # why nobody holds the authority, or "held"
         self._breaks_seen = 0  # of the vehicle's link, when last looked at
+        self._slept = slept
+        self._slept_seen = slept()  # when last looked at, or noticed
+        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
         self._rising: Intent | None = None  # a take-off that the vehicle was told of, and does not show yet
         self._enforced = True  # whether the safety box and zones could be, at the last set-point
+        self._episodes = Episodes()  # of limits that touch what the proxy does with nobody in command
         self._stamp()
 
     # From the proxy: what decides takes the lock -----------------------------------------------------------------
@@ -139,18 +155,32 @@ class CommandHandler:
     def configure(self, settings: FlightSettings) -> None:
         """Let new values of the parameters take effect."""
         with self._lock:
-            self.checks.limits = settings.limits
-            self.checks.safety = settings.safety
-            self.checks.space = settings.space
+            self._report_thin_zones(settings.airspace.space)
+            self.checks.airspace.settings = settings.airspace
             self.checks.returns = settings.returns
             self.checks.max_age_ns = settings.max_age_ns
             self.authority.timeout_ns = settings.authority_timeout_ns
             self.authority.ask_ns = settings.authority_ask_ns
             self.ladder.settings = settings.failsafe
             self.warm_s = settings.warm_s
-            self._executor.guarded = settings.safety is not None
+            self._executor.guarded = settings.airspace.space.walled
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
+
+    def aged(self, command: Command, now_ns: int) -> Command:
+        """Return a command as old as it is: one from before the computer slept looks as if it had just been sent."""
+        if self._slept() - self._slept_seen >= SLEEP_NS:
+            with self._lock:
+                self._observe_sleep(now_ns)
+        if command.sent_ns >= self._awake_ns:
+            return command
+        return msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
+
+    def problem_with_ceiling(self, altitude: float) -> str:
+        """Return why ``limits.altitude`` must not be lowered to this height [m] now, for a person; empty if it may."""
+        with self._lock:
+            flies = self._executor.airborne
+            return self.checks.airspace.ceiling_problem(altitude, self._vehicle.feedback_now) if flies else ""
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and carry it out, on the thread that received it."""
@@ -219,7 +249,9 @@ class CommandHandler:
     def tick(self, now_ns: int) -> None:
         """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace."""
         with self._lock:
+            self._observe_sleep(now_ns)
             self._observe_link(now_ns)
+            self._observe_position(now_ns)
             effects = self.authority.update(now_ns)
             if effects:
                 self._apply_authority(effects, now_ns)
@@ -228,34 +260,44 @@ class CommandHandler:
             session = self._sessions.get(holder.app_id) if holder is not None else None
             if session is not None:
                 self._observe_intent(session, now_ns)
-            if self._back.update(now_ns, ours=self.ownership.ours):
+            if self._back.update(now_ns, ours=self.flight.ours):
                 self._stamp()
             steered = self._executor.step(now_ns)
             if steered is not None:
                 self._echo_own(steered, now_ns)
 
     def order_landing(self, now_ns: int) -> bool:
-        """Land because the proxy is about to end. Returns whether there is anything to land."""
+        """Land because the proxy is about to end; from now on only landing and emergency stop are accepted.
+
+        Returns:
+            Whether anything of the proxy's flies, or may be about to.
+        """
         with self._lock:
-            self._observe_ownership(now_ns)
-            if not (self._executor.airborne and self.ownership.ours):
-                return False
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
-            return True
+            self._call_off(now_ns)
+            return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
         """The proxy ends now: leave what flies hovering, as far as the vehicle can by itself."""
         with self._lock:
-            self._observe_ownership(now_ns)
-            flies = self._executor.airborne and self._executor.state is not FlightState.LANDING
-            if flies and self.ownership.ours:
-                self._executor.failsafe(Hover(), now_ns)
+            self.ladder.order_landing()
+            self._observe_flight(now_ns)
+            self._call_off(now_ns)
+            executor = self._executor
+            if self.flight.ours and executor.airborne and executor.state is not FlightState.LANDING:
+                executor.leave(now_ns)
+
+    def _call_off(self, now_ns: int) -> None:
+        """Land what was told to take off and does not show it yet."""
+        if self.flight.ours and self.flight.may_begin(now_ns) and self._executor.state is FlightState.LANDED:
+            self._executor.failsafe(Land(), now_ns)
+            self.flight.call_off(now_ns)
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies, or may, and is the proxy's to land. Takes no lock."""
-        return self._executor.airborne and self.ownership.ours
+        """Whether the vehicle flies, or may, or may be about to, and is the proxy's to land. Takes no lock."""
+        return self.flight.ours and (self._executor.airborne or self.flight.may_begin(self._clock()))
 
     @property
     def at_rest(self) -> bool:
@@ -263,7 +305,7 @@ class CommandHandler:
         return (
             self.authority.holder is None
             and self.ladder.idle
-            and not self.ownership.ours
+            and not self.flight.ours
             and self._vehicle.link_breaks == self._breaks_seen
             and not self._executor.airborne
         )
@@ -279,7 +321,7 @@ class CommandHandler:
         """Return what was applied, and when: the time of receipt for a command that was refused."""
         # Each call of a function costs microseconds on a machine that was idle, and a command comes when it was: an
         # ordinary command is received, decided and executed here; what went wrong is put into words elsewhere.
-        vehicle, checks, ownership = self._vehicle, self.checks, self.ownership
+        vehicle, checks, flight = self._vehicle, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
         intents = session.intents
@@ -290,8 +332,8 @@ class CommandHandler:
             return self._refuse(session, command, refusal, checks.explain(refusal, command, intents, now_ns)), now_ns
         action = command.action
         kind = type(action)
-        if not ownership.ours:
-            self._observe_ownership(now_ns)
+        if not flight.ours:
+            self._observe_flight(now_ns)
         state = self._observe_intent(session, now_ns)
         intent, new = intents.receive(command, state, now_ns)
         if kind not in _LEAVE_A_TAKEOFF:
@@ -323,7 +365,9 @@ class CommandHandler:
         applied: AnyAction = _NOTHING
         if decision.action is not None:
             if decision.clamps or (decision.enforced is not None and decision.enforced is not self._enforced):
-                self._report_limits(session, decision, now_ns)
+                self._report_limits(session, decision.clamps, decision.enforced, now_ns)
+                if decision.clamps:
+                    self._counts["commands.clamped"] += 1
             try:
                 applied = self._executor.execute(decision.action, now_ns, new=new)
             except RefusedError as error:
@@ -333,9 +377,9 @@ class CommandHandler:
                 return self._refuse_intent(session, command, intent, Refusal.DRIVER_FAILED, why, now_ns), now_ns
             intent.begun = True
             if decision.takes_off:
-                ownership.claim(now_ns)
+                flight.claim(now_ns)
                 self._rising = intent
-            if not ownership.ours or kind is Takeoff:
+            if not flight.ours or kind is Takeoff:
                 self._take_vehicle(session, applied, new)
         if kind is not ReturnToStart and decision.action is not None:
             checks.back = None
@@ -354,6 +398,7 @@ class CommandHandler:
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
+        in_time = command.seq > session.intents.seq and now_ns - command.sent_ns <= self.checks.max_age_ns
         session.intents.stop(command)
         if session.role is not Role.PILOT:
             return self._refuse_role(session, command), now_ns
@@ -365,6 +410,8 @@ class CommandHandler:
         except Exception as error:  # noqa: BLE001  it is reported, and the repeats try again
             why = self._vehicle.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
+        if in_time and self.holds(session, command.lease):
+            self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent meanwhile
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
@@ -376,14 +423,30 @@ class CommandHandler:
         self._delays_ns.append(applied_ns - command.sent_ns)
         return applied_ns
 
-    def _report_limits(self, session: Session, decision: Decision, now_ns: int) -> None:
-        if decision.enforced is not None and decision.enforced is not self._enforced:
-            self._enforced = decision.enforced
-            self._events.publish_draft(enforcement_event(decision.enforced))
-        if decision.clamps:
-            self._counts["commands.clamped"] += 1
-            for clamp in session.episodes.begun(decision.clamps, now_ns):
-                self._events.publish_draft(clamped_event(session.name, clamp))
+    def _report_limits(
+        self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
+    ) -> None:
+        """Publish what began to be in the way of a command of this application, or of what the proxy does itself."""
+        if enforced is not None and enforced is not self._enforced:
+            self._enforced = enforced
+            self._events.publish_draft(enforcement_event(enforced))
+        episodes, name = (self._episodes, "the proxy") if session is None else (session.episodes, session.name)
+        for clamp in episodes.begun(clamps, now_ns):
+            self._events.publish_draft(clamped_event(name, clamp))
+
+    def _report_thin_zones(self, space: Space) -> None:
+        if space.thin and space != self.checks.airspace.settings.space:
+            self._events.publish_draft(thin_zones_event(space))
+
+    def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
+        """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
+        allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
+        clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
+        if clamps or (enforced is not None and enforced is not self._enforced):
+            holder = self.authority.holder
+            self._report_limits(None if holder is None else self._sessions.get(holder.app_id), clamps, enforced, now_ns)
+        assert isinstance(allowed, Velocity)
+        return allowed
 
     def _refuse_role(self, session: Session, command: Command) -> AnyAction:
         if session.role is Role.OBSERVER:
@@ -423,6 +486,8 @@ class CommandHandler:
     def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
         """End, or complete, what a holder asked for by what the vehicle does; return the flight state."""
         state, intent = self._executor.state, session.intents.newest
+        if state is not intent.state:
+            self._observe_flight(now_ns)  # a landing may be others': then that is what ended it
         if not intent.over:
             intent.observe(state, now_ns)
             if intent.over:
@@ -439,7 +504,7 @@ class CommandHandler:
     def _withdraw_takeoff(self, now_ns: int) -> bool:
         """Make the vehicle forget a take-off that it has not begun to show; return whether there was one."""
         rising, self._rising = self._rising, None
-        if rising is None or not self._executor.stands or self.ownership.whose is Whose.OTHERS:
+        if rising is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
             return False
         self._stop_instead(_LAND, now_ns)
         return True
@@ -503,7 +568,7 @@ class CommandHandler:
                 "owner_priority": owner.priority if owner is not None else None,
                 "lease": self.authority.lease,
                 "failsafe": self.ladder.step,
-                "others": self.ownership.others or None,
+                "others": self.flight.others or None,
                 "start_position_m": self._back.start,
                 "return_phase": self._back.phase,
             }
@@ -520,33 +585,60 @@ class CommandHandler:
         breaks = self._vehicle.link_breaks
         if breaks != self._breaks_seen:
             self._breaks_seen = breaks
-            self._end_intents(Fate.LINK, now_ns)
-            self.ladder.hand_over(now_ns)
-            self._update_failsafe(now_ns)
+            self._start_over(Fate.LINK, now_ns)
+
+    def _observe_sleep(self, now_ns: int) -> None:
+        """Act on a sleep of the computer: all that is known is older than its clock says."""
+        slept_ns = self._slept() - self._slept_seen
+        if slept_ns < SLEEP_NS:
+            return
+        self._slept_seen += slept_ns
+        self._slept_ns, self._awake_ns = slept_ns, now_ns
+        self.authority.slept(slept_ns)
+        self.flight.slept(slept_ns)
+        self._events.publish_draft(slept_event(seconds(slept_ns)))
+        self._start_over(Fate.SLEPT, now_ns)
+
+    def _start_over(self, fate: Fate, now_ns: int) -> None:
+        """Hover, and let nothing that was asked for until now be done later."""
+        self._end_intents(fate, now_ns)
+        self.ladder.hand_over(now_ns)
+        self._update_failsafe(now_ns)
+
+    def _observe_position(self, now_ns: int) -> None:
+        """Note where the vehicle is, and hover where that jumped: what was asked for meant another place."""
+        airspace = self.checks.airspace
+        airspace.observe(self._vehicle.feedback_now)
+        if not airspace.jumped_m:
+            return
+        if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
+            self._events.publish_draft(position_jumped_event(airspace.jumped_m))
+            self._start_over(Fate.JUMPED, now_ns)
+        airspace.jumped_m = 0.0
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""
-        if type(applied) is Idle or not (new or self.ownership.whose is not Whose.OTHERS):
+        if type(applied) is Idle or not (new or self.flight.whose is not Whose.OTHERS):
             return
-        others = self.ownership.others
-        self.ownership.take()
+        others = self.flight.others
+        self.flight.take()
         self._stamp()
         if others:
             self._events.publish_draft(taken_event(session.name, applied.name, others))
         self.on_ownership(True)
 
-    def _observe_ownership(self, now_ns: int) -> None:
+    def _observe_flight(self, now_ns: int) -> None:
         """Observe whose flight it is by now, and act on a change."""
         executor = self._executor
-        state = executor.state
-        changed = self.ownership.observe(state, executor.is_airborne(state), executor.left_to(), now_ns)
+        changed = executor.observe(now_ns)
+        if not self.flight.awaited:  # else the note of it stays as it is
+            self.on_ownership(self.flight.ours)
         if changed is None:
             return
-        self.on_ownership(changed.whose is Whose.OURS)
         self._stamp()
         if changed.whose is Whose.OTHERS:
             executor.stop_autopilot()
-            why = f"{self.ownership.others}: hover, take off or land first to take it over"
+            why = f"{self.flight.others}: hover, take off or land first to take it over"
             self._end_intents(Fate.OTHERS, now_ns, why, Refusal.WRONG_STATE)
         elif changed.why:  # found on a flight that is ours: its pilot may come back, as if a command had just come
             self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
@@ -556,17 +648,17 @@ class CommandHandler:
     # Failsafe ----------------------------------------------------------------------------------------------------
 
     def _update_failsafe(self, now_ns: int) -> None:
-        self._observe_ownership(now_ns)
+        self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
         state = self._executor.state
         inputs = FailsafeInputs(
             state=state,
-            airborne=self._executor.is_airborne(state),
+            airborne=self.flight.flies(state),
             last_command_ns=self.authority.last_command_ns,
             pilot=self._pilot,
             link_up=self._vehicle.link_up,
             battery=feedback.battery if feedback is not None else None,
-            ours=self.ownership.ours,
+            ours=self.flight.ours,
             return_problem=self._back.why_not(now_ns),
         )
         effects = self.ladder.update(now_ns, inputs)

@@ -19,13 +19,13 @@ from skyloop.errors import DriverError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterPage, ParameterType, Refusal, Value
 from skyloop.messages.checkup import CHECKUP, encode_checkup
 from skyloop.messages.codec import MAX_BODY
+from skyloop.proxy.core.airspace import AirspaceSettings
 from skyloop.proxy.core.autopilot import AutopilotSettings
 from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.core.limits import Limits
 from skyloop.proxy.core.returning import ReturnSettings
-from skyloop.proxy.core.safety import Safety, check_written, safety_of
 from skyloop.warmth import PERIOD_S, SHORTEST_S
-from skyloop.zones import BOX, FAR_M, ROOM, ZONES, Space, space_of
+from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
 
 MAX_TEXT: Final = 1024  #: characters of a text value
 MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
@@ -225,9 +225,7 @@ def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
 class FlightSettings:
     """What the parameters ask of the flight."""
 
-    limits: Limits
-    safety: Safety | None  #: the safety box and zones; None: there are none
-    space: Space  #: where it may fly
+    airspace: AirspaceSettings
     failsafe: FailsafeSettings
     autopilot: AutopilotSettings
     returns: ReturnSettings
@@ -340,9 +338,7 @@ class Parameters:
         )
         space = space_of(number, self.text)
         return FlightSettings(
-            limits,
-            safety_of(number, space),
-            space,
+            AirspaceSettings(limits, space, number("safety.deceleration"), number("safety.reaction_s")),
             failsafe,
             autopilot,
             ReturnSettings(number("return.height"), number("return.speed"), self.flag("return.land")),

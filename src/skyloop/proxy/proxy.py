@@ -17,7 +17,8 @@ from typing import Final
 
 import msgspec
 
-from skyloop.clock import Clock, clock_identity, monotonic_ns, nanoseconds, seconds
+from skyloop.child_process import leave_to_parent
+from skyloop.clock import Clock, clock_identity, monotonic_ns, nanoseconds, seconds, slept_ns
 from skyloop.drivers.base import Driver
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import (
@@ -27,7 +28,6 @@ from skyloop.messages import (
     Command,
     EventKind,
     Feedback,
-    FlightState,
     GetParameter,
     GetStatistics,
     Hello,
@@ -58,6 +58,7 @@ from skyloop.messages.overview import MAX_ADDRESS, MAX_EVENT_TEXT
 from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
 from skyloop.proxy.core.events import EventDraft
+from skyloop.proxy.core.flight import Flight
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.flight_record import FlightRecord
@@ -73,12 +74,13 @@ from skyloop.transport.base import Peer, TransportServer
 
 MAX_NAME: Final = 64  #: characters of a proxy's name
 
+_POLL_S: Final = 0.2
 _ABANDON_S: Final = 1.0  #: how long the end of a proxy with a driver that hangs waits for what does not
 _log = logging.getLogger(__name__)
 
 
 class Proxy:
-    """Owns a driver and its transport server, from :meth:`start` to :meth:`stop`; also a context manager.
+    """Owns a driver and its transport server, from :meth:`start` to :meth:`end`; also a context manager.
 
     Args:
         driver: the vehicle's driver, not yet open.
@@ -88,6 +90,7 @@ class Proxy:
         ticker: False leaves :meth:`tick` to the caller, for many proxies in a process, for tests, and for
             time that stands still.
         jobs: Answers what may wait for the vehicle; by default a thread of its own.
+        slept: For how long the computer has slept, in all [ns]; by default what it says, where the clock is its own.
 
     Raises:
         UsageError: for a name that is empty or too long.
@@ -102,6 +105,7 @@ class Proxy:
         clock: Clock = monotonic_ns,
         ticker: bool = True,
         jobs: JobQueue | None = None,
+        slept: Clock | None = None,
     ) -> None:
         if not 1 <= len(name) <= MAX_NAME:
             raise UsageError(f"a proxy's name has 1 to {MAX_NAME} characters, and {name!r} has {len(name)}")
@@ -121,25 +125,26 @@ class Proxy:
         self._counts = self._counters.counts
         self.events = EventPublisher(server_end.publish, clock, self._counters)
         steerable = bool(self.capabilities.actions & {"attitude", "velocity"})
-        autopilot = Autopilot(self.capabilities.actions) if steerable else None
+        flight = Flight(self.capabilities.actions, shared=driver.shared)
+        autopilot = Autopilot(self.capabilities.actions, flight=flight) if steerable else None
         self.publisher = VehiclePublisher(
             server=server_end,
             events=self.events,
             counters=self._counters,
             clock=clock,
             capabilities=self.capabilities,
-            state_of=_as_reported if autopilot is None else autopilot.state,
+            state_of=flight.state,
             on_link_up=self._refresh_parameters,
         )
         self.handler = CommandHandler(
-            executor=ActionExecutor(driver, self.capabilities, autopilot, self.publisher),
+            executor=ActionExecutor(driver, self.capabilities, flight, autopilot, self.publisher),
             publisher=self.publisher,
             events=self.events,
             counters=self._counters,
             server=server_end,
             sessions=self._sessions,
             clock=clock,
-            shared=driver.shared,
+            slept=slept or (slept_ns if clock is monotonic_ns else _never),
         )
         self.parameters = Parameters(lambda: described(driver), driver.set_parameter)
         self.workers = ProcessorWorkers(server_end, self.events, self._counters, self.publisher.cameras)
@@ -173,11 +178,12 @@ class Proxy:
         self.keep_warm: Callable[[float], None] = _let_be
         self._stopping = threading.Event()
         self._life_lock = threading.Lock()
-        self._started = self._stopped = False
+        self._started = False
+        self.ended = False  #: whether it ends, or has ended
         self._trail: AuditTrail | None = None
         self._record: FlightRecord | None = None
         self._decode = decode
-        self._command = self.handler.command
+        self._command, self._aged = self.handler.command, self.handler.aged
 
     def keep_trail(self, trail: AuditTrail) -> None:
         """Write who flies when to this trail and close it with the proxy. Call before :meth:`start`."""
@@ -197,58 +203,96 @@ class Proxy:
             if self._started:
                 raise UsageError(f"proxy {self.name} was started before: make another one")
             self._started = True
+        leave_to_parent(self)
         self._parameter_requests.read_driver()
         self.handler.begin(self.clock())
         try:
             self.server.start(self)
         except BaseException:
-            self._stopped = True
+            self.ended = True
             if self._trail is not None:
                 self._trail.close()
             raise
         if self._trail is not None:
             self._trail.begin(str(self.driver.uri))
         if self._record is not None:  # now that the name is ours
-            if self._record.believed():
-                self.handler.ownership.began_before()
+            left_s = self._record.left_s()
+            if left_s > 0.0:
+                self.handler.flight.began_before(self.clock() + nanoseconds(left_s))
             self._record.start()
         self._requests.start()
         self.overview.begin()
         try:
             self.driver.open(self.publisher)
         except BaseException:
-            self.stop()
+            self.end()
             raise
         if self._ticker is not None:
             self._ticker.start()
 
-    def land(self, timeout_s: float) -> bool:
-        """Land what flies because the proxy is about to end, and wait for it.
+    def end(
+        self,
+        within_s: float = 0.0,
+        *,
+        reason: str = "the proxy was stopped",
+        hurry: Callable[[], bool] = lambda: False,
+        unless_flying: bool = False,
+        hangs: bool = False,
+    ) -> bool:
+        """End the flight and then the proxy, and give every resource back. Idempotent. Any thread but the driver's own.
 
-        From the first call on the proxy takes no set-points, only landing and emergency stop.
+        First everything is barred but landing and the emergency stop, for good, whether or not the vehicle flies. What
+        flies is landed. What has not landed in time is left hovering if the vehicle hovers by itself; else it is told
+        to stand still, once, as nobody steers it from then on.
 
         Args:
-            timeout_s: how long to wait [s].
+            within_s: How long it may take to land [s]; 0: it does not land.
+            reason: Why it ends, for people.
+            hurry: Asked several times a second whether to wait for the landing no longer. A vehicle that does not hover
+                by itself is landed all the same, for as long as it may take: without its proxy it would fall.
+            unless_flying: What has not landed in time goes on to land, and the proxy goes on.
+            hangs: The driver hangs or fails. Nothing waits for it then, and it is not asked to land or to hover: what
+                may hang is left to daemon threads, and the vehicle is on its own, as when its proxy is killed.
 
         Returns:
             Whether nothing of the proxy's flies any more.
         """
-        if not self.handler.order_landing(self.clock()):
+        if not self._started or self.ended:
             return True
-        return self.publisher.wait_for(lambda _: not self.handler.airborne, timeout_s)
-
-    def stop(self, *, reason: str = "the proxy was stopped") -> None:
-        """Publish that the proxy ends and give every resource back. Idempotent.
-
-        It does not land: what flies is left hovering, as far as the vehicle can by itself. See :meth:`land`.
-        """
+        landed = not hangs and self._land(within_s, hurry)
+        if unless_flying and not landed:
+            return False
         with self._life_lock:
-            if self._stopped or not self._started:
-                return
-            self._stopped = True
-        self.events.publish(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", Severity.WARNING)
+            if self.ended:
+                return landed
+            self.ended = True
+        severity = Severity.ERROR if hangs else Severity.WARNING
+        self.events.publish(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", severity)
         self._stopping.set()
         self.overview.end()
+        try:
+            if hangs:
+                self._abandon()
+            else:
+                self._close()
+        finally:
+            for kept in (self._trail, self._record):
+                if kept is not None:
+                    kept.close()
+        return landed
+
+    def _land(self, within_s: float, hurry: Callable[[], bool]) -> bool:
+        """Land what flies; return whether nothing of the proxy's flies any more."""
+        handler, hovers = self.handler, "hover" in self.capabilities.actions
+        deadline_s = time.monotonic() + within_s
+        while time.monotonic() < deadline_s and not (hovers and hurry()):
+            if not handler.order_landing(self.clock()):
+                return True
+            left_s = deadline_s - time.monotonic()
+            self.publisher.wait_for(lambda _: not handler.airborne, max(0.0, min(_POLL_S, left_s)))
+        return not handler.airborne
+
+    def _close(self) -> None:
         if self._ticker is not None and self._ticker.is_alive():
             self._ticker.join()
         self.keep_warm(0.0)
@@ -259,21 +303,13 @@ class Proxy:
         finally:
             self.publisher.streams.end()
             self.server.stop()
-            self._close_records()
 
-    def abandon(self, reason: str) -> None:
-        """Publish that the proxy ends because its driver does not work, and give back what can be. Idempotent.
+    def forked(self) -> None:
+        """Leave the vehicle and the clients to the parent process; in a child made by ``os.fork``."""
+        self.ended = True
 
-        For a driver that hangs or fails: nothing waits for it, and it is not asked to land or to hover. What may hang
-        is left to daemon threads. The vehicle is on its own, as when its proxy is killed.
-        """
-        with self._life_lock:
-            if self._stopped or not self._started:
-                return
-            self._stopped = True
-        self.events.publish(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", Severity.ERROR)
-        self._stopping.set()
-        self.overview.end()
+    def _abandon(self) -> None:
+        """Give back what can be, without waiting for what hangs."""
         self.keep_warm(0.0)
         parts = (self.server.stop, self.driver.close, self._requests.stop)
         threads = [threading.Thread(target=part, name="skyloop-abandoned", daemon=True) for part in parts]
@@ -282,19 +318,13 @@ class Proxy:
         deadline_s = time.monotonic() + _ABANDON_S
         for thread in threads:
             thread.join(max(0.0, deadline_s - time.monotonic()))
-        self._close_records()
-
-    def _close_records(self) -> None:
-        for kept in (self._trail, self._record):
-            if kept is not None:
-                kept.close()
 
     def __enter__(self) -> Proxy:
         self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.stop()
+        self.end()
 
     # From the transport ----------------------------------------------------------------------------------------
 
@@ -315,7 +345,7 @@ class Proxy:
             return
         kind = type(sample)
         if kind is Command:
-            self._command(session, sample, now_ns)  # type: ignore[arg-type]
+            self._command(session, self._aged(sample, now_ns), now_ns)  # type: ignore[arg-type]
         elif isinstance(sample, Request):
             self._requests.handle(session, sample, now_ns)
         elif isinstance(sample, Annotation):
@@ -396,6 +426,8 @@ class Proxy:
 
     def tick(self, now_ns: int) -> None:
         """Update what goes by time: authority, failsafe, software autopilot, feedback of a silent vehicle, events."""
+        if self._stopping.is_set():  # a tick may come after the end, of one ticker for many, or back from a hang
+            return
         self.tick_flight(now_ns)
         self._end_silent(now_ns)
         self.workers.tick(now_ns)
@@ -404,9 +436,11 @@ class Proxy:
 
     def tick_flight(self, now_ns: int) -> None:
         """Update of what :meth:`tick` does that which a flight needs 50 times a second; the rest may be seldom."""
+        if self._stopping.is_set():
+            return
         self.handler.tick(now_ns)
         self.publisher.keep_alive(now_ns)
-        flown = self.handler.piloted and not self._stopping.is_set()  # a tick may come back after the end, from a hang
+        flown = self.handler.piloted and not self._stopping.is_set()  # it may come back after the end, from a hang
         self.keep_warm(self.handler.warm_s if flown else 0.0)
 
     @property
@@ -496,12 +530,12 @@ class Proxy:
         self._requests.call_later(self._parameter_requests.read_driver)
 
 
+def _never() -> int:
+    return 0
+
+
 def _let_be(period_s: float) -> None:
     """Keep nothing warm."""
-
-
-def _as_reported(state: FlightState) -> FlightState:
-    return state
 
 
 def _silent(session: Session, why: str) -> EventDraft:

@@ -1,7 +1,9 @@
-"""Requests: each gets exactly one answer.
+"""Requests: each is carried out once and answered as often as it is asked.
 
-What only looks at the proxy's own state (Hello, authority, Ping) is answered at once on the receiving thread, so that
-a take-over never waits behind somebody's slow parameter. What may ask the driver is answered on a thread of its own.
+A client repeats a request until its answer arrives, with the same number. A repeat of one that is being answered joins
+it; a repeat of one that changed something gets the kept answer. What concerns only the proxy's own state (Hello,
+authority, Ping) is answered at once on the receiving thread, so that a take-over never waits behind a slow parameter.
+What may ask the driver is answered on a thread of its own.
 """
 
 from __future__ import annotations
@@ -14,16 +16,20 @@ from typing import Any, Final, Protocol
 
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import (
+    AnswerTakeover,
     AnyReply,
     EventKind,
     GetParameter,
     Hello,
+    JoinProcessor,
     ListParameters,
     ParameterValue,
     Refusal,
     Refused,
+    ReleaseAuthority,
     Reply,
     Request,
+    RequestAuthority,
     Role,
     SetParameter,
     Severity,
@@ -39,6 +45,10 @@ from skyloop.transport.base import TransportServer
 
 MAX_PENDING: Final = 16  #: requests of one application that wait for their thread; further ones are refused
 MAX_MESSAGE: Final = 1000  #: characters of a refusal
+
+_AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
+#: Requests that change something. The others may be answered again, with what is true then.
+_CHANGING: Final = (*_AUTHORITY, AnswerTakeover, SetParameter, JoinProcessor)
 
 #: Answers one type of request: of this connection, with this body, received at this time [ns].
 Answer = Callable[[Session, Any, int], AnyReply]
@@ -133,19 +143,33 @@ class RequestDispatcher:
         if session.role is None and kind is not Hello:
             self._reply(session, request, Refused(Refusal.PROTOCOL, "the first request on a connection is Hello"))
             return
-        answer = self._immediate.get(kind)
-        if answer is not None:
-            self._reply(session, request, answer(session, request.body, now_ns))
-            return
         with self._pending_lock:
-            full = session.pending >= MAX_PENDING
-            if not full:
-                session.pending += 1
+            repeated = session.answers.repeats(request.id)
+            kept = session.answers.kept(request.id)
+            full = not repeated and kind in self._deferred and session.answers.pending >= MAX_PENDING
+            if not (repeated or full):
+                session.answers.begin(request.id)
+        if repeated:
+            self._counts["requests.repeated"] += 1
+            if kept is not None:
+                self._send(session, kept)
+            return
         if full:
             why = f"{MAX_PENDING} requests of this application wait already: wait for their answers"
             self._reply(session, request, Refused(Refusal.BUSY, why))
             return
-        self._jobs.put(lambda: self._answer_later(session, request, now_ns))
+        if isinstance(request.body, _AUTHORITY):
+            # A request that was lost on the way and repeated must not undo the release that followed it.
+            if request.id < session.authority_request:
+                why = "a later request for the authority, or its release, has taken its place"
+                self._finish(session, request, Refused(Refusal.NOT_FRESH, why))
+                return
+            session.authority_request = request.id
+        answer = self._immediate.get(kind)
+        if answer is not None:
+            self._finish(session, request, answer(session, request.body, now_ns))
+        else:
+            self._jobs.put(lambda: self._answer_later(session, request, now_ns))
 
     def _answer_later(self, session: Session, request: Request, now_ns: int) -> None:
         kind = type(request.body)
@@ -158,11 +182,15 @@ class RequestDispatcher:
         except Exception as error:  # noqa: BLE001  whatever a driver's code does, the asker gets an answer
             self._on_failure(kind.__name__, error)
             reply = Refused(Refusal.DRIVER_FAILED, f"the driver failed: {error!r}"[:MAX_MESSAGE])
-        with self._pending_lock:
-            session.pending -= 1
-        self._reply(session, request, reply)
+        self._finish(session, request, reply)
 
-    def _reply(self, session: Session, request: Request, body: AnyReply) -> None:
+    def _finish(self, session: Session, request: Request, body: AnyReply) -> None:
+        """Send an answer, and keep it for repeats if the request changed something."""
+        packet = self._reply(session, request, body)
+        with self._pending_lock:
+            session.answers.end(request.id, packet if isinstance(request.body, _CHANGING) else None)
+
+    def _reply(self, session: Session, request: Request, body: AnyReply) -> bytes:
         if isinstance(body, Refused):
             self._counts["requests.refused"] += 1
         try:
@@ -170,6 +198,10 @@ class RequestDispatcher:
         except (ValueError, TypeError, OverflowError) as error:  # a driver's parameter may hold anything
             _log.error("an answer cannot be sent: %s", error)
             packet = encode(Reply(request.id, Refused(Refusal.DRIVER_FAILED, "the answer cannot be sent")))
+        self._send(session, packet)
+        return packet
+
+    def _send(self, session: Session, packet: bytes) -> None:
         if not self._server.send(session.peer, packet):
             self._counts["replies.missed"] += 1
 
@@ -241,10 +273,14 @@ class ParameterRequests:
         if not self._handler.holds(session, request.lease):
             code = Refusal.FOREIGN_LEASE if request.lease else Refusal.NO_AUTHORITY
             return Refused(code, "writing a parameter needs the authority: request it, and name its lease")
+        if request.name == "limits.altitude" and isinstance(request.value, int | float):
+            problem = self._handler.problem_with_ceiling(float(request.value))
+            if problem:
+                return Refused(Refusal.OUT_OF_RANGE, f"{request.name} can't be {request.value:g} m now: {problem}")
         parameter = self._parameters.set(request.name, request.value)
         self._handler.configure(self._parameters.flight_settings())
         unit = f" {parameter.unit}" if parameter.unit else ""
         text = f"{session.name} set {parameter.name} to {parameter.value!r}{unit}"
-        data: dict[str, Value] = {"name": parameter.name, "value": parameter.value}
+        data: dict[str, Value] = {"name": parameter.name, "value": parameter.value, "app_id": session.app_id}
         self._events.publish(EventKind.PARAMETER_CHANGED, text, app=session.name, data=data)
         return ParameterValue(parameter)

@@ -6,7 +6,6 @@ import logging
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
@@ -161,11 +160,13 @@ def run(
     overview = OverviewRegistry()
     for proxy in proxies:
         proxy.overview.share(overview)
-    with on_signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as started:
+    within_s = 0.0
+    with on_signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as around:
         if beside is not None:
-            started.enter_context(beside(proxies))
-        for proxy in proxies:
-            started.push(partial(_stop, proxy, shutdown))
+            around.enter_context(beside(proxies))
+        around.callback(
+            lambda: end_all(proxies, within_s, reason=shutdown.reason or "it failed", hurry=shutdown.hurry.is_set)
+        )
         for proxy in proxies:
             proxy.start()
         if parent_fd is not None:
@@ -181,7 +182,7 @@ def run(
             if parent_fd is None:  # a parent gets the proxy's events, and may not read what is written here
                 for proxy, link in zip(proxies, lines, strict=True):
                     _announce_link(proxy, link)
-        _land(proxies, shutdown, land_within_s)
+        within_s = land_within_s
 
 
 def _publish_keys(proxies: Sequence[Proxy], change: str) -> None:
@@ -204,15 +205,24 @@ def keep_trail(proxy: Proxy, path: Path | None) -> None:
         _log.warning("there is no audit trail, because %s can't be written: %s", chosen, error)
 
 
-def _stop(proxy: Proxy, shutdown: Shutdown, *_: object) -> None:
-    proxy.stop(reason=shutdown.reason or "it failed")
+def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Callable[[], bool]) -> None:
+    """End several proxies at the same time, as :meth:`Proxy.end` does each. Raises what one of them does, then."""
+    raised: list[Exception] = []
 
+    def end(proxy: Proxy) -> None:
+        try:
+            proxy.end(within_s, reason=reason, hurry=hurry)
+        except Exception as error:  # noqa: BLE001  it is raised when all have ended
+            raised.append(error)
 
-def _land(proxies: Sequence[Proxy], shutdown: Shutdown, within_s: float) -> None:
-    deadline = time.monotonic() + within_s
-    flying = list(proxies)
-    while flying and not shutdown.hurry.is_set() and time.monotonic() < deadline:
-        flying = [proxy for proxy in flying if not proxy.land(_POLL_S)]
+    threads = [threading.Thread(target=end, args=(proxy,), name="skyloop-end") for proxy in proxies]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        while thread.is_alive():  # looks up now and then, for signals
+            thread.join(_POLL_S)
+    if raised:
+        raise raised[0]
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from skyloop.child_process import leave_to_parent
 from skyloop.client import Drone
 from skyloop.errors import UsageError
 from skyloop.logfile.layout import ClockPair, DroneRecord, to_plain
@@ -78,6 +79,11 @@ class Engine:
         self._writer.start()
         for tap in self._taps:
             tap.start()
+        leave_to_parent(self)
+
+    def forked(self) -> None:
+        """Leave the file to the parent process; in a child made by ``os.fork``."""
+        self._ended_ns = time.monotonic_ns()
 
     def stop(self, timeout_s: float = 10.0) -> None:
         """Write what was received, and close the file. Idempotent.

@@ -62,7 +62,8 @@ def _described(parameter: Parameter) -> Any:
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
     unit = f" [{parameter.unit}]" if parameter.unit else ""
-    descriptor = ParameterDescriptor(description=f"{parameter.description}{unit}")
+    once = " (momentary: writing it does something once)" if parameter.momentary else ""
+    descriptor = ParameterDescriptor(description=f"{parameter.description}{unit}{once}")
     if parameter.read_only:
         descriptor.additional_constraints = "read-only"
     elif parameter.choices:

@@ -93,12 +93,8 @@ class Pilot:
     def on_velocity(self, twist: Any) -> None:
         """Fly with the velocity of a ``geometry_msgs/Twist`` (levelled axes); rates of roll and pitch are ignored."""
         linear, angular = twist.linear, twist.angular
-        if self._is_occupied("cmd_vel"):
-            return
-        try:
-            self._drone.velocity(forward=linear.x, left=linear.y, up=linear.z, yaw_rate=angular.z)
-        except SkyloopError as error:
-            self._ignored("cmd_vel", error)
+        rates = {"forward": linear.x, "left": linear.y, "up": linear.z, "yaw_rate": angular.z}
+        self._unless_occupied("cmd_vel", lambda: self._drone.velocity(**rates))
 
     def on_stamped_velocity(self, message: Any) -> None:
         """Fly with the velocity of a ``TwistStamped``, unless it is too old or in the axes of something else."""
@@ -115,21 +111,28 @@ class Pilot:
 
     def on_goal(self, pose: Any) -> None:
         """Fly to a pose, without waiting."""
-        if self._is_occupied("goal_pose"):
-            return
-        try:
+
+        def fly() -> None:
             place = self._place(pose)
             self._drone.go_to(x=place["x"], y=place["y"], z=place["z"], yaw=place.get("yaw"), wait=False)
-        except SkyloopError as error:
-            self._ignored("goal_pose", error)
 
-    def _is_occupied(self, topic: str) -> bool:
-        """Return whether a service is under way: programs go on to publish velocities while they wait for it."""
-        with self._lock:
-            service = self._under_way[-1] if self._under_way else ""
+        self._unless_occupied("goal_pose", fly)
+
+    def _unless_occupied(self, topic: str, send: Callable[[], object]) -> None:
+        """Send a set-point, unless a service is under way: programs go on publishing while they wait for it.
+
+        Sent under the lock that a service takes before it begins: else a velocity that was checked before a landing
+        could be sent after it. ``send`` does not wait.
+        """
+        try:
+            with self._lock:
+                service = self._under_way[-1] if self._under_way else ""
+                if not service:
+                    send()
+        except SkyloopError as error:
+            self._ignored(topic, error)
         if service:
             self._log.info(f"{topic} is ignored during {service}", throttle_duration_sec=WARN_AGAIN_S)
-        return bool(service)
 
     @contextmanager
     def _occupied(self, service: str) -> Iterator[None]:

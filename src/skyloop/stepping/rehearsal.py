@@ -96,7 +96,7 @@ def rehearse(uri: str = "sim://?cameras=none", *, radio: Radio | None = None) ->
             with open_drone(server.dial, app="rehearsal", scheduler=scheduler, timeout_s=_CONNECT_S) as drone:
                 yield drone
         finally:
-            proxy.stop()
+            proxy.end()
     finally:
         executor.close()
 

@@ -74,5 +74,5 @@ class SteppedReplay:
         """Stop the proxy and the thread. Idempotent."""
         if not self._ended:
             self._ended = True
-            self._proxy.stop()
+            self._proxy.end()
             self._executor.close()

@@ -222,6 +222,60 @@ def test_no_second_edge_while_nothing_new_is_heard() -> None:
     assert {cockpit.ref() for _ in range(40)} == {Ref.EMERGENCY}
 
 
+def test_a_stop_pressed_while_the_drone_is_lost_is_not_sent_when_it_is_back_minutes_later() -> None:
+    cockpit = at(AIR)
+    cockpit.take(Hover())
+    cockpit.setpoints.lost()
+    cockpit.take(EmergencyStop())
+    said = [cockpit.ref() for _ in range(400)]
+    assert said.count(Ref.EMERGENCY) == pytest.approx(10.0 / PERIOD_S, abs=2)
+    assert Ref.EMERGENCY not in said[340:]
+    (event,) = cockpit.setpoints.pop_events()
+    assert event.data["reason"] == "stop_given_up"
+    cockpit.now_s += 600.0
+    cockpit.hears(GROUND)
+    assert cockpit.ref() == Ref(0)
+    assert cockpit.take(ResetEmergency()) == ResetEmergency()
+    cockpit.hears(GROUND)
+    cockpit.hears(AIR)
+    assert cockpit.ref() is None, "another program flies it"
+    cockpit.take(Land())
+    assert cockpit.ref() == Ref(0)
+
+
+def test_a_stop_that_has_no_effect_is_given_up_and_the_drone_can_be_landed() -> None:
+    cockpit = at(AIR)
+    cockpit.take(Hover())
+    cockpit.take(EmergencyStop())
+    with pytest.raises(DriverError, match="has not shown"):
+        cockpit.take(ResetEmergency())
+    for _ in range(340):
+        cockpit.hears(AIR)
+        cockpit.ref()
+    assert cockpit.ref() is None
+    cockpit.take(Land())
+    assert cockpit.ref() == Ref(0)
+
+
+def test_a_stop_of_a_drone_that_another_program_flies_since_is_still_sent() -> None:
+    cockpit = at(AIR)
+    cockpit.setpoints.lost()
+    cockpit.take(EmergencyStop())
+    cockpit.hears(GROUND)
+    cockpit.hears(AIR)
+    assert cockpit.ref() == Ref.EMERGENCY
+
+
+def test_a_further_stop_while_a_stopped_drone_is_lost_makes_no_edge_that_would_release_it() -> None:
+    cockpit = at(AIR)
+    cockpit.take(EmergencyStop())
+    cockpit.hears(EMERGENCY)
+    assert cockpit.ref() == Ref(0)
+    cockpit.setpoints.lost()
+    cockpit.take(EmergencyStop())
+    assert {cockpit.ref() for _ in range(400)} == {Ref(0)}
+
+
 @pytest.mark.parametrize("action", [Hover(), Land(), Attitude(pitch=0.1)])
 def test_nothing_but_a_reset_takes_an_emergency_stop_back(action: AnyAction) -> None:
     cockpit = at(AIR)

@@ -15,6 +15,7 @@ from skyloop.messages import (
     Hover,
     Idle,
     Land,
+    LinkState,
     Position,
     ResetEmergency,
     Takeoff,
@@ -28,6 +29,7 @@ from tests.drivers.mavlink.scripted import ARDUPILOT, PX4, Bench, Vehicle
 
 ARM, MODE, TAKEOFF = 400, 176, 22
 FORCE = 21196.0
+CUT = (ARM, 0.0, FORCE, 0.0, 0.0)
 AUTOPILOTS = pytest.mark.parametrize("autopilot", [ARDUPILOT, PX4])
 GUIDED = {ARDUPILOT: "GUIDED", PX4: "OFFBOARD"}
 HOLD = {ARDUPILOT: ("BRAKE", (MODE, 1.0, 17.0, 0.0, 0.0)), PX4: ("AUTO.LOITER", (MODE, 1.0, 4.0, 3.0, 0.0))}
@@ -698,7 +700,7 @@ def test_an_emergency_stop_disarms_by_force_until_it_shows(autopilot: int) -> No
     bench.apply(EmergencyStop())
     bench.go_on(0.5)
     assert set(bench.commands()) == {(ARM, 0.0, FORCE, 0.0, 0.0)}
-    assert bench.state() is FlightState.EMERGENCY
+    assert bench.state() is FlightState.HOVERING, "what still flies is told as flying"
     with pytest.raises(DriverError, match="still armed"):
         bench.apply(ResetEmergency())
     bench.vehicle.armed, bench.vehicle.landed = False, Landed.ON_GROUND
@@ -735,6 +737,130 @@ def test_a_stop_that_did_not_succeed_can_be_pressed_again_and_given_up(autopilot
     bench.apply(Land())
     bench.go_on(0.5)
     assert LAND[autopilot][1] in bench.commands()
+
+
+@AUTOPILOTS
+def test_a_stop_right_after_arming_goes_out_at_once_and_a_quick_reset_does_not_end_it(autopilot: int) -> None:
+    """The heartbeat that shows the arming comes up to a second later: it is not waited for."""
+    bench = arming(autopilot)
+    bench.vehicle.armed = True
+    bench.answer(ARM)
+    bench.commands()
+    bench.apply(EmergencyStop())
+    assert bench.commands() == [CUT], "though no heartbeat has shown that it is armed"
+    for _ in range(2):  # one that was on its way says that it is not
+        bench.clock.advance(0.1)
+        bench.hear(stale_heartbeat(bench))
+        bench.tick()
+        with pytest.raises(DriverError, match="has not shown"):
+            bench.apply(ResetEmergency())
+    bench.go_on(1.0)
+    assert bench.commands().count(CUT) in (10, 11, 12), "ten times a second until it shows"
+    bench.vehicle.armed = False
+    bench.go_on(0.5)
+    bench.commands()
+    bench.go_on(1.0)
+    assert bench.commands() == []
+    bench.apply(ResetEmergency())
+    bench.go_on(0.1)
+    assert bench.state() is FlightState.LANDED
+
+
+@AUTOPILOTS
+def test_landing_while_arming_is_on_its_way_disarms_what_arms_then(autopilot: int) -> None:
+    """Nothing has acknowledged the arming, and no heartbeat has shown it: it must not stand there armed."""
+    bench = arming(autopilot)
+    bench.apply(Land())
+    bench.apply(Land())
+    bench.vehicle.armed = True
+    bench.answer(ARM)
+    bench.go_on(0.6)
+    assert bench.state() is FlightState.LANDING
+    assert set(bench.commands()) == {(ARM, 0.0, 0.0, 0.0, 0.0)}
+    bench.vehicle.armed = False
+    bench.go_on(0.3)
+    assert bench.state() is FlightState.LANDED
+    bench.commands()
+    bench.go_on(3.0)
+    assert bench.commands() == []
+
+
+@AUTOPILOTS
+def test_landing_before_an_arming_that_never_comes_ends_soon(autopilot: int) -> None:
+    bench = arming(autopilot)
+    bench.apply(Land())
+    bench.go_on(3.0)
+    assert bench.state() is FlightState.LANDED
+    bench.commands()
+    bench.go_on(1.0)
+    assert bench.commands() == []
+
+
+@AUTOPILOTS
+def test_a_stop_that_the_vehicle_never_shows_is_given_up_and_it_can_be_landed(autopilot: int) -> None:
+    """The link is out when it is pressed, and back after it was given up: it flies, which is told, and lands."""
+    bench = steering(autopilot)
+    bench.go_on(3.0, silent=True)
+    assert bench.link() is LinkState.LOST
+    bench.apply(EmergencyStop())
+    assert bench.commands() == [CUT], "it may hear what is sent, though it is not heard"
+    bench.go_on(9.0, silent=True)
+    assert len(bench.commands()) > 80
+    bench.go_on(3.0, silent=True)
+    assert any("given up" in text and "land it" in text for text in bench.texts)
+    bench.commands()
+    bench.go_on(1.0)
+    assert bench.state() in (FlightState.HOVERING, FlightState.FLYING)
+    assert bench.commands() == [] or CUT not in bench.commands()
+    bench.apply(Land(), alone=True)
+    bench.go_on(0.5)
+    assert LAND[autopilot][1] in bench.commands(), "a failsafe lands it"
+
+
+@AUTOPILOTS
+def test_a_stop_shows_while_it_is_repeated(autopilot: int) -> None:
+    """As the library does, until it shows: the repeats must not put that off."""
+    bench = steering(autopilot)
+    bench.apply(EmergencyStop())
+    bench.vehicle.armed, bench.vehicle.landed = False, Landed.ON_GROUND
+    for _ in range(40):
+        bench.go_on(0.04)
+        bench.apply(EmergencyStop(), new=False)
+    assert bench.state() is FlightState.EMERGENCY
+
+
+@AUTOPILOTS
+def test_a_stopped_vehicle_that_others_arm_again_is_told_as_it_flies(autopilot: int) -> None:
+    bench = steering(autopilot)
+    bench.apply(EmergencyStop())
+    bench.vehicle.armed, bench.vehicle.landed = False, Landed.ON_GROUND
+    bench.go_on(12.0)
+    assert bench.state() is FlightState.EMERGENCY
+    bench.vehicle.armed, bench.vehicle.landed, bench.vehicle.mode = True, Landed.IN_AIR, other_mode(autopilot, "sticks")
+    bench.commands()
+    bench.go_on(0.5)
+    assert CUT not in bench.commands()
+    assert bench.state() is FlightState.FLYING
+    assert any("started again, not from here" in text for text in bench.texts)
+
+
+def arming(autopilot: int) -> Bench:
+    """Asked to arm for a take-off, and nothing came of it yet."""
+    bench = Bench(Vehicle(autopilot))
+    bench.vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.found()
+    bench.apply(Takeoff())
+    bench.tick()
+    assert (ARM, 1.0, 0.0, 0.0, 0.0) in bench.commands()
+    return bench
+
+
+def stale_heartbeat(bench: Bench) -> Message:
+    """What it sent just before it was armed."""
+    bench.vehicle.armed = False
+    message = bench.vehicle.heartbeat()
+    bench.vehicle.armed = True
+    return message
 
 
 # Places ----------------------------------------------------------------------------------------------------------

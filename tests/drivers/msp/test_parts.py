@@ -21,7 +21,7 @@ from skyloop.drivers.msp.telemetry import charge_left
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, ParameterError, UnknownNameError, UsageError
-from skyloop.messages import Attitude, LinkState, Takeoff
+from skyloop.messages import Attitude, EmergencyStop, FlightState, LinkState, ResetEmergency, Takeoff
 from skyloop.wire.msp import messages as msp
 from skyloop.wire.msp.frames import Direction, Frame, Parser, encode
 from skyloop.wire.msp.messages import Function, Identity, ModeRange
@@ -299,6 +299,48 @@ def test_inav_is_read_and_armed() -> None:
 
 
 def test_a_pilot_gives_the_sticks_away_and_takes_them_back() -> None:
+    setpoints = given_away()
+    assert setpoints.left_to == ""
+    assert setpoints.channels(NS_PER_S // 50)[2] == pytest.approx(1420, abs=2), "nothing jumps"
+    setpoints.on_report(Report(armed=True), 2)
+    assert setpoints.left_to == "RECEIVER"
+    assert [event.data["active"] for event in setpoints.pop_events()] == [True, False]
+    with pytest.raises(DriverError, match="by the pilot's receiver"):
+        setpoints.apply(Attitude(climb=0.5), 3)
+
+
+def test_a_pilots_switch_off_and_on_starts_no_throttle_after_a_stop_that_was_not_reset() -> None:
+    setpoints = given_away()
+    setpoints.apply(EmergencyStop(), 0)
+    now_ns = 0
+
+    def see(overridden: bool, seconds: float) -> int:
+        """The throttle after this time [µs]."""
+        nonlocal now_ns
+        for _ in range(round(seconds / 0.02)):
+            now_ns += NS_PER_S // 50
+            setpoints.on_report(Report(armed=True, overridden=overridden), now_ns)
+            if not overridden:
+                setpoints.on_pilot_throttle(0.42)
+            setpoints.step_stop(now_ns)
+        return setpoints.channels(now_ns)[2]
+
+    assert see(overridden=True, seconds=1.0) == 1000
+    see(overridden=False, seconds=1.0)
+    assert see(overridden=True, seconds=1.0) == 1000
+    see(overridden=False, seconds=30.0)
+    assert see(overridden=True, seconds=1.0) == 1000, "however long the pilot flew it"
+    assert setpoints.flight_state() is FlightState.EMERGENCY
+    setpoints.apply(ResetEmergency(), now_ns)
+    assert see(overridden=True, seconds=1.0) == 1000
+    see(overridden=False, seconds=1.0)
+    assert see(overridden=True, seconds=0.02) == pytest.approx(1420, abs=2), (
+        "after the reset it is taken over in flight"
+    )
+
+
+def given_away() -> SetpointController:
+    """A pilot flew it by the receiver at a throttle of 0.42, and gave the sticks away."""
     setpoints = SetpointController(override=True)
     setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
     setpoints.on_report(Report(armed=True), 0)
@@ -308,13 +350,7 @@ def test_a_pilot_gives_the_sticks_away_and_takes_them_back() -> None:
     setpoints.on_motion(estimate.at(0))
     setpoints.on_pilot_throttle(0.42)
     setpoints.on_report(Report(armed=True, overridden=True), 1)
-    assert setpoints.left_to == ""
-    assert setpoints.channels(NS_PER_S // 50)[2] == pytest.approx(1420, abs=2), "nothing jumps"
-    setpoints.on_report(Report(armed=True), 2)
-    assert setpoints.left_to == "RECEIVER"
-    assert [event.data["active"] for event in setpoints.pop_events()] == [True, False]
-    with pytest.raises(DriverError, match="by the pilot's receiver"):
-        setpoints.apply(Attitude(climb=0.5), 3)
+    return setpoints
 
 
 # Without a vehicle ---------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from skyloop.drivers.msp.setpoints import Phase
 from skyloop.emulators.msp.board import bit
 from skyloop.emulators.msp.settings import BoardSettings
 from skyloop.errors import DriverError
@@ -299,6 +300,50 @@ def test_emergency_stop_until_the_reset() -> None:
     bench.session.command(ResetEmergency(), bench.clock.now_ns)
     bench.run(0.2)
     assert [*states, bench.feedback.state] == [FlightState.EMERGENCY, FlightState.LANDED]
+
+
+def test_a_stop_is_sent_at_once_though_the_flight_controller_is_behind() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.deaf = True
+    bench.run(0.1)
+    bench.sent.clear()
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.tick()
+    assert [frame.function for frame in bench.sent if frame.function == Function.SET_RAW_RC]
+    bench.tick()
+    assert not bench.board.armed
+
+
+def test_a_stop_of_what_is_just_being_found_in_flight_is_not_undone_by_taking_it_over() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.reconnect()
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.until(lambda: not bench.board.armed, 3.0)
+    bench.run(1.0)
+    assert not bench.board.armed
+    assert bench.session.setpoints.phase is Phase.STANDING
+    assert bench.feedback.state is FlightState.EMERGENCY
+
+
+def test_a_stop_pressed_in_a_long_loss_does_not_disarm_what_flies_when_the_link_is_back() -> None:
+    """Its failsafe has it in the air for minutes: the stop was given up long before, and it is flown on."""
+    bench = Bench(BoardSettings(failsafe=FailsafeConfig(1.5, 60.0, 1322, 10.0, 0)))
+    bench.take_off()
+    bench.cut = True
+    bench.run(1.5)
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.run(9.0)
+    assert not bench.texts("stop_given_up")
+    bench.run(1.5)
+    assert len(bench.texts("stop_given_up")) == 1
+    bench.sink.feedbacks.clear()
+    bench.cut = False
+    bench.run(3.0)
+    assert bench.board.armed
+    assert bench.session.setpoints.phase is Phase.FLYING
+    assert {feedback.state for feedback in bench.sink.feedbacks} == {FlightState.FLYING}
 
 
 def test_a_crash_disarms_and_is_told() -> None:

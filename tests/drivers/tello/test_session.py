@@ -138,8 +138,8 @@ def test_an_emergency_stop_is_kept_until_the_reset(lost: float) -> None:
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
     rig.do(EmergencyStop())
-    rig.until(lambda: rig.state is FlightState.EMERGENCY, 1.0)
     rig.until(lambda: rig.bench.flight is FlightState.LANDED, 4.0)
+    rig.until(lambda: rig.state is FlightState.EMERGENCY, 3.0)
     assert EventKind.EMERGENCY in [event.kind for event in rig.sink.events]
     with pytest.raises(DriverError, match="reset the emergency first"):
         rig.do(Takeoff())
@@ -167,6 +167,96 @@ def test_a_stop_that_does_not_show_can_not_be_reset() -> None:
     with pytest.raises(DriverError, match="motors still run"):
         rig.do(ResetEmergency())
     assert rig.do(Idle()) == Idle()
+
+
+def test_a_stop_that_is_never_shown_is_given_up_told_and_the_drone_lands_by_itself() -> None:
+    """The Wi-Fi is out when it is pressed, and back long after: nobody commands, and nothing keeps it from landing."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.on = False
+    rig.run(2.0)
+    rig.do(EmergencyStop())
+    rig.take_said()
+    rig.run(9.8)
+    assert rig.take_said().count("emergency") > 75, "also to a drone that is not heard"
+    rig.run(0.6)
+    assert rig.reasons.count("stop_given_up") == 1
+    rig.take_said()
+    rig.on = True
+    rig.until(lambda: rig.state is FlightState.HOVERING, 5.0)
+    assert "emergency" not in rig.said, "it does not fall minutes later"
+    rig.until(lambda: rig.state is FlightState.LANDED, 30.0)
+    assert rig.bench.flight is FlightState.LANDED
+    assert not [text for text in rig.said if text.startswith(("rc", "wifi?", "land", "emergency"))]
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+
+
+def test_a_drone_whose_stop_was_given_up_can_be_landed_and_the_reset_is_allowed() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.deaf = True
+    rig.do(EmergencyStop())
+    rig.run(11.0)
+    assert rig.state is FlightState.HOVERING, "no emergency is told of what flies"
+    rig.deaf = False
+    rig.do(ResetEmergency())
+    rig.do(Hover())
+    rig.run(6.0)
+    assert "wifi?" in rig.said, "once something is commanded it is kept awake again"
+    rig.do(Land())
+    rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
+
+
+def test_a_stop_shows_while_it_is_repeated() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+
+    def repeated() -> bool:
+        rig.do(EmergencyStop())
+        return rig.state is FlightState.EMERGENCY
+
+    rig.until(repeated, 4.0)
+
+
+def test_an_answer_alone_does_not_end_a_stop() -> None:
+    """An "ok" does not say what it answers: it may be that of a landing before."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.deaf = True
+    rig.do(EmergencyStop())
+    rig.step()
+    rig.step()
+    for _ in range(2):  # the take-off's, and one more
+        rig.session.on_reply(b"ok", rig.now_ns)
+    rig.run(2.0)
+    with pytest.raises(DriverError, match="motors still run"):
+        rig.do(ResetEmergency())
+    rig.deaf = False
+    rig.until(lambda: rig.bench.flight is FlightState.LANDED, 4.0)
+
+
+def test_a_stop_in_a_take_off_goes_on_until_the_motors_are_off() -> None:
+    """They did not turn when it was pressed, and turn when the drone has heard the take-off but not the stop."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.run(0.1)
+    rig.deaf = True
+    rig.do(EmergencyStop())
+    rig.run(3.0)
+    rig.deaf = False
+    rig.until(lambda: rig.bench.flight is FlightState.LANDED, 4.0)
+    rig.run(3.0)
+    assert rig.state is FlightState.EMERGENCY
 
 
 def test_attitude_is_a_share_of_the_stick() -> None:

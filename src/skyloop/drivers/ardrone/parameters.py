@@ -304,6 +304,11 @@ def _switch(name: str, description: str) -> Parameter:
     return Parameter(name, ParameterType.BOOL, False, default=False, description=description)
 
 
+def _once(parameter: Parameter) -> Parameter:
+    """Mark a parameter whose writing makes the drone do something once."""
+    return msgspec.structs.replace(parameter, momentary=True)
+
+
 def _choice(name: str, names: tuple[str, ...], description: str) -> Parameter:
     choices = (NO_ANIMATION, *names)
     return Parameter(
@@ -315,14 +320,18 @@ def _number(name: str, value: float, unit: str, low: float, high: float, descrip
     return Parameter(name, ParameterType.FLOAT, value, unit, low, high, value, description=description)
 
 
-_LEDS: Final = _choice("leds.animation", LED_ANIMATIONS, "plays this animation of the lights (LED); none: nothing")
+_LEDS: Final = _once(
+    _choice("leds.animation", LED_ANIMATIONS, "plays this animation of the lights (LED); none: nothing")
+)
 _LEDS_FREQUENCY: Final = _number("leds.frequency", 2.0, "1/s", 0.1, 50.0, "of the next animation of the lights")
 _LEDS_DURATION: Final = _number(
     "leds.duration", 3.0, "s", 0.0, 3600.0, "of the next one, in whole seconds; 0: for ever"
 )
-_TRIM: Final = _switch("ardrone.flat_trim", "true: the drone takes its attitude for level (FTRIM); on the ground only")
-_CALIBRATE: Final = _switch(
-    "ardrone.calibrate_magnetometer", "true: the drone turns about itself to calibrate (CALIB); in flight only"
+_TRIM: Final = _once(
+    _switch("ardrone.flat_trim", "true: the drone takes its attitude for level (FTRIM); on the ground only")
+)
+_CALIBRATE: Final = _once(
+    _switch("ardrone.calibrate_magnetometer", "true: the drone turns about itself to calibrate (CALIB); in flight only")
 )
 _ABSOLUTE: Final = _switch(
     "ardrone.absolute_control",
@@ -341,7 +350,7 @@ _HEADING: Final = _number(
 def _flight_animations(version: int | None) -> Parameter:
     known = FLIGHT_ANIMATIONS[:FIRST_FLIP] if version == 1 else FLIGHT_ANIMATIONS
     names = tuple(name for name, _ in known)
-    return _choice("ardrone.flight_animation", names, "flies this animation (ANIM, sent once); in flight only")
+    return _once(_choice("ardrone.flight_animation", names, "flies this animation (ANIM, sent once); in flight only"))
 
 
 class Commands:
@@ -421,7 +430,7 @@ class Commands:
         condition = self._condition()
         if on_ground and condition.flying:
             raise _refused(f"{message[0]} is for a drone that stands level on the ground: land first")
-        if not on_ground and (not condition.flying or condition.emergency):
+        if not on_ground and (not condition.flying or condition.emergency or self._setpoints.stop.active):
             raise _refused(f"{message[0]} is for a drone in the air: take off first")
         self._send(message, times)
 

@@ -21,7 +21,7 @@ from skyloop.drivers.ardrone.telemetry import (
     native_of,
 )
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
-from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
+from skyloop.messages import AnyAction, EmergencyStop, EventKind, LinkState, Severity, Value
 from skyloop.wire.ardrone.at import AtMessage, format_command
 from skyloop.wire.ardrone.navdata import Navdata, State
 from skyloop.wire.ardrone.options import Demo
@@ -129,7 +129,10 @@ class ArdroneSession(VehicleSession):
         """
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
-        if self.setpoints.intent != before:
+        if isinstance(action, EmergencyStop):
+            self._once.clear()
+            self.due_ns = now_ns
+        elif self.setpoints.intent != before:
             self.due_ns = min(self.due_ns, max(now_ns, self._sent_ns + HURRY_NS))
         return applied
 

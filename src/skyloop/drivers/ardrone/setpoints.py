@@ -15,6 +15,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
+from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.errors import DecodeError, DriverError
 from skyloop.messages import (
@@ -149,12 +150,13 @@ class SetpointController:
         self.condition: Condition | None = None  #: None while nothing is received from the drone
         self.limits: StickLimits | None = None  #: None until they were read
         self.reference_rad: float | None = None
+        self.stop = MotorStop(self._forget_flight)
         self._decision = Decision.STAY
         self._stick: Stick | None = None
         self._landing_is_ours = False
         self._decided_ns = 0
-        self._toggle: bool | None = None  #: whether the motors shall be cut (True) or released (False); None: neither
-        self._toggle_ns = 0
+        self._releasing = False  # a reset was asked for, and does not show
+        self._edge_ns = 0  # when the emergency bit was set or cleared last for want of an effect
         self._received_ns = 0
         self._warned_blind = False
         self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
@@ -163,7 +165,7 @@ class SetpointController:
     @property
     def intent(self) -> tuple[object, ...]:
         """Changes when something else is to be sent."""
-        return self._decision, self._stick, self._toggle
+        return self._decision, self._stick, self.stop.active, self._releasing
 
     # What is decided -------------------------------------------------------------------------------------------
 
@@ -175,7 +177,8 @@ class SetpointController:
             now_ns: The present time.
 
         Returns:
-            What is applied: an attitude within the drone's limits, or hover while the limits are not known.
+            What is applied: an attitude within the drone's limits, or hover while the limits are not known or an
+            emergency stop is in force.
 
         Raises:
             DriverError: A take-off while nothing is received or in emergency, a reset while nothing is reced, or an
@@ -190,6 +193,8 @@ class SetpointController:
             self._release_motors(now_ns)
         elif isinstance(action, Takeoff):
             self._take_off(now_ns)
+        elif self.stop.active:
+            return Hover()
         elif isinstance(action, Land):
             self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, True
         elif isinstance(action, Attitude):
@@ -202,22 +207,27 @@ class SetpointController:
 
     def _stop_motors(self, now_ns: int) -> None:
         self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
-        if self.condition is not None and self.condition.emergency:
-            self._toggle = None
-        elif self._toggle is not True:
-            self._toggle, self._toggle_ns = True, now_ns
+        self._releasing = False
+        if not self.stop.active:
+            self._edge_ns = now_ns
+        self.stop.press(now_ns)
+
+    def _forget_flight(self, given_up: VehicleEvent) -> None:
+        self._events.append(given_up)
+        self._decision, self._steering = Decision.STAY, False
 
     def _release_motors(self, now_ns: int) -> None:
         if self.condition is None:
             raise DriverError("no data from the drone: whether there is an emergency to reset is not known")
+        self.stop.reset()
         self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
-        if self.condition.emergency and self._toggle is not False:
-            self._toggle, self._toggle_ns = False, now_ns
+        if self.condition.emergency and not self._releasing:
+            self._releasing, self._edge_ns = True, now_ns
 
     def _take_off(self, now_ns: int) -> None:
         if self.condition is None:
             raise DriverError("no data from the drone: take-off is refused until the link is up")
-        if self.condition.emergency or self._toggle is not None:
+        if self.condition.emergency or self.stop.active:
             raise DriverError("the drone is in emergency: reset it first")
         if self._decision is not Decision.TAKE_OFF:
             self._decided_ns = now_ns
@@ -249,8 +259,7 @@ class SetpointController:
         if self.condition is not None and self.condition.flying and not condition.flying:
             self._stick = None
         self.condition, self._received_ns = condition, now_ns
-        if self._toggle is condition.emergency:
-            self._toggle = None
+        self._releasing &= condition.emergency
         if not (condition.flying or condition.emergency) and self._decision is not Decision.TAKE_OFF:
             self._steering = False
         if condition.emergency:
@@ -264,8 +273,7 @@ class SetpointController:
         """Forget the drone's condition and a take-off that is under way, as nothing is received any more."""
         self.condition = None
         self._warned_blind = False
-        if self._toggle is False:
-            self._toggle = None
+        self._releasing = False
         if self._decision is Decision.TAKE_OFF:
             self._decision = Decision.STAY
 
@@ -281,20 +289,21 @@ class SetpointController:
 
         While another program flies the drone: only the watchdog's answer.
         """
-        if self.condition is not None and self.condition.flying and not self._steering:
-            return [("COMWDG", ())]
         bits = self._emergency_bits(now_ns)
+        if bits is None and self.condition is not None and self.condition.flying and not self._steering:
+            return [("COMWDG", ())]
         if bits is None:
             bits = self._flight_bits(now_ns)
         moving = motion(self._stick, self.reference_rad if self._stick is not None else None)
         return [moving] if bits is None else [("REF", (int(Ref.FIXED | bits),)), moving]
 
     def _emergency_bits(self, now_ns: int) -> Ref | None:
-        if self._toggle is None:
+        self.stop.step(None if self.condition is None else self.condition.emergency, now_ns)
+        if not (self._releasing or (self.stop.active and not self.stop.shown)):
             return None
-        if self.condition is None or self._received_ns - self._toggle_ns < TOGGLE_NS:
+        if self.condition is None or self._received_ns - self._edge_ns < TOGGLE_NS:
             return Ref.EMERGENCY
-        self._toggle_ns = now_ns  # data came since, and show no effect: clear the bit once, for the next edge
+        self._edge_ns = now_ns  # data came since, and show no effect: clear the bit once, for the next edge
         return Ref(0)
 
     def _flight_bits(self, now_ns: int) -> Ref | None:

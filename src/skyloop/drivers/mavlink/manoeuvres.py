@@ -257,7 +257,7 @@ class TakeoffSequence:
         self._sent_ns = 0
         self._seen = not autopilot.TAKING_OFF  # its mode for taking off, where it has one
         self.refused = ""  #: why it is not armed yet
-        self.armed_here = False  #: not by others before
+        self.arm_asked_ns: int | None = None  #: when arming was asked for last; None: it was armed by others before
         self._ready = False  # it was seen armed in the mode that it takes off in
 
     @property
@@ -281,7 +281,7 @@ class TakeoffSequence:
         if not vehicle.armed and vehicle.mode != self._autopilot.ARMING and self._climb_command is None:
             commands.request(self._autopilot.mode_command(self._autopilot.ARMING), now_ns)
         elif self._armed_ns is None:
-            self.armed_here = True
+            self.arm_asked_ns = now_ns
             commands.request(ARM, now_ns, ARM_PACE_S)
         elif vehicle.mode in (self._autopilot.ARMING, *self._autopilot.TAKING_OFF) or self._climb_command is not None:
             self._climb_command = self._climb_command or self._autopilot.takeoff_command(self._height_m, vehicle)

@@ -257,6 +257,8 @@ class MavlinkSession(VehicleSession):
             vehicle = self.vehicle_state(now_ns)
             out += self._fly(vehicle, now_ns)
             self._check_health(vehicle, now_ns)
+        elif self.setpoints is not None and self.setpoints.step_stop(None, now_ns):
+            out += self.commands.pop_messages()
         packets += [(self._encoded(message), peer) for message in out if self._axes.sent(message)]
         self.due_ns = self._next_ns(now_ns)
         return packets

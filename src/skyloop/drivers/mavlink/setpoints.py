@@ -14,6 +14,7 @@ from typing import Final
 from skyloop.clock import nanoseconds
 from skyloop.drivers.mavlink.autopilots import AutopilotProfile, ThrustModel
 from skyloop.drivers.mavlink.manoeuvres import (
+    ARMED_NS,
     STRAYED_NS,
     AttitudeSetpoint,
     PositionHold,
@@ -26,6 +27,7 @@ from skyloop.drivers.mavlink.manoeuvres import (
 from skyloop.drivers.mavlink.microservices import CommandSender, VehicleCommand
 from skyloop.drivers.mavlink.ownership import FlightOwnership
 from skyloop.drivers.mavlink.telemetry import VehicleState
+from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.errors import DriverError
 from skyloop.messages import (
@@ -51,8 +53,6 @@ from skyloop.wire.mavlink.modes import Landed
 FORCE: Final = 21196.0  #: "even in flight", of the command to disarm
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
-CUT_PACE_S: Final = 0.2
-CUT_FOR_NS: Final = nanoseconds(10.0)  #: a stop is sent for so long at most, while the vehicle reports that it is armed
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
 STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
 HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
@@ -87,7 +87,7 @@ class SetpointController:
     ) -> None:
         self.takeoff_m = takeoff_m
         self.goal = Goal.NOTHING
-        self.stopped = False  #: the motors were stopped by us, and not released since
+        self.stop = MotorStop(lambda event: self._events.append(event))
         self.ownership = FlightOwnership(autopilot)
         self._autopilot = autopilot
         self._commands = commands
@@ -100,7 +100,7 @@ class SetpointController:
         self._strayed_ns: int | None = None  # since when it is another one again
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
         self._stepped_ns = 0  # when what is wanted now had its last step; 0: it has not had one
-        self._cut_ns = 0
+        self._arms_until_ns: int | None = None  # a take-off that a landing broke off may arm it until then
         self._events: list[VehicleEvent] = []
 
     # What is decided ---------------------------------------------------------------------------------------------
@@ -110,9 +110,8 @@ class SetpointController:
     ) -> AnyAction:
         """Accept an action.
 
-        An emergency stop is sent from the next tick on, until :data:`CUT_FOR_NS` after the last press at most; until
-        the reset nothing else is. A vehicle whose motors could not be stopped in that time may be reset while it is
-        armed, so that it can be landed.
+        While an emergency stop is in force (see :class:`~skyloop.drivers.motor_stop.MotorStop`) everything else is
+        ignored, and a take-off refused.
 
         Args:
             action: What is asked for.
@@ -130,10 +129,18 @@ class SetpointController:
         if isinstance(action, Idle):
             return action
         if isinstance(action, EmergencyStop):
-            self._stop_motors(now_ns)
+            self._end()
+            self.stop.press(now_ns)
             return action
         if isinstance(action, ResetEmergency):
-            return self._release_motors(action, vehicle, now_ns)
+            if vehicle is None:
+                raise DriverError("no data from the vehicle: whether it is at rest is not known")
+            self.stop.reset()
+            return action
+        if self.stop.active:
+            if isinstance(action, Takeoff):
+                raise DriverError("the motors were stopped in an emergency: reset it first")
+            return Idle()
         if alone and self._others_fly(vehicle):
             return Idle()
         if not alone:
@@ -161,24 +168,9 @@ class SetpointController:
             return False
         return not self._leave(vehicle)
 
-    def _stop_motors(self, now_ns: int) -> None:
-        self._cut_ns = now_ns  # with each press: the first ones may have been lost with the link
-        self.stopped = True
-        self._end()
-
-    def _release_motors(self, action: ResetEmergency, vehicle: VehicleState | None, now_ns: int) -> AnyAction:
-        if vehicle is None:
-            raise DriverError("no data from the vehicle: whether it is at rest is not known")
-        if vehicle.armed and now_ns - self._cut_ns < CUT_FOR_NS:
-            raise DriverError("the motors are still armed: there is nothing to reset yet")
-        self.stopped = False
-        return action
-
     def _take_off(self, vehicle: VehicleState | None, now_ns: int) -> None:
         if vehicle is None:
             raise DriverError("no data from the vehicle: take-off is refused until the link is up")
-        if self.stopped:
-            raise DriverError("the motors were stopped in an emergency: reset it first")
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None:
             self._takeoff.asked_ns = now_ns
             if self._takeoff.refused and not self._takeoff.started:
@@ -193,16 +185,14 @@ class SetpointController:
             self._follow(PositionHold(now_ns))
 
     def _land(self, vehicle: VehicleState | None) -> None:
-        started = self._takeoff is not None and self._takeoff.started
-        if self.stopped:
-            return
+        arms_until_ns = self._arms_until_ns
+        if self._takeoff is not None and self._takeoff.arm_asked_ns is not None:
+            arms_until_ns = self._takeoff.arm_asked_ns + ARMED_NS
         self._end()
-        if vehicle is None or vehicle.airborne or vehicle.armed or started:
-            self.goal = Goal.LAND
+        if vehicle is None or vehicle.airborne or vehicle.armed or arms_until_ns is not None:
+            self.goal, self._arms_until_ns = Goal.LAND, arms_until_ns
 
     def _hover(self, vehicle: VehicleState | None, now_ns: int, *, alone: bool) -> None:
-        if self.stopped:
-            return
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None and (alone or not self._takeoff.rose):
             if not alone:
                 self._land(vehicle)  # who asked for the take-off wants it no more: it stays on the ground
@@ -218,7 +208,7 @@ class SetpointController:
     def _steer(self, action: Velocity | Attitude | Position, vehicle: VehicleState | None, now_ns: int) -> AnyAction:
         if vehicle is None:
             raise DriverError("no data from the vehicle: set-points are refused until the link is up")
-        if self.stopped or vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
+        if vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
             return Idle()  # a set-point would cancel a take-off
         if vehicle.airborne is None and self.goal is not Goal.FOLLOW:
             return Idle()  # on the ground some would start by it
@@ -254,6 +244,7 @@ class SetpointController:
         """End whatever was wanted, and the stream."""
         self.goal, self._takeoff, self._setpoint = Goal.NOTHING, None, None
         self._stepped_ns = 0
+        self._arms_until_ns = None
         self._lead_ns, self._entered, self._strayed_ns, self._settling_ns = None, False, None, None
 
     # What is reported -----------------------------------------------------------------------------------------------
@@ -278,8 +269,10 @@ class SetpointController:
         """Return the flight state, as far as it is known."""
         if vehicle is None:
             return FlightState.UNKNOWN
-        if self.stopped:
+        if self.stop.shown:
             return FlightState.EMERGENCY
+        if self._arms_until_ns is not None and not vehicle.airborne:
+            return FlightState.LANDING  # it is armed, or may be any moment
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None and self._takeoff.started:
             return FlightState.TAKING_OFF
         if vehicle.airborne is None:
@@ -312,9 +305,7 @@ class SetpointController:
     def messages(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
         """Return the set-points that are due now; commands go to the command sender."""
         self._stepped_ns = now_ns
-        if self.stopped:
-            if vehicle.armed and now_ns - self._cut_ns < CUT_FOR_NS:
-                self._commands.request(CUT, now_ns, CUT_PACE_S)
+        if self.step_stop(vehicle, now_ns):
             return []
         if self.goal is Goal.TAKE_OFF:
             return self._step_takeoff(vehicle, now_ns)
@@ -332,10 +323,21 @@ class SetpointController:
             self._step_land(vehicle, now_ns)
         return []
 
+    def step_stop(self, vehicle: VehicleState | None, now_ns: int) -> bool:
+        """Send an emergency stop that is due, whether or not the vehicle is heard; return whether one is in force."""
+        if not self.stop.active:
+            return False
+        shown = None
+        if vehicle is not None and self.stop.settled(vehicle.heartbeat_ns):
+            shown = not vehicle.armed
+        if self.stop.step(shown, now_ns):
+            self._commands.request(CUT, now_ns, 0.0)
+        return True
+
     def due_ns(self, now_ns: int) -> int | None:
         """Return when :meth:`messages` has something to do next; None: nothing by the time alone."""
-        if self.stopped:
-            return now_ns
+        if self.stop.active:
+            return None if self.stop.shown else now_ns
         if self.goal in (Goal.TAKE_OFF, Goal.HOLD, Goal.LAND):
             return self._stepped_ns + STEP_NS
         if self.goal is Goal.FOLLOW and self._setpoint is not None:
@@ -358,7 +360,7 @@ class SetpointController:
             self._leave(vehicle)
         elif takeoff.given_up:
             self._notify(f"the vehicle did not take off: {takeoff.given_up}", reason="no_takeoff")
-            disarm = vehicle.armed and takeoff.armed_here
+            disarm = vehicle.armed and takeoff.arm_asked_ns is not None
             self._end()
             self.goal = Goal.LAND if disarm else Goal.NOTHING
         return messages
@@ -425,7 +427,10 @@ class SetpointController:
 
     def _step_land(self, vehicle: VehicleState, now_ns: int) -> None:
         inside = vehicle.mode in self._autopilot.LANDING
-        if not vehicle.armed:
+        arms_until_ns = self._arms_until_ns
+        if vehicle.armed and arms_until_ns is not None:
+            self._arms_until_ns = 0  # it has shown: once disarmed it stays so
+        if not vehicle.armed and (arms_until_ns is None or vehicle.heartbeat_ns >= arms_until_ns):
             self._flight_is_over()
         elif vehicle.airborne is False:
             self._commands.request(DISARM, now_ns)

@@ -40,6 +40,7 @@ class VehicleState:
     altitude_m: float | None  #: above where it stood, or the nearest to that which it reports
     amsl_m: float | None  #: altitude above mean sea level
     remote: bool = False  #: a remote control is there and received, as far as the vehicle reports it
+    heartbeat_ns: int = 0  #: when its newest heartbeat came, which says whether it is armed
 
     @property
     def airborne(self) -> bool | None:
@@ -218,6 +219,7 @@ class Telemetry:
             altitude_m=self.altitude_m(position, now_ns),
             amsl_m=self.amsl_m(now_ns),
             remote=self.remote(now_ns),
+            heartbeat_ns=self._newest["HEARTBEAT"][1] if "HEARTBEAT" in self._newest else 0,
         )
 
 

@@ -19,7 +19,7 @@ from skyloop.drivers.msp.setpoints import Phase, Report, SetpointController
 from skyloop.drivers.msp.telemetry import Reported, feedback_of
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
 from skyloop.errors import DecodeError
-from skyloop.messages import AnyAction, LinkState, Severity, Value
+from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
 from skyloop.messages.checkup import Diagnostic
 from skyloop.wire.msp import messages as msp
 from skyloop.wire.msp.frames import Direction, Frame, Parser, encode
@@ -91,7 +91,7 @@ class MspSession(VehicleSession):
         """
         self.setpoints.on_motion(self.motion.at(now_ns))
         applied = self.setpoints.apply(action, now_ns)
-        self.due_ns = min(self.due_ns, self._sticks_due_ns)
+        self.due_ns = min(self.due_ns, now_ns if isinstance(action, EmergencyStop) else self._sticks_due_ns)
         return applied
 
     def why_not(self, now_ns: int) -> str:
@@ -284,7 +284,8 @@ class MspSession(VehicleSession):
         return made
 
     def _due_sticks(self, now_ns: int) -> bytes:
-        if not self._may_steer or self.setup is None or now_ns < self._sticks_due_ns:
+        urgent = self._step_stop(now_ns)
+        if self.setup is None or not (urgent or (self._may_steer and now_ns >= self._sticks_due_ns)):
             return b""
         while self._sticks and now_ns - self._sticks[0] >= STICKS_LOST_NS:
             self._sticks.popleft()
@@ -293,10 +294,20 @@ class MspSession(VehicleSession):
         self._count(now_ns)
         self.setpoints.on_motion(self.motion.at(now_ns))
         made = self._stick_frame(now_ns)
-        if len(self._sticks) >= MOST_STICKS:
+        if len(self._sticks) >= MOST_STICKS and not urgent:
             return b""  # it is behind: what is sent now would be obeyed late
         self._sticks.append(now_ns)
         return made
+
+    def _step_stop(self, now_ns: int) -> bool:
+        """Go on with an emergency stop; return whether its sticks are due."""
+        setpoints = self.setpoints
+        active, urgent = setpoints.stop.active, setpoints.step_stop(now_ns)
+        if active and not setpoints.stop.active and not setpoints.receiving:
+            # What flies when it is found again is adopted, and not disarmed by a stop from before.
+            self._may_steer, self._armed_throttle = False, None
+            setpoints.report = Report()
+        return urgent
 
     def _stick_frame(self, now_ns: int) -> bytes:
         return encode(Frame(Function.SET_RAW_RC, msp.pack_channels(self.setpoints.channels(now_ns))))

@@ -13,6 +13,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.msp.firmware import Setup
 from skyloop.drivers.msp.motion import Motion
 from skyloop.drivers.vehicle_session import VehicleEvent, message
@@ -57,7 +58,6 @@ BLIND_NS: Final = nanoseconds(6.0)
 MOST_LEARNT: Final = 0.9
 LEAST_LEARNT: Final = 0.05
 LIFT_M_S2: Final = 4.0  #: the most that the climb loop asks for
-STOP_NS: Final = nanoseconds(1.0)  #: so long motors may still be reported on after a stop
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ class SetpointController:
         self.hover: float | None = None  #: the throttle that carries it, 0 to 1; None: not learnt yet
         self.report = Report()
         self.phase = Phase.STANDING
-        self.stopped = False  #: motors cut by us, until the reset
+        self.stop = MotorStop(lambda event: self._events.append(event))
         self.throttle = 0.0
         self.receiving = False
         self._override = override
@@ -130,7 +130,6 @@ class SetpointController:
         self._still_ns: int | None = None
         self._blind_ns: int | None = None
         self._sink = 1.0
-        self._stopped_ns = 0
         self._events: list[VehicleEvent] = []
 
     def set_up(self, setup: Setup, hindrance: str) -> None:
@@ -140,7 +139,7 @@ class SetpointController:
 
     def flight_state(self) -> FlightState:
         """Return the flight state for feedback."""
-        if self.stopped:
+        if self.stop.shown:
             return FlightState.EMERGENCY
         if self.report.armed is None:
             return FlightState.UNKNOWN
@@ -172,12 +171,11 @@ class SetpointController:
             DriverError: It stands and can't be armed for this climb, or a reset while the motors still run.
         """
         if isinstance(action, EmergencyStop):
-            self.stopped, self._stopped_ns, self._wanted = True, now_ns, LEVEL
+            self.stop.press(now_ns)
+            self._wanted = LEVEL
             self._enter(Phase.STANDING, now_ns)
         elif isinstance(action, ResetEmergency):
-            if self.stopped and self.report.armed:
-                raise DriverError("the motors still run: the stop has not shown yet")
-            self.stopped = False
+            self.stop.reset()
         elif isinstance(action, Attitude):
             return self._follow(action, now_ns)
         else:
@@ -185,7 +183,7 @@ class SetpointController:
         return action
 
     def _follow(self, action: Attitude, now_ns: int) -> Attitude:
-        if self.stopped:
+        if self.stop.active:
             return LEVEL
         limits = self.limits
         tilt = min(limits.tilt, self.full_tilt)
@@ -205,7 +203,7 @@ class SetpointController:
         """Return why it can't take off now; empty if nothing is known to prevent it, or it is at it already."""
         if self.phase is not Phase.STANDING:
             return ""
-        if self.stopped:
+        if self.stop.active:
             return "the motors were stopped: reset the emergency first"
         if not self.receiving or self.report.armed is None:
             return "no data from the flight controller"
@@ -262,7 +260,7 @@ class SetpointController:
             self._events.append(message("the pilot took the sticks", "override", Severity.WARNING, active=False))
         elif self._override and report.overridden and not before.overridden:
             self._events.append(message("the pilot gave the sticks away", "override", active=True))
-            if report.armed and self.throttle > IDLE:
+            if report.armed and self.throttle > IDLE and not self.stop.active:
                 self._wanted = LEVEL
                 self._enter(Phase.FLYING, now_ns)
 
@@ -273,7 +271,7 @@ class SetpointController:
             throttle: That it was sent last, 0 to 1.
             now_ns: The present time.
         """
-        if throttle > IDLE:
+        if throttle > IDLE and not self.stop.active:
             self.hover = self.throttle = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
             self._enter(Phase.FLYING, now_ns)
 
@@ -328,6 +326,18 @@ class SetpointController:
         """Return the events since the last call."""
         events, self._events = self._events, []
         return events
+
+    def step_stop(self, now_ns: int) -> bool:
+        """Go on with an emergency stop; return whether its sticks are due, whatever the pace of others."""
+        return self.stop.step(self._motors_are_off(), now_ns)
+
+    def _motors_are_off(self) -> bool | None:
+        report = self.report
+        if not self.receiving or report.armed is None:
+            return None
+        if not (self._override and report.armed):
+            return not report.armed
+        return True if report.overridden else None  # only the pilot disarms: without throttle, or not by our sticks
 
     def channels(self, now_ns: int) -> list[int]:
         """Return the receiver's channels [µs] now, in the order of the flight controller. Called at a steady rate."""

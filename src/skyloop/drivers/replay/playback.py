@@ -78,6 +78,7 @@ class Playback:
                 0.0,
                 self.duration_s,
                 description="position in the recording; written, the replay goes there",
+                momentary=True,
             ),
             Parameter(
                 SPEED,

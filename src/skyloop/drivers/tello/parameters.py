@@ -143,6 +143,7 @@ def flip_parameter(value: str) -> Parameter:
         default=NO_FLIP,
         choices=(NO_FLIP, *FLIPS),
         description="flips in this direction (sent once); in flight only",
+        momentary=True,
     )
 
 
@@ -250,7 +251,7 @@ class DroneSettings:
         if value != NO_FLIP:
             with self._link.lock:
                 session = self._link.session
-                if not session.setpoints.watch.in_air:
+                if session.setpoints.stop.active or not session.setpoints.watch.in_air:
                     raise ParameterError("a flip is for a drone in the air: take off first", code=Refusal.WRONG_STATE)
                 session.flip(FLIPS[str(value)])
         self._flip = str(value)

@@ -13,7 +13,7 @@ from skyloop.drivers.tello.setpoints import SetpointController
 from skyloop.drivers.tello.telemetry import Health, feedback_of, native_of
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
 from skyloop.errors import DecodeError
-from skyloop.messages import AnyAction, LinkState, Severity, Value
+from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
 from skyloop.messages.checkup import Diagnostic
 from skyloop.wire.tello.commands import ENTER, Sdk, decoded, ports
 from skyloop.wire.tello.replies import Shape, answers, is_error, shape_of
@@ -206,7 +206,10 @@ class TelloSession(VehicleSession):
         """
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
-        if self.setpoints.intent != before:
+        if isinstance(action, EmergencyStop):
+            self._flips.clear()
+            self.due_ns = now_ns
+        elif self.setpoints.intent != before:
             self.due_ns = min(self.due_ns, max(now_ns, self._rc_ns + HURRY_NS))
         return applied
 
@@ -320,6 +323,8 @@ class TelloSession(VehicleSession):
 
     def _keep_alive(self, now_ns: int) -> None:
         """Ask something now and then: it keeps the drone awake, and shows whether our commands are received."""
+        if self.ready and self.setpoints.left_alone:
+            return
         if self.ready and now_ns - self._alive_ns >= ALIVE_NS:
             self._alive_ns = now_ns
             self.conversation.ask(Request(ALIVE, self._alive))
@@ -340,7 +345,8 @@ class TelloSession(VehicleSession):
 
     def _keep_video(self, now_ns: int) -> None:
         last_ns = max(self._video_ns(), self._asked_video_ns)
-        if self.options.video and self.ready and now_ns - last_ns >= VIDEO_NS and self.conversation.idle:
+        missing = self.options.video and self.ready and now_ns - last_ns >= VIDEO_NS
+        if missing and self.conversation.idle and not self.setpoints.left_alone:
             self._asked_video_ns = now_ns
             self.conversation.ask(Request("streamon", _whatever))
 

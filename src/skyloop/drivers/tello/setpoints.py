@@ -10,6 +10,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
+from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.tello.telemetry import FlightWatch
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DriverError
@@ -86,9 +87,6 @@ def _within(value: float, limit: float) -> float:
 
 AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that does not show is sent again
 TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone that has not started by then refuses to
-STOP_AGAIN_NS: Final = nanoseconds(0.1)
-STOPS: Final = 5  #: an emergency stop is sent so often at least, for it may not be answered
-STOP_NS: Final = nanoseconds(5.0)  #: and for so long at most
 
 TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
 
@@ -112,14 +110,14 @@ class SetpointController:
         self.full = Scale()
         self.limits = Scale()
         self.receiving = False  #: whether the drone's state comes
+        #: After a stop that was given up, until something is commanded: left alone, a Tello lands by itself after 15 s.
+        self.left_alone = False
+        self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY
         self._stick = LEVEL
         self._decided_ns = 0
         self._sent_ns: int | None = None  # the take-off or landing
-        self._stopped = False  # motors cut by us, until the reset
-        self._stops = 0
-        self._stop_ns = 0
-        self._stop_done = True
+        self._state_ns = 0  # when its state came last
         self._was_in_air = False  # when its state came last
         self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
         self._events: list[VehicleEvent] = []
@@ -127,11 +125,11 @@ class SetpointController:
     @property
     def intent(self) -> tuple[object, ...]:
         """Changes when something else is to be sent."""
-        return self._decision, self._stick, self._stop_done
+        return self._decision, self._stick, self.stop.active
 
     def flight_state(self) -> FlightState:
         """Return the flight state for feedback."""
-        if self._stopped:
+        if self.stop.shown:
             return FlightState.EMERGENCY
         if self.watch.in_air and self._stick != LEVEL:
             return FlightState.FLYING
@@ -156,10 +154,12 @@ class SetpointController:
         if isinstance(action, Idle):
             return action
         if isinstance(action, EmergencyStop):
-            self._stop(now_ns)
+            self._stop_motors(now_ns)
         elif isinstance(action, ResetEmergency):
-            self._reset(now_ns)
-        elif self._stopped:
+            if self.stop.active and not self.receiving:
+                raise DriverError("no data from the drone: whether it is on the ground is not known")
+            self.stop.reset()
+        elif self.stop.active:
             if isinstance(action, Takeoff):
                 raise DriverError("the motors were stopped: reset the emergency first")
             if isinstance(action, Velocity | Attitude):
@@ -169,7 +169,7 @@ class SetpointController:
         return action
 
     def _fly(self, action: AnyAction, now_ns: int) -> AnyAction:
-        self._steering = True
+        self._steering, self.left_alone = True, False
         if isinstance(action, Takeoff):
             self._take_off(now_ns)
         elif isinstance(action, Land):
@@ -204,42 +204,34 @@ class SetpointController:
         else:
             self._decide(Decision.TAKE_OFF, now_ns)
 
-    def _stop(self, now_ns: int) -> None:
+    def _stop_motors(self, now_ns: int) -> None:
         self._decide(Decision.STAY, now_ns)
-        self._stick = LEVEL
-        if not self._stopped:
+        self.left_alone = False
+        if not self.stop.active:
             text = "the drone was commanded to cut its motors; reset the emergency when it is safe on the ground"
             self._events.append(VehicleEvent(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": "user"}))
-        self._stopped, self._stop_done = True, False
-        self._stops, self._stop_ns = 0, now_ns
+        self.stop.press(now_ns)
 
-    def _reset(self, now_ns: int) -> None:
-        if not self._stopped:
-            return
-        if not self.receiving:
-            raise DriverError("no data from the drone: whether it is on the ground is not known")
-        if not self._stop_done and self.watch.motors(now_ns):
-            raise DriverError("the motors still run: the stop has not shown yet")
-        self._stopped, self._stop_done = False, True
+    def _leave_alone(self, given_up: VehicleEvent) -> None:
+        self._events.append(given_up)
+        self._steering, self.left_alone = False, True
 
     # What is received ---------------------------------------------------------------------------------------------
 
     def on_state(self, now_ns: int) -> None:
         """Handle that the watch has seen a new state."""
         phase = self.watch.phase
-        self.receiving = True
+        self.receiving, self._state_ns = True, now_ns
         self._was_in_air = phase.airborne
         shown = {Decision.TAKE_OFF: FlightState.HOVERING, Decision.LAND: FlightState.LANDED}.get(self._decision)
         if phase is shown:
             self._decide(Decision.STAY, now_ns)
         elif phase is FlightState.LANDED:
-            self._stick = LEVEL
+            self._stick, self.left_alone = LEVEL, False
             self._steering = self._decision is not Decision.STAY
-        if self._stops >= STOPS and self.watch.motors(now_ns) is False:
-            self._stop_done = True
 
     def on_answer(self, motion: str, reply: str, now_ns: int) -> None:
-        """Handle the answer to a take-off, landing or emergency stop.
+        """Handle the answer to a take-off or landing. That to an emergency stop shows nothing: the motors do.
 
         Args:
             motion: The command that is answered.
@@ -249,8 +241,6 @@ class SetpointController:
         refused = is_error(reply)
         if motion == LAND:
             self.watch.landing_answered = self._decision is Decision.LAND and not refused
-        elif motion == EMERGENCY:
-            self._stop_done = self._stop_done or not refused
         elif motion == TAKEOFF and refused and self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
             self._decide(Decision.STAY, now_ns)
             text = f"the drone refused to take off: {reply!r}"
@@ -274,8 +264,8 @@ class SetpointController:
 
     def motions(self, now_ns: int) -> list[str]:
         """Return the commands due now that are answered seconds later."""
-        if self._stopped:
-            return self._emergency(now_ns)
+        if self.stop.active:
+            return [EMERGENCY] if self.stop.step(self._motors_are_off(now_ns), now_ns) else []
         if self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
             if now_ns - self._decided_ns >= TAKEOFF_NS:
                 self._decide(Decision.STAY, now_ns)
@@ -293,7 +283,7 @@ class SetpointController:
 
         A drone that stands, rises or sinks is left alone, and so is one that another program flies.
         """
-        if self._stopped or self._decision is not Decision.STAY or not self._steering:
+        if self.stop.active or self._decision is not Decision.STAY or not self._steering:
             return None
         if self.receiving:
             return self._stick if self.watch.in_air else None
@@ -305,9 +295,8 @@ class SetpointController:
         self._sent_ns = now_ns
         return [text]
 
-    def _emergency(self, now_ns: int) -> list[str]:
-        late = now_ns - self._stop_ns
-        if (self._stop_done and self._stops >= STOPS) or late >= STOP_NS or late < self._stops * STOP_AGAIN_NS:
-            return []
-        self._stops += 1
-        return [EMERGENCY]
+    def _motors_are_off(self, now_ns: int) -> bool | None:
+        if not (self.receiving and self.stop.settled(self._state_ns)):
+            return None
+        running = self.watch.motors(now_ns)
+        return None if running is None else not running

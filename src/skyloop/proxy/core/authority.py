@@ -123,7 +123,8 @@ class Authority:
         self.ask_ns = nanoseconds(ask_s)  #: how long a holder that is asked may wait before the higher priority wins
         self.holder: QueueEntry | None = None
         self.lease = 0  #: the lease in force; 0 for none
-        self.last_command_ns = 0  #: when the holder sent its last valid command, or got the lease
+        self.last_command_ns = 0  #: when a holder sent its last valid command, this one or one before it
+        self._granted_ns = 0  # when the holder got the lease
         self.until_ns: int | None = None  #: when the holder's time is over
         self.silent: QueueEntry | None = (
             None  #: who lost the lease by silence and keeps the name on it until somebody asks
@@ -248,7 +249,7 @@ class Authority:
         holder = self.holder
         if holder is None:
             return []
-        if now_ns - self.last_command_ns >= self.timeout_ns:
+        if now_ns - max(self.last_command_ns, self._granted_ns) >= self.timeout_ns:
             effects = self._drop(holder.app_id, "silent", now_ns)
             if self.holder is None:
                 self.silent = holder
@@ -258,6 +259,13 @@ class Authority:
             self._expiry_reported = True
             effects.append(Expired(holder.app_id, self.lease))
         return effects
+
+    def slept(self, ns: int) -> None:
+        """Let everything be older by so much: the computer slept, and its clock stood still."""
+        self.last_command_ns -= ns
+        self._granted_ns -= ns
+        if self.until_ns is not None:
+            self.until_ns -= ns
 
     # Inside ----------------------------------------------------------------------------------------------------
 
@@ -354,7 +362,7 @@ class Authority:
     def _grant(self, now_ns: int) -> Granted:
         first = self._waiting.pop(0)
         self._last_lease += 1
-        self.holder, self.lease, self.last_command_ns = replace(first, asks_until_ns=None), self._last_lease, now_ns
+        self.holder, self.lease, self._granted_ns = replace(first, asks_until_ns=None), self._last_lease, now_ns
         self.until_ns = None if first.term_ns is None else now_ns + first.term_ns
         self._expiry_reported = False
         self.silent = None

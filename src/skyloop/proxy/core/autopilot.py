@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final
 
-from skyloop.clock import NS_PER_S, seconds
+from skyloop.clock import seconds
 from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
 from skyloop.messages.geometry import wrap_angle
+from skyloop.proxy.core.flight import STALE_NS, Flight
 
 PERIOD_S: Final = 0.02  #: the pace that it is made for
-STALE_NS: Final = NS_PER_S // 2  #: older feedback is not steered by: level out instead
 ALTITUDE_GAIN: Final = 1.0  #: climb per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
 POSITION_SPEED: Final = 0.5  #: at most [m/s]
@@ -32,13 +32,8 @@ TURN_GAIN: Final = 1.5  #: yaw rate per radian that is left [1/s]
 TURN_RATE: Final = 1.2  #: at most, where none is given [rad/s]
 SETTLED_SPEED: Final = 0.2  #: below it the place to hold is fixed [m/s]
 ARRIVED: Final = 0.1  #: a take-off ends so far below its altitude [m]
-TOUCH_ALTITUDE: Final = 0.1  #: below it the vehicle stands on the ground [m]
-AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle first seen above it is taken to be flying [m]
-STALL_ALTITUDE: Final = 0.5  #: below it a descent that makes no headway has met the ground [m]
-STALL_NS: Final = NS_PER_S
-STALL_HEADWAY: Final = 0.02  #: [m]
-REFUSED_NS: Final = 15 * NS_PER_S  #: a vehicle that reports to stand so long after the take-off began does not rise
-BLIND_LANDING_NS: Final = 15 * NS_PER_S  #: how long a landing takes where the altitude is not known
+LONGEST_RISE: Final = 2.0  #: a take-off ends after so many times what it takes by its climb rate, ...
+LONGEST_RISE_S: Final = 2.0  #: ... and this [s]
 
 SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position", "return_to_start"})
 
@@ -80,45 +75,34 @@ _STATES: Final = {
     Mode.VELOCITY: FlightState.FLYING,
     Mode.POSITION: FlightState.FLYING,
 }
-_STANDING: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 
 
 class Autopilot:
-    """Flies one vehicle in software. ``native`` names the actions that the vehicle itself takes."""
+    """Flies one vehicle in software.
 
-    def __init__(self, native: frozenset[str], settings: AutopilotSettings | None = None) -> None:
+    Args:
+        native: The actions that the vehicle itself takes.
+        settings: Its tuning.
+        flight: What is known of the vehicle's flight; told what is done, and asked when that has ended.
+    """
+
+    def __init__(
+        self, native: frozenset[str], settings: AutopilotSettings | None = None, flight: Flight | None = None
+    ) -> None:
+        self.flight = flight or Flight(native)
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
-        #: On the way to a place: the velocity that is allowed instead of the wanted one, by the newest feedback.
+        #: The velocity that is allowed instead of the wanted one, by the newest feedback; not asked while it lands.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
-        self._state = FlightState.LANDED
         self._takes_velocity = "velocity" in native
-        self._owns_state = not native & {"takeoff", "land"}  # such a vehicle has no notion of it
         self._target: Velocity | Position = Velocity()
         self._integral = (0.0, 0.0)  # forward, left [rad]
         self._stepped_ns: int | None = None
-        self._begun_ns = 0
-        self._was_up = False  # the vehicle reported to be in the air since this began
+        self._lifted_ns: int | None = None  # when the take-off left the ground
+        self._from_height: float | None = None  # its position's height then [m]
         self._hold_altitude: float | None = None
         self._hold_position: tuple[float, float] | None = None
         self._hold_yaw: float | None = None
-        self._lowest = math.inf
-        self._lowest_ns = 0
-
-    def state(self, reported: FlightState) -> FlightState:
-        """The flight state, given what the driver ``reported``: the vehicle's own state where it has one."""
-        if reported is FlightState.EMERGENCY or (self.mode is Mode.LAND and reported is FlightState.LANDED):
-            return reported
-        if self._owns_state or self.mode in (Mode.TAKEOFF, Mode.LAND):
-            return self._state
-        if reported is FlightState.FLYING and self.mode is Mode.HOVER:
-            return FlightState.HOVERING
-        return reported
-
-    def on_first_feedback(self, feedback: Feedback) -> None:
-        """The vehicle's first feedback: a proxy may have been restarted under a flying one."""
-        if self.mode is Mode.OFF and (feedback.altitude_m or 0.0) > AIRBORNE_ALTITUDE:
-            self._state = FlightState.FLYING
 
     def start(
         self, action: Takeoff | Hover | Land | Velocity | Position, now_ns: int, feedback: Feedback | None
@@ -133,26 +117,20 @@ class Autopilot:
             return
         if self.mode is Mode.OFF:
             self._integral, self._stepped_ns = (0.0, 0.0), None
-            self._was_up = False
-        self.mode, self._state, self._begun_ns = mode, _STATES[mode], now_ns
-        self._hold_position = self._hold_yaw = None
+        self.mode = mode
+        self.flight.steer(_STATES[mode], now_ns)
+        self._hold_position = self._hold_yaw = self._lifted_ns = None
         self._hold_altitude = feedback.altitude_m if feedback is not None else None
-        self._lowest, self._lowest_ns = math.inf, now_ns
 
     def stop(self, action_name: str) -> None:
         """The vehicle itself does something now: steer no longer."""
         self.mode = Mode.OFF
-        if action_name == "emergency_stop":
-            self._state = FlightState.EMERGENCY
-        elif action_name == "reset_emergency":
-            self._state = FlightState.LANDED
-        elif self._state not in _STANDING:
-            self._state = FlightState.HOVERING if action_name == "hover" else FlightState.FLYING
+        self.flight.let_go(action_name)
 
     def refused(self, reported: FlightState) -> None:
         """The vehicle refused what it was sent: a take-off of one that ``reported`` to stand is over."""
-        if self.mode is Mode.TAKEOFF and reported is FlightState.LANDED:
-            self.mode, self._state = Mode.OFF, FlightState.LANDED
+        if self.flight.refused(reported):
+            self.mode = Mode.OFF
 
     def step(
         self, now_ns: int, feedback: Feedback | None, reported: FlightState = FlightState.UNKNOWN
@@ -164,10 +142,14 @@ class Autopilot:
         if self.mode is Mode.OFF:
             return None
         known = feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
-        if known is not None and self._stands(reported, now_ns):
-            self.mode, self._state = Mode.OFF, FlightState.LANDED
-            return None
-        wanted = self._wanted(now_ns, known)
+        mode = self.mode
+        if self.flight.has_ended(reported, now_ns, known):
+            self.mode = Mode.OFF
+            if mode is not Mode.LAND:
+                return None  # else the descent stays in force, which keeps the vehicle on the ground
+        wanted = self._wanted(mode, now_ns, known, reported)
+        if known is not None and self.mode not in (Mode.LAND, Mode.OFF):
+            wanted = self.guard(wanted, known, now_ns)
         dt = PERIOD_S if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
         self._stepped_ns = now_ns
         if self._takes_velocity:
@@ -175,56 +157,49 @@ class Autopilot:
         roll, pitch = self._tilt(wanted, known, dt)
         return Attitude(roll, pitch, wanted.up, wanted.yaw_rate)
 
-    def _stands(self, reported: FlightState, now_ns: int) -> bool:
-        """Whether a vehicle that is flown from here stopped to fly by itself, or never began: it disarmed."""
-        self._was_up = self._was_up or reported.airborne
-        if reported is not FlightState.LANDED or not self._owns_state or self.mode is Mode.LAND:
-            return False
-        return self._was_up or (self.mode is Mode.TAKEOFF and now_ns - self._begun_ns >= REFUSED_NS)
-
-    def _wanted(self, now_ns: int, known: Feedback | None) -> Velocity:
-        altitude = known.altitude_m if known is not None else None
-        if self.mode is Mode.TAKEOFF:
-            return self._rise(now_ns, altitude)
-        if self.mode is Mode.LAND:
-            return self._descend(now_ns, altitude)
-        if self.mode is Mode.HOVER:
-            return self._hold(known, altitude)
+    def _wanted(self, mode: Mode, now_ns: int, known: Feedback | None, reported: FlightState) -> Velocity:
+        if mode is Mode.TAKEOFF:
+            return self._rise(now_ns, known, self.flight.lifted(reported))
+        if mode is Mode.LAND:
+            return Velocity(up=-self.settings.descent)
+        if mode is Mode.HOVER:
+            return self._hold(known)
         if isinstance(self._target, Position):
-            return self._go(self._target, known, now_ns)
+            return self._go(self._target, known)
         return self._target
 
-    def _rise(self, now_ns: int, altitude: float | None) -> Velocity:
+    def _rise(self, now_ns: int, known: Feedback | None, lifted: bool) -> Velocity:
+        """Climb until the altimeter, or else the position or the time, say that it is high enough."""
         settings = self.settings
-        if altitude is None:
-            arrived = seconds(now_ns - self._begun_ns) >= settings.takeoff_altitude / settings.climb
+        altitude = known.altitude_m if known is not None else None
+        height = known.position_m[2] if known is not None and known.position_m is not None else None
+        if self._lifted_ns is None and lifted:
+            self._lifted_ns, self._from_height = now_ns, height
+        if self._lifted_ns is None:
+            return Velocity(up=settings.climb)
+        rising_s, needed_s = seconds(now_ns - self._lifted_ns), settings.takeoff_altitude / settings.climb
+        there = altitude is not None and altitude >= settings.takeoff_altitude - ARRIVED
+        if height is not None and self._from_height is not None:
+            arrived = there or height - self._from_height >= settings.takeoff_altitude
         else:
-            arrived = altitude >= settings.takeoff_altitude - ARRIVED
-        if arrived:
-            self.mode, self._state = Mode.HOVER, FlightState.HOVERING
-            self._hold_altitude = settings.takeoff_altitude if altitude is not None else None
+            arrived = there or (altitude is None and rising_s >= needed_s)
+        if not arrived and rising_s < LONGEST_RISE * needed_s + LONGEST_RISE_S:
+            return Velocity(up=settings.climb)
+        self.mode = Mode.HOVER
+        self.flight.steer(FlightState.HOVERING, now_ns)
+        self._hold_altitude = settings.takeoff_altitude if there else altitude
+        return Velocity()
+
+    def _hold(self, known: Feedback | None) -> Velocity:
+        if known is None:  # it may be anywhere by when it is heard again: there it stays
+            self._hold_altitude = self._hold_position = None
             return Velocity()
-        return Velocity(up=settings.climb)
-
-    def _descend(self, now_ns: int, altitude: float | None) -> Velocity:
-        if altitude is None:
-            touched = now_ns - self._begun_ns >= BLIND_LANDING_NS
-        else:
-            if altitude < self._lowest - STALL_HEADWAY:
-                self._lowest, self._lowest_ns = altitude, now_ns
-            stalled = altitude < STALL_ALTITUDE and now_ns - self._lowest_ns >= STALL_NS
-            touched = altitude < TOUCH_ALTITUDE or stalled
-        if touched:  # the descent stays in force, which keeps the vehicle on the ground
-            self.mode, self._state = Mode.OFF, FlightState.LANDED
-        return Velocity(up=-self.settings.descent)
-
-    def _hold(self, known: Feedback | None, altitude: float | None) -> Velocity:
-        up = 0.0
+        altitude, up = known.altitude_m, 0.0
         if altitude is not None:
             if self._hold_altitude is None:
                 self._hold_altitude = altitude
             up = _bound((self._hold_altitude - altitude) * ALTITUDE_GAIN, self.settings.climb)
-        if known is None or known.position_m is None or known.yaw_rad is None:
+        if known.position_m is None or known.yaw_rad is None:
             return Velocity(up=up)
         x, y, _ = known.position_m
         if self._hold_position is None:
@@ -236,7 +211,7 @@ class Autopilot:
         forward, left = _shorten(cos * east + sin * north, cos * north - sin * east, POSITION_SPEED)
         return Velocity(forward, left, up)
 
-    def _go(self, target: Position, known: Feedback | None, now_ns: int) -> Velocity:
+    def _go(self, target: Position, known: Feedback | None) -> Velocity:
         """Straight towards a place, and slower near it; a speed of zero while position or yaw are not known."""
         if known is None or known.position_m is None or known.yaw_rad is None:
             return Velocity()
@@ -249,13 +224,12 @@ class Autopilot:
         share = speed / away if away > 1e-9 else 0.0
         cos, sin = math.cos(known.yaw_rad), math.sin(known.yaw_rad)
         turn = wrap_angle((self._hold_yaw if target.yaw is None else target.yaw) - known.yaw_rad)
-        wanted = Velocity(
+        return Velocity(
             forward=share * (cos * east + sin * north),
             left=share * (cos * north - sin * east),
             up=share * up,
             yaw_rate=_bound(TURN_GAIN * turn, TURN_RATE if target.turn_rate is None else target.turn_rate),
         )
-        return self.guard(wanted, known, now_ns)
 
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
         """Roll and pitch [rad] that bring the velocity to the wanted one; level while the velocity is not known."""

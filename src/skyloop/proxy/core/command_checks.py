@@ -32,15 +32,13 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.command import SET_POINTS
+from skyloop.proxy.core.airspace import Airspace, Verdict
 from skyloop.proxy.core.authority import Authority
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
+from skyloop.proxy.core.flight import Flight, Whose
 from skyloop.proxy.core.intents import MAX_AHEAD_NS, Intent, Intents
-from skyloop.proxy.core.limits import Ceiling, Clamp, Limits
-from skyloop.proxy.core.ownership import Ownership, Whose
-from skyloop.proxy.core.places import decide_place
+from skyloop.proxy.core.limits import Clamp
 from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, ReturnSettings, StartPoint
-from skyloop.proxy.core.safety import Safety
-from skyloop.zones import Space
 
 _HOVER_ACTION: Final = Hover()
 _ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
@@ -96,7 +94,7 @@ class CommandChecks:
     Args:
         authority: who holds the lease; :meth:`receive` notes when its holder's last command came.
         ladder: the failsafe ladder.
-        ownership: whose the flight is.
+        flight: whose flight it is.
         supported: the actions that the vehicle or the software autopilot can do.
         why_not: why others are not supported, for people; may be empty.
     """
@@ -105,24 +103,21 @@ class CommandChecks:
         self,
         authority: Authority,
         ladder: FailsafeLadder,
-        ownership: Ownership,
+        flight: Flight,
         *,
         supported: frozenset[type[Action]],
         why_not: str,
     ) -> None:
-        self.limits = Limits()
-        self.safety: Safety | None = None  #: the safety box and zones; None: there are none
-        self.space = Space()  #: the same and the room, for what is flown by position
+        self.airspace = Airspace()
         self.returns = ReturnSettings()
         self.start = StartPoint()
         self.back: ReturnFlight | None = None  #: the flight back to the start; None: it was not asked for
         self.max_age_ns = 0
         self._authority = authority
         self._ladder = ladder
-        self._ownership = ownership
+        self._flight = flight
         self._supported = supported
         self._why_not = why_not
-        self._ceiling = Ceiling()
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
         """Check sequence, age, lease and numbers. None: they passed, which keeps the holder's lease."""
@@ -177,36 +172,35 @@ class CommandChecks:
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state), new)
-        clamps: tuple[Clamp, ...] = ()
-        enforced = None
-        if type(action) is Position and policy is not StatePolicy.HOVER:
-            place = decide_place(action, self.limits, self.space, feedback, now_ns, new=not intent.begun)
-            if policy is StatePolicy.HOLD:  # judged all the same: who waits for a take-off learns it now
-                return Decision(None, place.refusal, place.why, new)
-            if place.action is None:  # what was flown before is not wanted any more either
-                instead = _HOVER_ACTION if Hover in self._supported else None
-                return Decision(instead, place.refusal, place.why, new)  # without a refusal: until it is known again
-            action, clamps = place.action, place.clamps
-            enforced = None if self.safety is None else True
-        elif policy is StatePolicy.HOLD:
+        if policy is StatePolicy.HOLD:
+            if type(action) is Position and (why := self.airspace.objection(action, feedback, now_ns)):
+                return Decision(None, Refusal.OUT_OF_RANGE, why, new)  # which would be too late after the take-off
             return Decision(new=new)
-        elif policy is StatePolicy.HOVER or kind is Hover:
-            action, clamps = self._hover_below_ceiling(state, feedback)
-        elif type(action) is ReturnToStart:
+        if type(action) is ReturnToStart and policy is not StatePolicy.HOVER:
             if self.back is None:
                 self.begin_return(action)
             back = self.step_return(feedback, now_ns)
             if back.action is None:
                 return Decision(_HOVER_ACTION, back.refusal, back.why, new)
-            action, clamps = back.action, back.clamps
-            enforced = None if self.safety is None else True
-        elif is_set_point:
-            action, clamps = self.limits.clamp(action, feedback.altitude_m if feedback else None)  # type: ignore[arg-type]
-            if self.safety is not None:
-                action, walls, enforced = self.safety.clamp(action, feedback, now_ns)
-                clamps += walls
+            return Decision(back.action, new=new, clamps=back.clamps, enforced=back.enforced)
+        action = _HOVER_ACTION if policy is StatePolicy.HOVER else action
+        if self._is_judged(action, state):
+            verdict = self.airspace.judge(action, feedback, now_ns, new=not intent.begun)
+            if verdict.action is None:  # what was flown before is not wanted any more either
+                instead = _HOVER_ACTION if is_set_point and Hover in self._supported else None
+                return Decision(
+                    instead, verdict.refusal, verdict.why, new
+                )  # without a refusal: until it is known again
+        else:
+            verdict = Verdict(action)
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
-        return Decision(action, None, "", new, takes_off, clamps, enforced)
+        return Decision(verdict.action, None, "", new, takes_off, verdict.clamps, verdict.enforced)
+
+    def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
+        """Whether it matters where the vehicle is: a hover only in its place, a take-off only on the ground."""
+        if type(action) is Hover:
+            return Velocity in self._supported and state in (FlightState.HOVERING, FlightState.FLYING)
+        return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)
 
     def begin_return(self, action: ReturnToStart) -> None:
         """Begin a flight back to the start, in place of another one."""
@@ -215,21 +209,13 @@ class CommandChecks:
     def step_return(self, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
         """Decide what the vehicle does now on its flight back to the start."""
         assert self.back is not None
-        return self.back.step(self.limits, self.space, feedback, now_ns)
+        return self.back.step(self.airspace, feedback, now_ns)
 
     def why_no_return(self, feedback: Feedback | None, now_ns: int) -> str:
         """Return why the vehicle could not begin to return to its start now and land there; empty if it could."""
         flight = ReturnFlight(ReturnToStart(land=True), self.start.position, self.returns)
-        decision = flight.step(self.limits, self.space, feedback, now_ns)
+        decision = flight.step(self.airspace.apart(), feedback, now_ns)
         return decision.why if decision.action is None and decision.refusal is not None else ""
-
-    def guard(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
-        """Return the nearest velocity that limits, safety box and zones allow, on the way to a place."""
-        allowed, _ = self.limits.clamp(wanted, feedback.altitude_m)
-        if self.safety is not None:
-            allowed, _, _ = self.safety.clamp(allowed, feedback, now_ns)
-        assert isinstance(allowed, Velocity)
-        return allowed
 
     def _problem(
         self,
@@ -248,8 +234,8 @@ class CommandChecks:
         if kind not in self._supported:
             why = self._why_not or "neither the vehicle nor the software autopilot can do it"
             return Refusal.UNSUPPORTED, f"{action.name} is not possible: {why}"
-        if self._ownership.whose is Whose.OTHERS:
-            others = self._ownership.others
+        if self._flight.whose is Whose.OTHERS:
+            others = self._flight.others
             if kind in SET_POINTS:
                 return Refusal.WRONG_STATE, f"{others}: hover, take off or land first to take it over"
             if not new and (automatic or policy is not StatePolicy.HOLD) and kind in _TAKING:
@@ -266,16 +252,6 @@ class CommandChecks:
         if policy is StatePolicy.HOVER and Hover not in self._supported:
             return Refusal.UNSUPPORTED, f"{action.name} is not possible while {state.value}"
         return None
-
-    def _hover_below_ceiling(
-        self, state: FlightState, feedback: Feedback | None
-    ) -> tuple[AnyAction, tuple[Clamp, ...]]:
-        """Hover, or come down first where it is above ``limits.altitude``."""
-        in_place = state is FlightState.HOVERING or state is FlightState.FLYING
-        if Velocity not in self._supported or feedback is None or not in_place:
-            return _HOVER_ACTION, ()
-        sink, clamps = self._ceiling.instead(self.limits, feedback.altitude_m)
-        return (_HOVER_ACTION, ()) if sink is None else (sink, clamps)
 
 
 def explain(reason: Refusal, command: Command, newest_seq: int, *, now_ns: int, max_age_ns: int, lease: int) -> str:

@@ -36,7 +36,7 @@ _LAND_AT_START: Final = ReturnToStart(land=True)
 #: States that show that an action which the driver took did not reach the vehicle.
 _CONTRADICTIONS: Final = {
     Hover: frozenset({FlightState.FLYING}),
-    Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING}),
+    Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN}),
     ReturnToStart: frozenset(),  # it is steered all the way
 }
 
@@ -63,7 +63,7 @@ class FailsafeInputs:
 
     state: FlightState
     airborne: bool
-    last_command_ns: int  #: when the last valid command came, or the authority was granted
+    last_command_ns: int  #: when the last valid command came, whoever held the authority then
     pilot: str  #: ``held``, or why nobody holds the authority: ``released``, ``silent``, ``gone``, ``none``
     link_up: bool  #: hop proxy–vehicle
     battery: float | None
@@ -98,6 +98,35 @@ class FailsafeAction:
 Effect = StepChange | BatteryLow | FailsafeAction
 
 
+def due(
+    now_ns: int, inputs: FailsafeInputs, settings: FailsafeSettings, *, barred: str, battery_low: bool
+) -> tuple[Failsafe, str]:
+    """Return the step that is due for a flight of ours, and why: the whole ladder.
+
+    Args:
+        now_ns: The time now [ns].
+        inputs: What is known of flight, pilot and vehicle.
+        settings: When each step is taken.
+        barred: Why set-points are refused now; may be empty.
+        battery_low: It is below the charge to return at, and the pilot has not taken over for that.
+    """
+    if barred:
+        return Failsafe.LAND, barred
+    if battery_low and inputs.state is not FlightState.LANDING:
+        return Failsafe.LAND, "battery_return"
+    silent_ns = now_ns - inputs.last_command_ns
+    silence = "silent" if inputs.pilot == "held" else inputs.pilot
+    if silent_ns >= nanoseconds(settings.land_after_s):
+        return Failsafe.LAND, silence
+    if inputs.state is FlightState.LANDING:  # better to end a landing than to hang over the place
+        return Failsafe.NONE, ""
+    if silent_ns >= nanoseconds(settings.hover_after_s) or inputs.pilot == "gone":
+        return Failsafe.HOVER, silence
+    if not inputs.link_up:
+        return Failsafe.HOVER, "vehicle_link"
+    return Failsafe.NONE, ""
+
+
 class FailsafeLadder:
     """The failsafe ladder of one vehicle."""
 
@@ -123,7 +152,8 @@ class FailsafeLadder:
         if not inputs.ours:  # what others fly is left alone, whatever is wrong with it
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
-        step, reason = self._due(now_ns, inputs)
+        low = self.battery_low and not self._overruled
+        step, reason = due(now_ns, inputs, self.settings, barred=self.barred, battery_low=low)
         if _RANK[step] > _RANK[self.step]:
             returns = step is Failsafe.LAND and self._should_return(reason) and inputs.state is not FlightState.LANDING
             why = inputs.return_problem if returns else ""
@@ -190,23 +220,6 @@ class FailsafeLadder:
             self._warned = True
             return [BatteryLow(level)]
         return []
-
-    def _due(self, now_ns: int, inputs: FailsafeInputs) -> tuple[Failsafe, str]:
-        if self.barred:
-            return Failsafe.LAND, self.barred
-        if self.battery_low and not self._overruled and inputs.state is not FlightState.LANDING:
-            return Failsafe.LAND, "battery_return"
-        silent_ns = now_ns - inputs.last_command_ns
-        silence = "silent" if inputs.pilot == "held" else inputs.pilot
-        if silent_ns >= nanoseconds(self.settings.land_after_s):
-            return Failsafe.LAND, silence
-        if inputs.state is FlightState.LANDING:  # better to end a landing than to hang over the place
-            return Failsafe.NONE, ""
-        if silent_ns >= nanoseconds(self.settings.hover_after_s) or inputs.pilot == "gone":
-            return Failsafe.HOVER, silence
-        if not inputs.link_up:
-            return Failsafe.HOVER, "vehicle_link"
-        return Failsafe.NONE, ""
 
     def _should_return(self, reason: str) -> bool:
         """Whether a landing for this reason is to be one at the start."""

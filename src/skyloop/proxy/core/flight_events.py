@@ -7,8 +7,9 @@ from typing import Final
 from skyloop.messages import Command, EventKind, Failsafe, Refusal, Severity, Value
 from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
+from skyloop.proxy.core.flight import Changed, Whose
 from skyloop.proxy.core.limits import Clamp
-from skyloop.proxy.core.ownership import Changed, Whose
+from skyloop.zones import THINNEST_M, ZONES, Space
 
 _ENFORCED: Final = "enforced: its position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
@@ -32,6 +33,20 @@ def enforcement_event(enforced: bool) -> EventDraft:
     text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
     severity = Severity.INFO if enforced else Severity.WARNING
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
+
+
+def thin_zones_event(space: Space) -> EventDraft:
+    """Some zones are kept clear of as if they were thicker than they are written."""
+    thin = "; ".join(str(zone) for zone in space.thin)
+    text = f"no-fly zones thinner than {THINNEST_M:g} m are kept clear of as if they were so thick: {thin} ({ZONES})"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "thin_zones"})
+
+
+def position_jumped_event(jumped_m: float) -> EventDraft:
+    """The position changed by more than the vehicle can have flown."""
+    text = f"the vehicle's position jumped by {jumped_m:.1f} m: it hovers, until something new is commanded"
+    data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
 def emergency_event(name: str) -> EventDraft:
@@ -70,3 +85,10 @@ def ownership_event(changed: Changed) -> EventDraft:
     """The flight is somebody else's, or an earlier run's."""
     reason = "others" if changed.whose is Whose.OTHERS else "flight"
     return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})
+
+
+def slept_event(slept_s: float) -> EventDraft:
+    """The computer slept in the meantime, for so long [s]."""
+    text = f"this computer slept for {slept_s:.1f} s: nothing that was asked for before is done any more"
+    data: dict[str, Value] = {"reason": "slept", "seconds": slept_s}
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)

@@ -14,9 +14,6 @@ from skyloop.messages import AnyAction, Attitude, Velocity
 ALTITUDE_GAIN: Final = 1.0
 #: So little above ``limits.altitude`` is the altimeter's noise [m].
 SLACK_M: Final = 0.15
-#: A vehicle that hovers is brought down from so far above it [m], at this speed at least [m/s].
-HOVER_SLACK_M: Final = 0.3
-SINK_M_S: Final = 0.2
 #: A limit not touched for so long begins a new episode when it is touched again.
 EPISODE_NS: Final = NS_PER_S
 
@@ -73,22 +70,6 @@ class Limits:
         if allowed_yaw_rate != yaw_rate:
             clamps.append(Clamp("limits.yaw_rate", yaw_rate, allowed_yaw_rate))
         return type(action)(x, y, allowed_up, allowed_yaw_rate), tuple(clamps)
-
-
-class Ceiling:
-    """Brings a vehicle down that is to hover above ``limits.altitude``, as one that overshot it is."""
-
-    def __init__(self) -> None:
-        self._sinking = False
-
-    def instead(self, limits: Limits, altitude: float | None) -> tuple[Velocity | None, tuple[Clamp, ...]]:
-        """Return what to do instead of hovering at this altitude [m], and what was in the way of it; None: hover."""
-        above = 0.0 if altitude is None else altitude - limits.altitude
-        self._sinking = above > (SLACK_M if self._sinking else HOVER_SLACK_M)
-        if not self._sinking:
-            return None, ()
-        up = -min(limits.climb, max(SINK_M_S, above * ALTITUDE_GAIN))
-        return Velocity(up=up), (Clamp("limits.altitude", 0.0, up),)
 
 
 class Episodes:

@@ -1,7 +1,8 @@
 """Back to where the vehicle took off: which place that is, and the flight there. Pure: the time is an argument.
 
-The flight is a series of places to fly to, each decided as ``go_to`` is (:mod:`skyloop.proxy.core.places`): straight up
-to a safe height, straight over the start, and there a landing or a hover. The rules in words are in ``docs/proxy.md``.
+The flight is a series of places to fly to, each judged as ``go_to`` is (:mod:`skyloop.proxy.core.airspace`): straight
+up to a safe height, straight over the start, and there a landing or a hover. The rules in words are in
+``docs/proxy.md``.
 """
 
 from __future__ import annotations
@@ -12,10 +13,9 @@ from typing import Final, NamedTuple
 
 from skyloop.clock import NS_PER_S, seconds
 from skyloop.messages import Feedback, FlightState, Land, Position, Refusal, ReturnPhase, ReturnToStart
-from skyloop.proxy.core.limits import Clamp, Limits
-from skyloop.proxy.core.ownership import STANDING_NS
-from skyloop.proxy.core.places import decide_place
-from skyloop.proxy.core.safety import STALE_NS
+from skyloop.proxy.core.airspace import STALE_NS, Airspace
+from skyloop.proxy.core.flight import STANDING_NS
+from skyloop.proxy.core.limits import Clamp
 from skyloop.zones import Space, Vec3
 
 NEAR_M: Final = 0.3  #: so near, and at rest, it is there
@@ -80,6 +80,7 @@ class ReturnDecision(NamedTuple):
     refusal: Refusal | None = None  #: None without an action: it goes on as soon as a young position comes
     why: str = ""  #: of the refusal, for a person
     lasting: bool = False  #: waiting for a young position does not help
+    enforced: bool | None = None  #: whether the safety box and zones could be; None: there are none, or no place
 
 
 class ReturnFlight:
@@ -99,54 +100,56 @@ class ReturnFlight:
         self._speed = settings.speed
         self._land = settings.land if action.land is None else action.land
         self._target: Vec3 = (0.0, 0.0, 0.0)
+        self._flown: Vec3 = (0.0, 0.0, 0.0)  # the target, lowered where the ceiling is lower now
         self._over: Vec3 = (0.0, 0.0, 0.0)  # the place above the start
         self._left_m, self._left_ns = math.inf, 0  # the shortest way that was left, and since when it is
         self._stepped_ns = 0
 
-    def step(self, limits: Limits, space: Space, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
+    def step(self, airspace: Airspace, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
         """Decide what the vehicle does now.
 
         Args:
-            limits: Those in force.
-            space: Where it may fly.
+            airspace: Where it may fly.
             feedback: The newest sample; None: none came yet.
             now_ns: The time now, on the clock of ``feedback.captured_ns`` [ns].
         """
         begins = self.phase is ReturnPhase.NONE
         if self.phase is not ReturnPhase.LANDING:
-            problem = self._plan(limits, space, feedback, now_ns)
+            airspace.observe(feedback)
+            problem = self._plan(airspace, feedback, now_ns)
             if problem is not None:
                 self.phase = ReturnPhase.NONE  # all of it is checked again before it goes on
                 return problem
         if self.phase is ReturnPhase.LANDING:
             return ReturnDecision(Land())
-        place = decide_place(Position(*self._target, None, self._speed), limits, space, feedback, now_ns, new=False)
-        if place.action is not None:
-            self._target = place.action.place  # it may have been lowered
-        elif begins:
+        place = airspace.judge(Position(*self._target, None, self._speed), feedback, now_ns, planned=True)
+        if isinstance(place.action, Position):
+            self._flown = place.action.place
+            return ReturnDecision(place.action, place.clamps, enforced=place.enforced)
+        if begins:
             self.phase = ReturnPhase.NONE
-        return ReturnDecision(place.action, place.clamps, place.refusal, place.why)
+        return ReturnDecision(None, place.clamps, place.refusal, place.why)
 
-    def _plan(self, limits: Limits, space: Space, feedback: Feedback | None, now_ns: int) -> ReturnDecision | None:
+    def _plan(self, airspace: Airspace, feedback: Feedback | None, now_ns: int) -> ReturnDecision | None:
         """Begin, or go on to the next part of the way; return what is against it."""
         if self._action.problem:
             return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, self._action.problem, True)
         if feedback is None or feedback.position_m is None or now_ns - feedback.captured_ns > STALE_NS:
             return None  # which is the same for every place
         if self.phase is not ReturnPhase.NONE:
-            problem = self._go_on(space, feedback, feedback.position_m, now_ns)
+            problem = self._go_on(feedback, feedback.position_m, now_ns)
             return ReturnDecision(None, (), Refusal.WRONG_STATE, problem, True) if problem else None
         if self._start is None:
             why = "where it took off is not known: fly it to a place, or land it here"
             return ReturnDecision(None, (), Refusal.WRONG_STATE, why, True)
-        problem = self._begin(self._start, limits, space, feedback, feedback.position_m)
+        problem = self._begin(self._start, airspace, feedback, feedback.position_m)
         return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, problem, True) if problem else None
 
-    def _begin(self, start: Vec3, limits: Limits, space: Space, feedback: Feedback, at: Vec3) -> str:
+    def _begin(self, start: Vec3, airspace: Airspace, feedback: Feedback, at: Vec3) -> str:
         """Plan the whole way; return what is in it, for a person."""
+        space = airspace.settings.space
         top = max(at[2], start[2] + self._height) if math.dist(at[:2], start[:2]) >= CLOSE_M else at[2]
-        if feedback.altitude_m is not None:
-            top = min(top, at[2] - feedback.altitude_m + limits.altitude)
+        top = min(top, airspace.ceiling(feedback))
         for walls in (space.room, space.box):
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
@@ -162,20 +165,22 @@ class ReturnFlight:
         if problem:
             return problem
         self.phase = ReturnPhase.CLIMBING if climbs else ReturnPhase.FLYING
-        self._over, self._target, self._left_m = over, (above if climbs else over), math.inf
+        self._over, self._left_m = over, math.inf
+        self._target = self._flown = above if climbs else over
         return ""
 
-    def _go_on(self, space: Space, feedback: Feedback, at: Vec3, now_ns: int) -> str:
+    def _go_on(self, feedback: Feedback, at: Vec3, now_ns: int) -> str:
         """Begin the next part of the way where the present one is over; return what is against it, for a person."""
-        left_m = math.dist(at, self._target)
+        left_m = math.dist(at, self._flown)
         paused, self._stepped_ns = now_ns - self._stepped_ns > NS_PER_S, now_ns
         if paused or left_m < self._left_m - HEADWAY_M:
             self._left_m, self._left_ns = left_m, now_ns
         stalled = now_ns - self._left_ns >= STALL_NS
         if self.phase is ReturnPhase.CLIMBING:
             if at[2] >= self._target[2] - NEAR_M or (stalled and left_m <= CLOSE_M):
-                self.phase, self._target, self._left_m = ReturnPhase.FLYING, self._over, math.inf
-                return space.problem_between(at, self._over)
+                self.phase, self._left_m = ReturnPhase.FLYING, math.inf
+                self._target = self._flown = self._over  # the straight way there is judged with it
+                return ""
         elif self.phase is ReturnPhase.FLYING:
             slow = feedback.velocity_m_s is None or math.hypot(*feedback.velocity_m_s) <= AT_REST_M_S
             if (left_m <= NEAR_M and slow) or (stalled and left_m <= CLOSE_M):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import logging
+import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -159,9 +160,14 @@ class Compiler:
         with self._lock:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="skyloop-sim-compiler", daemon=True)
-                atexit.register(self._compiling.acquire)  # for good: no other function is begun
+                atexit.register(self._hold, os.getpid())
                 self._thread.start()
             return self._thread
+
+    def _hold(self, process: int) -> None:
+        """Begin no other function, for good; a fork has no such thread, and the lock as it was."""
+        if process == os.getpid():
+            self._compiling.acquire()
 
     def _run(self) -> None:
         try:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import zenoh
 
 JOIN_S: Final = 1.0  #: how long a proxy that was found may take to let this application in
+TIMED_OUT: Final = "Timeout"  #: the text of Zenoh's error reply to a query that nobody answered in time
 MAX_CANDIDATES: Final = 4  #: with keys: so many proxies of one name are asked until one proves that it is it
 
 
@@ -145,7 +146,10 @@ def join(session: Session, name: str, run: str, connection: str) -> Admission:
     )
     for reply in replies:
         if reply.err is not None:
-            raise LinkError(f"the proxy {name!r} does not let us in: {reply.err.payload.to_string()[:400]}")
+            words = reply.err.payload.to_string()[:400]
+            if words == TIMED_OUT:  # a router's, in place of an answer that did not come: no refusal
+                continue
+            raise LinkError(f"the proxy {name!r} does not let us in: {words}")
         try:
             ok = reply.ok
             welcome = None if ok is None else packets.decode_welcome(packets.copied(ok.payload, packets.MAX_OWN))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import json
 import logging
+import os
 import platform
 import re
 import threading
@@ -198,7 +199,14 @@ _POOL: Final = _Pool()
 acquire = _POOL.acquire
 release = _POOL.release
 retire = _POOL.retire
-atexit.register(_POOL.close_all)
+
+
+def _close_all(process: int) -> None:
+    if process == os.getpid():  # a fork has none of the sessions' threads
+        _POOL.close_all()
+
+
+atexit.register(_close_all, os.getpid())
 
 
 def load() -> Any:

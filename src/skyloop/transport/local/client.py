@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
+from skyloop.child_process import leave_to_parent
 from skyloop.errors import DecodeError, LinkError, UnknownNameError
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
 from skyloop.transport.base import MAX_PACKET, ClientHandler, Dialer, TransportClient, check_packet, check_topic
@@ -83,6 +84,14 @@ class LocalClient(TransportClient):
         self._send_own(packets.hello())
         self._thread = threading.Thread(target=self._run, args=(sock,), name=f"skyloop-{name}-client", daemon=True)
         self._thread.start()
+        leave_to_parent(self)
+
+    def forked(self) -> None:
+        """Drop a forked child's copy of the connection; shutting it down would end the parent's."""
+        sock, self._socket = self._socket, None
+        self._ended = "the connection belongs to the parent process"
+        if sock is not None:
+            sock.close()
 
     def send(self, packet: bytes) -> bool:
         if not 0 < len(packet) <= MAX_PACKET:

@@ -122,6 +122,11 @@ class Reactor:
             self._epoll.unregister(source.fileno)
             return True
 
+    @property
+    def empty(self) -> bool:
+        """Whether it waits for no socket."""
+        return not self._sources
+
     def split(self, stuck: Receiver) -> Reactor:
         """Leave this reactor to one server, and return a new one that receives for all others. Any thread.
 

@@ -1,0 +1,364 @@
+"""The vehicle's motion, how old it is and what of it is missing, and the base of the laws that fly by it. Pure.
+
+Motion is in *odometry axes*: levelled, x along yaw 0, z up, origin where it was at its first sample. The origin
+drifts with the error of the vehicle's velocity. That does no harm here, because only differences over about a second
+are used; after a gap it may have jumped (:attr:`Airframe.interruptions`). Times are on the proxy's clock.
+
+A vehicle that reports no velocity, but keeps its height, accelerates by gravity times the tangent of its tilt, less the
+drag of the air. So the attitude, integrated, gives the velocity through the air; drag makes it forget its errors after
+two seconds. The wind and a drag other than the assumed one remain as an error, but one that changes slowly:
+differences, such as how much faster than a target the vehicle moves, are right. To fly at a speed against its own drag
+estimate also holds a vehicle against the wind, as an integral would: the estimate is the tilt, averaged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import seconds
+from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped
+from skyloop.messages import Feedback, FlightState, Vector, Velocity
+from skyloop.messages.geometry import rotation_from_euler, wrap_angle
+
+Array = NDArray[np.float64]
+
+STALE_S: Final = 0.5  #: what was not reported for longer is not known, and a gap in which a vehicle may do anything
+#: Of a small quadrotor, at a few metres a second [1/s]: 0.58 was identified for an AR.Drone 2 (J. Engel, J. Sturm, D.
+#: Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim/vehicles``).
+DRAG_PER_S: Final = 0.45
+_HISTORY_S: Final = 3.0
+_SHORTEST_STEP_S: Final = 0.02  # between samples that came later than they were sent, yaw says little about its rate
+_EXTRAPOLATE_S: Final = 0.3
+_TILTING_S: Final = 0.3
+_STEEPEST: Final = 0.5  # cosine of the tilt, beyond which the vehicle does not keep its height
+
+
+class Part(StrEnum):
+    """What a law may need to know of the vehicle."""
+
+    ATTITUDE = "attitude"
+    YAW = "yaw"
+    VELOCITY = "velocity"
+    HEIGHT = "height above the ground"
+    POSITION = "position"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """The vehicle's motion at one time, in odometry axes.
+
+    Attributes:
+        at_ns: On the proxy's clock.
+        position: Shape (3,) [m].
+        velocity: Shape (3,) [m/s].
+        yaw: [rad]
+        yaw_rate: [rad/s]
+    """
+
+    at_ns: int
+    position: Array
+    velocity: Array
+    yaw: float
+    yaw_rate: float
+
+    def moved_to(self, at_ns: int) -> Motion:
+        """Return the motion extrapolated to another time, by at most 0.3 s forward or back."""
+        dt = clamped(seconds(at_ns - self.at_ns), _EXTRAPOLATE_S)
+        yaw = wrap_angle(self.yaw + self.yaw_rate * dt)
+        return Motion(at_ns, self.position + self.velocity * dt, self.velocity, yaw, self.yaw_rate)
+
+    def to_body(self, horizontal: Array) -> tuple[float, float]:
+        """Turn a horizontal vector (2,) from odometry axes into forward and left of the levelled body."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return float(c * horizontal[0] + s * horizontal[1]), float(c * horizontal[1] - s * horizontal[0])
+
+    def stiffened(self, wanted: Array, share: float) -> Array:
+        """Add a share of the present velocity error to a wanted velocity.
+
+        Args:
+            wanted: Shape (3,) in odometry axes [m/s].
+            share: Of the difference between wanted and present velocity; 0 or more.
+        """
+        return wanted + share * (wanted - self.velocity)
+
+
+class Airframe:
+    """What is known of a vehicle: its motion in the last three seconds, and the age of each part of it.
+
+    Attributes:
+        feedback: The newest sample, without what was not finite; None before the first.
+        by_tilt: The vehicle reports no velocity: it is taken from the attitude (:class:`TiltVelocity`).
+        interruptions: How often the motion was not known for longer than :data:`STALE_S`: what was noted in odometry
+            axes before is off by as much as the vehicle moved meanwhile.
+    """
+
+    def __init__(self, *needs: Part) -> None:
+        """Initialise the airframe.
+
+        Args:
+            *needs: What its user can't fly without; see :meth:`missing`.
+        """
+        self.feedback: Feedback | None = None
+        self.by_tilt = False
+        self.interruptions = 0
+        self._needs = needs
+        self._known_ns: dict[Part, int] = {}
+        self._history: deque[Motion] = deque()
+        self._altitude: float | None = None
+        self._position: Vector | None = None
+        self._reckoning = TiltVelocity()
+        self._tilts: deque[tuple[int, float, float]] = deque()
+
+    def add(self, feedback: Feedback) -> None:
+        """Update with the next sample; one that is not newer than the last is ignored.
+
+        Args:
+            feedback: Numbers in it that are not finite count as missing.
+        """
+        at_ns = feedback.captured_ns
+        if self.feedback is not None and at_ns <= self.feedback.captured_ns:
+            return
+        self.feedback = feedback = _finite(feedback)
+        roll, pitch, yaw = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
+        if roll is not None and pitch is not None:
+            self._tilts.append((at_ns, roll, pitch))
+            while seconds(at_ns - self._tilts[0][0]) > _TILTING_S:
+                self._tilts.popleft()
+        if yaw is not None:
+            self._known_ns[Part.YAW] = at_ns
+            if roll is not None and pitch is not None:
+                self._known_ns[Part.ATTITUDE] = at_ns
+            velocity = self._reckoning.step(feedback) if self.by_tilt else feedback.velocity_m_s
+            if velocity is not None:
+                self._known_ns[Part.VELOCITY] = at_ns
+                self._integrate(feedback, velocity, yaw)
+        if feedback.altitude_m is not None:
+            self._known_ns[Part.HEIGHT], self._altitude = at_ns, feedback.altitude_m
+        if feedback.position_m is not None:
+            self._known_ns[Part.POSITION], self._position = at_ns, feedback.position_m
+
+    def age_s(self, part: Part, now_ns: int) -> float:
+        """Return how long ago a part of the motion was reported [s]; infinite if it never was."""
+        known_ns = self._known_ns.get(part)
+        return math.inf if known_ns is None else seconds(now_ns - known_ns)
+
+    def missing(self, now_ns: int) -> str:
+        """Return what of the needed parts is not known now, as a sentence; empty if nothing is missing."""
+        old = [part.value for part in self._needs if self.age_s(part, now_ns) > STALE_S]
+        return f"the vehicle's {' and '.join(old)} {'is' if len(old) == 1 else 'are'} not known" if old else ""
+
+    def altitude_m(self, now_ns: int) -> float | None:
+        """Return the newest height above the ground [m]; None while it is not known."""
+        return self._altitude if self.age_s(Part.HEIGHT, now_ns) <= STALE_S else None
+
+    def position_m(self, now_ns: int) -> Vector | None:
+        """Return the newest position in world axes [m]; None while it is not known."""
+        return self._position if self.age_s(Part.POSITION, now_ns) <= STALE_S else None
+
+    @property
+    def newest(self) -> Motion | None:
+        """The motion as of the last sample that told it, whatever its age; None before the first."""
+        return self._history[-1] if self._history else None
+
+    def at(self, at_ns: int) -> Motion | None:
+        """Return the motion at a time [ns], extrapolated from the nearest sample; None while it is not known."""
+        if not self._history:
+            return None
+        nearest = self._history[-1]
+        for motion in reversed(self._history):
+            if abs(motion.at_ns - at_ns) > abs(nearest.at_ns - at_ns):
+                break
+            nearest = motion
+        return nearest.moved_to(at_ns) if abs(seconds(nearest.at_ns - at_ns)) <= STALE_S else None
+
+    def at_capture(self, frame: Feedback, captured_ns: int, *seen: Array) -> tuple[Motion, Array] | None:
+        """Return the motion at the capture of a frame and the rotation (3, 3) from the body to odometry axes.
+
+        Args:
+            frame: Feedback with the attitude at the capture.
+            captured_ns: Capture of the frame.
+            *seen: What was measured in it.
+
+        Returns:
+            None while motion or attitude are not known, and where something that was measured is not finite.
+        """
+        motion, frame = self.at(captured_ns), _finite(frame)
+        if motion is None or frame.roll_rad is None or frame.pitch_rad is None or frame.yaw_rad is None:
+            return None
+        return (motion, frame.rotation) if all(np.isfinite(one).all() for one in seen) else None
+
+    @property
+    def tilt_rate_rad_s(self) -> float:
+        """How fast it tilted lately, by differences, for one whose feedback has no gyroscope.
+
+        The farthest that roll and pitch are apart within the last 0.3 s, per 0.15 s [rad/s].
+        """
+        if not self._tilts:
+            return 0.0
+        _, rolls, pitches = zip(*self._tilts, strict=True)
+        return math.hypot(max(rolls) - min(rolls), max(pitches) - min(pitches)) / (_TILTING_S / 2)
+
+    def _integrate(self, feedback: Feedback, levelled: Vector, yaw: float) -> None:
+        last, at_ns = self.newest, feedback.captured_ns
+        velocity = rotation_from_euler(0.0, 0.0, yaw) @ np.asarray(levelled)
+        position = np.zeros(3)
+        if last is not None:
+            dt = seconds(at_ns - last.at_ns)
+            self.interruptions += dt > STALE_S
+            position = last.position + (last.velocity + velocity) * (min(dt, STALE_S) / 2)
+        self._history.append(Motion(at_ns, position, velocity, yaw, _yaw_rate(feedback, yaw, last)))
+        while seconds(at_ns - self._history[0].at_ns) > _HISTORY_S:
+            self._history.popleft()
+
+
+class TiltVelocity:
+    """Integrates attitude to the velocity through the air."""
+
+    def __init__(self, drag_per_s: float = DRAG_PER_S) -> None:
+        """Initialise the estimate: at rest.
+
+        Args:
+            drag_per_s: Deceleration per speed [1/s].
+        """
+        self.drag_per_s = drag_per_s
+        self._velocity = np.zeros(2)  # horizontal, along yaw 0 and to its left
+        self._last_ns: int | None = None
+
+    def step(self, feedback: Feedback) -> tuple[float, float, float] | None:
+        """Integrate the next sample.
+
+        Args:
+            feedback: The vehicle's newest state; landed, it is at rest.
+
+        Returns:
+            The velocity forward, left and up (which is 0), in the levelled body's axes [m/s]; None while the attitude
+            is not known.
+        """
+        roll, pitch, yaw = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
+        if roll is None or pitch is None or yaw is None:
+            return None
+        dt_s = 0.0 if self._last_ns is None else seconds(feedback.captured_ns - self._last_ns)
+        self._last_ns = max(feedback.captured_ns, self._last_ns or feedback.captured_ns)
+        if feedback.state is FlightState.LANDED:
+            self._velocity = np.zeros(2)
+        elif dt_s > 0.0:
+            up = rotation_from_euler(roll, pitch, yaw)[:, 2]
+            push = GRAVITY_M_S2 * up[:2] / max(_STEEPEST, up[2])
+            kept = math.exp(-self.drag_per_s * min(dt_s, STALE_S))
+            self._velocity = kept * self._velocity + (1.0 - kept) / self.drag_per_s * push
+        c, s = math.cos(yaw), math.sin(yaw)
+        x, y = self._velocity.tolist()
+        return c * x + s * y, c * y - s * x, 0.0
+
+
+class AirframeLaw:
+    """The base of laws that fly by the vehicle's motion: they hold it while what they need of it is not known.
+
+    Attributes:
+        airframe: What is known of the vehicle.
+        problem: Why the law holds the vehicle, as of the last step; empty while it flies.
+    """
+
+    def __init__(self, *needs: Part) -> None:
+        """Initialise the law.
+
+        Args:
+            *needs: What it can't fly without.
+        """
+        self.airframe = Airframe(*needs)
+        self.problem = ""
+        self._altitude: float | None = None  # as of the last step; None: not known
+        self._last_ns: int | None = None  # the last step
+
+    def feedback(self, feedback: Feedback) -> None:
+        """Update with the vehicle's newest state."""
+        before = self.airframe.interruptions
+        self.airframe.add(feedback)
+        if self.airframe.interruptions != before:
+            self.forget()
+
+    def pause(self) -> None:
+        """Restart from rest, because others flew the vehicle, or nothing was known of it."""
+        self._last_ns = None
+
+    def forget(self) -> None:
+        """Forget what was noted in odometry axes, because the motion was interrupted."""
+
+    def _ready(self, now_ns: int) -> bool:
+        """Whether all is known that the law needs; else it pauses."""
+        self.problem = self.airframe.missing(now_ns)
+        self._altitude = self.airframe.altitude_m(now_ns)
+        if self.problem:
+            self.pause()
+        return not self.problem
+
+    def _since_s(self, now_ns: int) -> float:
+        """Return the time since the last step [s]; 0 after a pause."""
+        last_ns, self._last_ns = self._last_ns, now_ns
+        return 0.0 if last_ns is None else max(0.0, seconds(now_ns - last_ns))
+
+    def _motion(self, at_ns: int) -> Motion:
+        """Return the motion at a time at which it is known."""
+        motion = self.airframe.at(at_ns)
+        assert motion is not None, "a law without its motion is not ready"
+        return motion
+
+
+class VelocityLaw(AirframeLaw):
+    """The base of laws whose set-points are velocities, with limits."""
+
+    def __init__(self, limits: SetpointLimits, *needs: Part) -> None:
+        """Initialise the law.
+
+        Args:
+            limits: Of the set-points.
+            *needs: What it can't fly without.
+        """
+        super().__init__(*needs)
+        self._limiter = SetpointLimiter(limits)
+
+    def step(self, now_ns: int) -> Velocity:
+        """Compute the set-point for now. All zero while what the law needs to know is not known."""
+        if not self._ready(now_ns):
+            return Velocity()
+        return self._limiter.step(self._setpoint(now_ns), self._since_s(now_ns))
+
+    def pause(self) -> None:
+        """Restart set-points from rest."""
+        super().pause()
+        self._limiter.reset(Velocity())
+
+    def _setpoint(self, now_ns: int) -> Array:
+        """Return forward, left, up [m/s] and yaw rate [rad/s], (4,), before the limits."""
+        raise NotImplementedError
+
+
+def _yaw_rate(feedback: Feedback, yaw: float, last: Motion | None) -> float:
+    """Return the yaw rate that is reported, or else that since the last sample: a Tello reports none."""
+    if feedback.angular_velocity_rad_s is not None:
+        return feedback.angular_velocity_rad_s[2]
+    if last is None:
+        return 0.0
+    dt_s = seconds(feedback.captured_ns - last.at_ns)
+    if dt_s < _SHORTEST_STEP_S:
+        return last.yaw_rate
+    return wrap_angle(yaw - last.yaw) / dt_s if dt_s <= STALE_S else 0.0
+
+
+_NUMBERS: Final = ("roll_rad", "pitch_rad", "yaw_rad", "altitude_m")
+_VECTORS: Final = ("velocity_m_s", "angular_velocity_rad_s", "position_m")
+
+
+def _finite(feedback: Feedback) -> Feedback:
+    """Return feedback without what is not finite: a driver or a source of positions may be at fault."""
+    wrong = [name for name in _NUMBERS if not math.isfinite(getattr(feedback, name) or 0.0)]
+    wrong += [name for name in _VECTORS if not all(map(math.isfinite, getattr(feedback, name) or ()))]
+    return msgspec.structs.replace(feedback, **dict.fromkeys(wrong)) if wrong else feedback

@@ -1,0 +1,442 @@
+"""Where a vehicle may fly, and how fast: one verdict for each set-point, place, hover, take-off and step. Pure.
+
+Every wall is a plane: those of the safety box, and before each no-fly zone the one through its nearest point, square to
+the line of sight, behind which all of the zone lies because zones are convex. Within a zone the plane by which the
+vehicle came in stays, so that it is led back to its own side. Towards a plane at distance ``d`` the vehicle may be as
+fast as it can still be stopped: ``v·t + v²/(2·a) = d`` with the reaction time ``t``, the age of the position included,
+and the deceleration ``a``. A velocity keeps what runs along the plane; a tilt is let through until the vehicle is as
+fast as that, and then is turned into one that brakes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from skyloop.clock import NS_PER_S, seconds
+from skyloop.messages import AnyAction, Attitude, Feedback, Hover, Position, Refusal, Takeoff, Velocity
+from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
+from skyloop.proxy.core.limits import ALTITUDE_GAIN, SLACK_M, Clamp, Limits
+from skyloop.zones import Space, Vec3, Wall, Zone
+
+GRAVITY_M_S2: Final = 9.80665
+STALE_NS: Final = NS_PER_S // 2  #: a vehicle whose feedback is older has no position
+LOST_NS: Final = 2 * NS_PER_S  #: a position that is older is not waited for
+BLIND_M: Final = 0.5  #: between walls a vehicle flies to a place at most so far without a new position
+#: A position that changes by more than this, and more than can have been flown since, has jumped.
+JUMP_M: Final = 1.0
+MARGIN_M: Final = 0.1  #: so far beyond a wall is taken for noise; farther is outside, where only coming back is allowed
+BRAKE_GAIN: Final = 2.0  #: deceleration asked for per speed that is too much [1/s]
+RETURN_M_S: Final = 0.5  #: at most so fast is it led back that is beyond a wall and asks to go farther
+#: A vehicle that hovers is brought down from so far above ``limits.altitude`` [m], at this speed at least [m/s].
+HOVER_SLACK_M: Final = 0.3
+SINK_M_S: Final = 0.2
+TAKEOFF_M: Final = 1.0  #: a take-off leads at least so high
+LIFTED_M: Final = 0.3  #: a zone that ends lower is left by it: a vehicle may stand on a table that is one
+
+_FAST_M_S: Final = 10.0  # what a vehicle that does not report its velocity may fly
+_BLIND_S: Final = 0.1  # what a vehicle does in less is within the reaction time
+_OLD_S: Final = 1.0  # a position may stay the same for longer where the vehicle stands still after all
+_AT_REST_M_S: Final = 0.05  # a slower vehicle may report the same position again and again
+_GROUND_NS: Final = NS_PER_S // 2  # the ground below is the median over so long: no single wrong height moves it
+_NO_WAY_M: Final = 0.05  # so near the place there is no direction that the limits could be applied to
+_PASSES: Final = 8  # of shortening by all walls in turn, before giving up on all but standing still
+
+
+class Verdict(NamedTuple):
+    """What becomes of what is asked for."""
+
+    action: AnyAction | None = None  #: what may be done of it; None: the vehicle must stop, or stay where it stands
+    clamps: tuple[Clamp, ...] = ()  #: what was in the way of it
+    refusal: Refusal | None = None  #: None without an action: it goes on as soon as a young position comes
+    why: str = ""  #: of the refusal, for a person
+    enforced: bool | None = None  #: whether the safety box and zones could be; None: there are none
+
+
+@dataclass(frozen=True, slots=True)
+class AirspaceSettings:
+    """What the parameters say about where it may fly, and how fast."""
+
+    limits: Limits = field(default_factory=Limits)
+    space: Space = field(default_factory=Space)
+    deceleration: float = 1.0  #: at which the vehicle can be relied on to stop [m/s²]
+    reaction_s: float = 0.3  #: until it begins to
+
+
+class Airspace:
+    """Judges what one vehicle is asked to do by where it is."""
+
+    def __init__(self, settings: AirspaceSettings | None = None) -> None:
+        self.settings = settings or AirspaceSettings()
+        self.jumped_m = 0.0  #: how far the position jumped lately; whoever acts on it sets it to 0
+        self._way: tuple[Vec3, Space] | None = None  # the place that it was allowed to fly to, and in which space
+        self._sinks = self._blocked = False  # down to the ceiling; and something is between
+        self._newest: Feedback | None = None
+        self._at_ns = 0  # how old the newest position is by itself
+        self._moves = False  # by what it was allowed last
+        self._sides: dict[Zone, tuple[Vec3, float]] = {}  # the plane before each zone when it was outside last
+        self._ground: deque[tuple[int, float]] = deque()  # when, and how high below the vehicle [m]
+
+    def judge(
+        self, action: AnyAction, feedback: Feedback | None, now_ns: int, *, new: bool = False, planned: bool = False
+    ) -> Verdict:
+        """Decide what becomes of what is asked for, newly or once more.
+
+        Args:
+            action: What is asked for; finite.
+            feedback: The newest sample; None: none came yet.
+            now_ns: The time now, on the clock of ``feedback.captured_ns`` [ns].
+            new: Whether it was newly asked for. A place that was allowed stays so while nothing else is asked for: what
+                comes into the straight way because the vehicle drifts is kept clear of step by step, and for a lower
+                ceiling its height is lowered.
+            planned: It is a place of a way that was checked as a whole, and whose height may be lowered from the start.
+        """
+        self.observe(feedback)
+        if isinstance(action, Position):
+            if new:
+                self._way = None
+            return self._place(action, feedback, now_ns, planned)
+        self._way = None
+        if isinstance(action, Velocity | Attitude):
+            return self.step(action, feedback, now_ns)
+        self._moves = False
+        if isinstance(action, Hover):
+            return self._hover(feedback, now_ns)
+        if isinstance(action, Takeoff):
+            return self._takeoff(action, feedback, now_ns)
+        return Verdict(action)
+
+    def step(self, action: Velocity | Attitude, feedback: Feedback | None, now_ns: int) -> Verdict:
+        """Shorten a set-point, or one step on the way to a place, to what limits and walls allow."""
+        self.observe(feedback)
+        allowed, clamps = self.settings.limits.clamp(action, feedback.altitude_m if feedback is not None else None)
+        enforced = None
+        if self.settings.space.walled:
+            allowed, walls, enforced = self.between_walls(allowed, feedback, now_ns)
+            clamps += walls
+            self._moves = any(getattr(allowed, name) for name in allowed.__struct_fields__[:3])
+        return Verdict(allowed, clamps, enforced=enforced)
+
+    def objection(self, action: Position, feedback: Feedback | None, now_ns: int) -> str:
+        """Return what is wrong with a place by itself, whatever the way there is, for a person; empty if nothing is."""
+        self.observe(feedback)
+        if action.problem or feedback is None or feedback.position_m is None or not self._young(feedback, now_ns):
+            return action.problem
+        ground, space = self._ground_below(feedback), self.settings.space
+        return self._too_high(action.z, ground) or space.problem_at(action.place) or _too_low(action.z, ground)
+
+    def ceiling_problem(self, altitude: float, feedback: Feedback | None) -> str:
+        """Return why ``limits.altitude`` must not be so low now: some vehicles sink to it by themselves."""
+        self.observe(feedback)
+        if feedback is None or feedback.position_m is None or (ground := self._ground_below(feedback)) is None:
+            return ""
+        x, y, z = at = feedback.position_m
+        below, zones = (x, y, ground + altitude), Space(zones=self.settings.space.zones)
+        problem = "" if below[2] >= z else zones.problem_at(below) or zones.problem_between(at, below)
+        return f"the vehicle would have to sink to {altitude:g} m, and {problem}" if problem else ""
+
+    def apart(self) -> Airspace:
+        """Return one that has seen the same, to try something without a trace."""
+        other = Airspace(self.settings)
+        other._newest, other._at_ns, other._moves = self._newest, self._at_ns, self._moves
+        other._sides, other._ground = dict(self._sides), self._ground.copy()
+        return other
+
+    def observe(self, feedback: Feedback | None) -> None:
+        """Note where the vehicle is: on which side of each zone, how old that is, and where the ground is below it.
+
+        ``jumped_m`` is set where the position changed by more than the vehicle can have flown.
+        """
+        before, at = self._newest, None if feedback is None else feedback.position_m
+        if feedback is None or at is None or feedback is before:
+            return
+        if before is None or abs(feedback.captured_ns - before.captured_ns) > NS_PER_S:
+            self._sides.clear()
+            self._ground.clear()
+        else:
+            self._notice_jump(before, feedback, math.dist(at, before.position_m or at))
+        rests = not self._moves and _speed(feedback) <= _AT_REST_M_S
+        if before is None or at != before.position_m or rests:
+            self._at_ns = feedback.captured_ns
+        self._newest = feedback
+        for zone in self.settings.space.barriers:
+            wall = zone.wall_outside(at)
+            if wall.distance > 0.0:
+                self._sides[zone] = wall.normal, _dot(wall.normal, at) + wall.distance
+        if feedback.altitude_m is not None:
+            ground = self._ground
+            ground.append((feedback.captured_ns, at[2] - feedback.altitude_m))
+            while feedback.captured_ns - ground[0][0] > _GROUND_NS:
+                ground.popleft()
+
+    def _notice_jump(self, before: Feedback, feedback: Feedback, moved_m: float) -> None:
+        limits = self.settings.limits
+        reported = _FAST_M_S if feedback.velocity_m_s is None else max(_speed(before), _speed(feedback))
+        fastest = max(math.hypot(limits.speed, limits.climb), reported)
+        if moved_m > JUMP_M + fastest * max(0.0, seconds(feedback.captured_ns - self._at_ns)):
+            self.jumped_m = moved_m
+            self._sides.clear()
+            self._ground.clear()
+
+    def allowed_speed(self, distance: float, late_s: float) -> float:
+        """The greatest speed towards a wall so far away [m/s]; 0 beyond it."""
+        deceleration = self.settings.deceleration
+        lost = deceleration * late_s
+        return math.sqrt(lost * lost + 2 * deceleration * distance) - lost if distance > 0.0 else 0.0
+
+    def between_walls(
+        self, action: AnyAction, feedback: Feedback | None, now_ns: int
+    ) -> tuple[AnyAction, tuple[Clamp, ...], bool]:
+        """Return the nearest set-point that keeps within the box and out of the zones.
+
+        Returns:
+            The set-point, what was in the way, and whether the position is known; if not, the set-point is unchanged.
+        """
+        if feedback is None or feedback.position_m is None or feedback.yaw_rad is None:
+            return action, (), False
+        self.observe(feedback)
+        if now_ns - feedback.captured_ns > STALE_NS:
+            return action, (), False
+        age_s, speed = self._age_s(feedback, now_ns), _speed(feedback)
+        late_s = self.settings.reaction_s + min(age_s, _OLD_S)
+        walls = self._walls(feedback.position_m)
+        turn = (math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad))
+        now = None if feedback.velocity_m_s is None else _to_world(feedback.velocity_m_s, turn)
+        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # it has come nearer since
+            walls = [wall._replace(distance=wall.distance - age_s * max(0.0, _dot(now, wall.normal))) for wall in walls]
+        if isinstance(action, Velocity):
+            return *self._velocity(action, walls, turn, now, late_s), True
+        if isinstance(action, Attitude):
+            return *self._attitude(action, walls, turn, now or (0.0, 0.0, 0.0), late_s), True
+        return action, (), True
+
+    def _walls(self, at: Vec3) -> list[Wall]:
+        space = self.settings.space
+        walls = [] if space.box is None else list(space.box.walls_inside(at))
+        for zone in space.barriers:
+            wall = zone.wall_outside(at)
+            if wall.distance <= 0.0 and (side := self._sides.get(zone)) is not None:
+                normal, offset = side
+                wall = Wall(normal, offset - _dot(normal, at), wall.name)
+            walls.append(wall)
+        return walls
+
+    def _velocity(
+        self, action: Velocity, walls: list[Wall], turn: tuple[float, float], now: Vec3 | None, late_s: float
+    ) -> tuple[AnyAction, tuple[Clamp, ...]]:
+        asked = _to_world((action.forward, action.left, action.up), turn)
+        wanted, clamps = asked, dict[str, Clamp]()
+        beyond = [(_dot(asked, wall.normal), wall) for wall in walls if wall.distance < -MARGIN_M]
+        if beyond and any(asked) and (max(beyond)[0] > 0.0 or min(beyond)[0] >= 0.0):
+            name = beyond[0][1].name
+            clamps[name] = Clamp(name, math.hypot(*asked), 0.0)
+            wanted = (0.0, 0.0, 0.0)
+        for _ in range(_PASSES):
+            before = wanted
+            for wall in walls:
+                most = self.allowed_speed(wall.distance, late_s) + min(0.0, max(-RETURN_M_S, wall.distance))
+                if now is not None and (excess := _dot(now, wall.normal) - most) > 0.0:
+                    most -= min(1.0, BRAKE_GAIN / 4 * excess)
+                if _dot(asked, wall.normal) <= 0.0:
+                    most = max(0.0, most)  # who does not ask to go there is not pushed away
+                towards = _dot(wanted, wall.normal)
+                if towards > most + 1e-9:
+                    wanted = _add(wanted, wall.normal, most - towards)
+                    first = clamps.get(wall.name)
+                    clamps[wall.name] = Clamp(wall.name, towards if first is None else first.asked, most)
+            if math.dist(wanted, before) < 1e-6:
+                break
+        else:
+            wanted = (0.0, 0.0, 0.0)  # between walls that contradict one another
+        if not clamps:
+            return action, ()
+        forward, left = _to_body(wanted[0], wanted[1], turn)
+        return Velocity(forward, left, wanted[2], action.yaw_rate), tuple(clamps.values())
+
+    def _attitude(
+        self, action: Attitude, walls: list[Wall], turn: tuple[float, float], now: Vec3, late_s: float
+    ) -> tuple[AnyAction, tuple[Clamp, ...]]:
+        """Pitch forward accelerates forward, roll to the right to the right, both by g·tan."""
+        ahead, aside = GRAVITY_M_S2 * math.tan(action.pitch), -GRAVITY_M_S2 * math.tan(action.roll)
+        east, north, climb = _to_world((ahead, aside, action.climb), turn)
+        clamps: dict[str, Clamp] = {}
+        deceleration = self.settings.deceleration
+        unseen_s = late_s - self.settings.reaction_s  # for so long it may have become faster
+        gaining_s = unseen_s if unseen_s > _BLIND_S else 0.0
+        for wall in walls:
+            x, y, z = wall.normal
+            most = self.allowed_speed(wall.distance, late_s)
+            across = math.hypot(x, y)
+            if across > 0.3:
+                x, y = x / across, y / across
+                pull = x * east + y * north
+                outside = wall.distance < -MARGIN_M
+                excess = now[0] * x + now[1] * y + gaining_s * max(0.0, pull) - most
+                brake = -min(deceleration, max(deceleration / 2 if outside else 0.0, BRAKE_GAIN * excess))
+                if pull > brake and (excess >= 0.0 or outside):
+                    east, north = east + (brake - pull) * x, north + (brake - pull) * y
+                    clamps[wall.name] = Clamp(wall.name, pull, brake)
+            if abs(z) > 0.3 and climb * z > most:
+                clamps[wall.name] = Clamp(wall.name, climb * z, most)
+                climb = most / z
+        if not clamps:
+            return action, ()
+        ahead, aside = _to_body(east, north, turn)
+        pitch, roll = math.atan(ahead / GRAVITY_M_S2), -math.atan(aside / GRAVITY_M_S2)
+        return Attitude(roll, pitch, climb, action.yaw_rate), tuple(clamps.values())
+
+    def _place(self, action: Position, feedback: Feedback | None, now_ns: int, planned: bool) -> Verdict:
+        limits, space = self.settings.limits, self.settings.space
+        before, self._way = self._way, None
+        if action.problem:
+            return _out_of_range(action.problem)
+        unknown = _why_unknown(feedback, now_ns)
+        if unknown or feedback is None or feedback.position_m is None:
+            return Verdict(None, (), Refusal.WRONG_STATE, unknown)
+        if not self._young(feedback, now_ns):
+            self._way = before
+            return Verdict()
+        at, (x, y, z) = feedback.position_m, action.place
+        goes_on = before is not None and before[0] == action.place
+        ground = self._ground_below(feedback)
+        clamps: list[Clamp] = []
+        allowed = goes_on or planned
+        if problem := self._too_high(z, ground):
+            if not allowed or ground is None:
+                return _out_of_range(problem)
+            z = ground + limits.altitude
+            clamps.append(Clamp("limits.altitude", action.z, z))
+        place = (x, y, z)
+        checked = before == (action.place, space) and z == action.z
+        problem = space.problem_at(place) or ("" if checked else space.problem_between(at, place))
+        if problem := problem or ("" if allowed else _too_low(z, ground)):
+            return _out_of_range(problem)
+        self._way = action.place, space
+        speed, limit = _fastest(at, place, limits)
+        if (
+            not goes_on and action.speed is not None and action.speed > speed
+        ):  # once: the direction turns near the place
+            clamps.append(Clamp(limit, action.speed, speed))
+        if action.turn_rate is not None and action.turn_rate > limits.yaw_rate:
+            clamps.append(Clamp("limits.yaw_rate", action.turn_rate, limits.yaw_rate))
+        turn_rate = min(limits.yaw_rate, action.turn_rate or math.inf)
+        fitted = Position(x, y, z, action.yaw, min(speed, action.speed or math.inf), turn_rate)
+        return Verdict(fitted, tuple(clamps), enforced=True if space.walled else None)
+
+    def _hover(self, feedback: Feedback | None, now_ns: int) -> Verdict:
+        """Hover, or come down first from above ``limits.altitude``, as far as nothing is between."""
+        limits = self.settings.limits
+        altitude = None if feedback is None else feedback.altitude_m
+        above = 0.0 if altitude is None else altitude - limits.altitude
+        self._sinks = above > (SLACK_M if self._sinks else HOVER_SLACK_M)
+        if not self._sinks:
+            self._blocked = False
+            return Verdict(Hover())
+        up = -min(limits.climb, max(SINK_M_S, above * ALTITUDE_GAIN))
+        sink, walls, _, _, enforced = self.step(Velocity(up=up), feedback, now_ns)
+        assert isinstance(sink, Velocity)
+        self._blocked = bool(walls) and -sink.up < (2 * SINK_M_S if self._blocked else SINK_M_S)
+        clamps = (Clamp("limits.altitude", 0.0, up), *walls)
+        return Verdict(Hover() if self._blocked else sink, clamps, enforced=enforced)
+
+    def _takeoff(self, action: Takeoff, feedback: Feedback | None, now_ns: int) -> Verdict:
+        """Refuse to take off in a no-fly zone, or into one."""
+        if feedback is None or feedback.position_m is None or not self._young(feedback, now_ns):
+            return Verdict(action)
+        x, y, z = feedback.position_m
+        zones, at, top = Space(zones=self.settings.space.zones), (x, y, z + LIFTED_M), (x, y, z + TAKEOFF_M)
+        problem = zones.problem_at(at) or zones.problem_between(at, top)
+        return _out_of_range(f"it would take off into it: {problem}") if problem else Verdict(action)
+
+    def _ground_below(self, feedback: Feedback) -> float | None:
+        """How high the ground is below the vehicle, as it was for the most part lately [m]; None: not known."""
+        if feedback.altitude_m is None or not self._ground:
+            return None
+        return sorted(height for _, height in self._ground)[len(self._ground) // 2]
+
+    def ceiling(self, feedback: Feedback) -> float:
+        """Return how high it may fly here, world axes [m]; infinite where the ground is not known."""
+        ground = self._ground_below(feedback)
+        return math.inf if ground is None else ground + self.settings.limits.altitude
+
+    def _too_high(self, z: float, ground: float | None) -> str:
+        limit = self.settings.limits.altitude
+        if ground is None or z - ground - limit <= SLACK_M:
+            return ""
+        return (
+            f"z is {z:g} m, and at most {ground + limit:.2f} m is allowed: "
+            f"{limit:g} m above the ground (limits.altitude)"
+        )
+
+    def _age_s(self, feedback: Feedback, now_ns: int) -> float:
+        """How old the newest position is, which may have been reported again and again; it was observed."""
+        return max(0.0, seconds(now_ns - min(self._at_ns, feedback.captured_ns)))
+
+    def _young(self, feedback: Feedback, now_ns: int) -> bool:
+        """Whether a place can be flown to by the newest position: by its age, between walls also by the speed."""
+        if now_ns - feedback.captured_ns > STALE_NS:
+            return False
+        speed = _speed(feedback)
+        blind = self.settings.space.walled and speed > _AT_REST_M_S
+        return not blind or speed * self._age_s(feedback, now_ns) <= BLIND_M
+
+
+def _speed(feedback: Feedback) -> float:
+    """The speed that is reported [m/s]; 0 if none is."""
+    return 0.0 if feedback.velocity_m_s is None else math.hypot(*feedback.velocity_m_s)
+
+
+def _out_of_range(why: str) -> Verdict:
+    return Verdict(None, (), Refusal.OUT_OF_RANGE, why)
+
+
+def _too_low(z: float, ground: float | None) -> str:
+    if ground is None or ground - z <= SLACK_M:
+        return ""
+    return f"z is {z:g} m, which is {ground - z:.2f} m below the ground under the vehicle: choose a place above it"
+
+
+def _why_unknown(feedback: Feedback | None, now_ns: int) -> str:
+    """Why the vehicle can't be flown to a place now, and what helps; empty if it can."""
+    if feedback is None or feedback.position_m is None:
+        return f"{NO_POSITION}: fly it by velocity, or {POSITION_SOURCES}"
+    if feedback.yaw_rad is None:
+        return "the vehicle does not report its yaw: fly it by velocity"
+    age_ns = now_ns - feedback.captured_ns
+    if age_ns > LOST_NS:
+        return (
+            f"the vehicle's newest position is {seconds(age_ns):.1f} s old, at most {seconds(LOST_NS):g} s are allowed"
+        )
+    return ""
+
+
+def _fastest(at: Vec3, place: Vec3, limits: Limits) -> tuple[float, str]:
+    """The greatest speed along the straight way that keeps to those across and upwards, and which of them it is."""
+    across, up = math.dist(at[:2], place[:2]), abs(place[2] - at[2])
+    away = math.hypot(across, up)
+    if away < _NO_WAY_M:
+        return (limits.speed, "limits.speed") if limits.speed <= limits.climb else (limits.climb, "limits.climb")
+    by_speed = limits.speed * away / across if across > 0.0 else math.inf
+    by_climb = limits.climb * away / up if up > 0.0 else math.inf
+    return (by_speed, "limits.speed") if by_speed <= by_climb else (by_climb, "limits.climb")
+
+
+def _dot(a: Vec3, b: Vec3) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _add(a: Vec3, b: Vec3, share: float) -> Vec3:
+    return a[0] + share * b[0], a[1] + share * b[1], a[2] + share * b[2]
+
+
+def _to_world(body: Vec3, turn: tuple[float, float]) -> Vec3:
+    """Levelled body axes to world axes; ``turn`` holds cosine and sine of the yaw."""
+    c, s = turn
+    return c * body[0] - s * body[1], s * body[0] + c * body[1], body[2]
+
+
+def _to_body(east: float, north: float, turn: tuple[float, float]) -> tuple[float, float]:
+    c, s = turn
+    return c * east + s * north, c * north - s * east

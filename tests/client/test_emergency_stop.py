@@ -1,0 +1,221 @@
+"""An emergency stop of an application goes on until it shows, whatever else the application asks for."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from skyloop.client import command_schedule
+from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client.drone import Drone
+from skyloop.clock import NS_PER_S, ManualClock
+from skyloop.drivers.motor_stop import GIVE_UP_NS
+from skyloop.errors import RefusedError, UnsupportedError
+from skyloop.messages import (
+    ACTION_NAMES,
+    AnyAction,
+    Attitude,
+    Capabilities,
+    Command,
+    EmergencyStop,
+    Feedback,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+    decode,
+)
+from skyloop.transport.base import Peer
+from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
+
+STICKS = Velocity(0.5)
+
+
+@pytest.fixture
+def proxy() -> Iterator[ScriptedProxy]:
+    with scripted() as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
+    with flown(proxy) as drone:
+        yield drone
+
+
+class LossyProxy(ScriptedProxy):
+    """Loses the first packets with an emergency stop on their way to it."""
+
+    def __init__(self, lost: int) -> None:
+        super().__init__()
+        self.left = lost
+
+    def packet(self, peer: Peer, packet: bytes) -> None:
+        sample = decode(packet)
+        if self.left and isinstance(sample, Command) and isinstance(sample.action, EmergencyStop):
+            self.left -= 1
+            return
+        super().packet(peer, packet)
+
+
+def test_a_lost_packet_does_not_end_a_stop_while_sticks_are_held() -> None:
+    """The ordinary way to press it: the other hand still holds the sticks, whose set-points go on coming."""
+    proxy = LossyProxy(lost=3)
+    proxy.state = FlightState.FLYING
+    proxy.start()
+    released = threading.Event()
+    try:
+        with flown(proxy) as drone:
+            drone.velocity(forward=0.5)
+            proxy.until_commanded(STICKS)
+            assert drone.emergency_stop()
+
+            def hold() -> None:
+                while not released.wait(0.01):
+                    drone.velocity(forward=0.5)
+
+            hand = threading.Thread(target=hold)
+            hand.start()
+            proxy.until_commanded(EmergencyStop())
+            at = len(proxy.commands)
+            proxy.until(lambda: len(proxy.commands) >= at + 10)
+            assert proxy.left == 0
+            assert set(proxy.actions()[at:]) == {EmergencyStop()}, "until it shows nothing else is sent"
+            proxy.state = FlightState.EMERGENCY
+            drone.wait("emergency", WAIT_S)
+            released.set()
+            hand.join(WAIT_S)
+    finally:
+        released.set()
+        proxy.stop()
+
+
+def test_what_a_stop_keeps_back_is_told(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.state = FlightState.FLYING
+    assert drone.emergency_stop()
+    assert [drone.hover(), drone.idle(), drone.velocity(forward=0.1), drone.attitude(roll=0.1)] == [False] * 4
+    calls: list[Callable[[], None]] = [
+        drone.takeoff,
+        drone.land,
+        lambda: drone.go_to(x=0.0, y=0.0, z=1.0),
+        lambda: drone.land(wait=False),
+    ]
+    for once in calls:
+        with pytest.raises(RefusedError, match="emergency stop of this application has not shown") as error:
+            once()
+        assert error.value.code == "wrong_state"
+    assert drone.emergency_stop(), "another press is one more"
+    assert set(proxy.actions()) <= {EmergencyStop(), Idle()}
+    proxy.state = FlightState.EMERGENCY
+    drone.wait("emergency", WAIT_S)
+    proxy.until(lambda: not drone._core.commands.stopping)
+    assert drone.hover()
+
+
+def test_leaving_waits_for_the_stop_to_show() -> None:
+    """The last line of a program, and its packet is lost: the end of the connection must not end the stop."""
+    proxy = LossyProxy(lost=5)
+    proxy.state = FlightState.FLYING
+    proxy.start()
+    seen = threading.Event()
+
+    def show() -> None:
+        proxy.notifier.wait_for(lambda: EmergencyStop() in proxy.actions(), WAIT_S)
+        proxy.state = FlightState.EMERGENCY
+        seen.set()
+
+    vehicle = threading.Thread(target=show)
+    vehicle.start()
+    try:
+        with flown(proxy) as drone, drone:
+            drone.emergency_stop()
+        assert seen.wait(WAIT_S)
+        assert Land() not in proxy.actions(), "there is nothing to land"
+    finally:
+        vehicle.join(WAIT_S)
+        proxy.stop()
+
+
+def test_a_vehicle_that_can_not_stop_its_motors_is_no_reason_for_silence(proxy: ScriptedProxy) -> None:
+    known = frozenset(ACTION_NAMES.values()) - {"emergency_stop"}
+    proxy.capabilities = Capabilities("scripted", known)
+    with flown(proxy) as drone:
+        with pytest.raises(UnsupportedError, match="cannot stop its motors"):
+            drone.emergency_stop()
+        assert drone.hover()
+
+
+# Its schedule --------------------------------------------------------------------------------------------------------
+
+
+def feedback(state: FlightState) -> Feedback:
+    return Feedback(captured_ns=1, state=state)
+
+
+def test_nothing_may_be_asked_for_until_it_shows_and_then_everything() -> None:
+    clock, schedule = ManualClock(), CommandSchedule()
+    schedule.ask(EmergencyStop(), clock())
+    assert schedule.next(clock()) == EmergencyStop()
+    others: list[AnyAction] = [Idle(), Hover(), Land(), Takeoff(), STICKS, Attitude()]
+    assert not any(schedule.may_ask(action) for action in others)
+    assert schedule.may_ask(EmergencyStop())
+    clock.advance(1.0)
+    schedule.observe(feedback(FlightState.EMERGENCY), clock())
+    assert all(schedule.may_ask(action) for action in others)
+
+
+@pytest.mark.parametrize(("after_s", "then"), [(1.0, ResetEmergency()), (2.5, Idle())])
+def test_a_reset_is_sent_once_the_stop_has_shown_if_that_is_soon(after_s: float, then: AnyAction) -> None:
+    clock, schedule = ManualClock(), CommandSchedule()
+    schedule.ask(EmergencyStop(), clock())
+    assert schedule.next(clock()) == EmergencyStop()
+    schedule.ask(ResetEmergency(), clock())
+    assert schedule.stopping
+    clock.advance(after_s)
+    schedule.observe(feedback(FlightState.FLYING), clock())
+    assert schedule.next(clock()) == EmergencyStop()
+    schedule.observe(feedback(FlightState.EMERGENCY), clock())
+    clock.advance(0.05)
+    assert schedule.next(clock()) == then
+
+
+def test_it_is_given_up_when_the_driver_gives_it_up() -> None:
+    clock, schedule = ManualClock(), CommandSchedule()
+    schedule.ask(EmergencyStop(), clock())
+    begun_ns, sent = clock(), []
+    while clock() - begun_ns < 12 * NS_PER_S:
+        action = schedule.next(clock())
+        if isinstance(action, EmergencyStop):
+            sent.append(clock() - begun_ns)
+        schedule.observe(feedback(FlightState.FLYING), clock())
+        clock.advance(0.01)
+    assert 7.9 * NS_PER_S < sent[-1] <= 8.0 * NS_PER_S < GIVE_UP_NS - NS_PER_S, "its last repeat presses nothing anew"
+    assert not schedule.stopping
+    assert schedule.may_ask(Land())
+
+
+def test_one_that_could_not_be_sent_is_withdrawn_or_soon_over() -> None:
+    clock, schedule = ManualClock(), CommandSchedule()
+    schedule.ask(EmergencyStop(), clock())
+    assert schedule.may_ask(Idle()), "it was told as not sent"
+    assert not schedule.may_ask(Hover())
+    clock.advance(2.1)
+    assert schedule.next(clock()) == Idle()
+
+
+def test_what_is_not_shown_is_told(proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(command_schedule._AT_MOST_NS, EmergencyStop, 200_000_000)
+    proxy.state = FlightState.FLYING
+    told = threading.Event()
+    drone.on_event(lambda event: told.set() if event.data.get("reason") == "stop_given_up" else None)
+    begun_s = time.monotonic()
+    drone.emergency_stop()
+    assert told.wait(WAIT_S)
+    assert time.monotonic() - begun_s >= 0.2
+    assert drone.hover()

@@ -1,0 +1,191 @@
+"""The end of a proxy: everything is barred first, then what flies lands, hovers, and is no longer served."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EmergencyStop,
+    EventKind,
+    FlightState,
+    Hover,
+    Land,
+    Parameter,
+    ParameterType,
+    Refusal,
+    SetParameter,
+    Takeoff,
+    Velocity,
+)
+from skyloop.proxy.serve import end_all
+from skyloop.transport.testing import wait_until
+from tests.proxy.fake import App, Bench
+
+LONG_S = 30.0
+
+
+@contextmanager
+def ending(end: Callable[[], object]) -> Iterator[threading.Thread]:
+    """On a thread of its own; it must have ended afterwards."""
+    thread = threading.Thread(target=end)
+    thread.start()
+    yield thread
+    thread.join(LONG_S)
+    assert not thread.is_alive()
+
+
+def land_told(bench: Bench) -> None:
+    wait_until(lambda: Land() in bench.driver.told, "it is told to land")
+
+
+@pytest.mark.parametrize("action", [Takeoff(), Velocity(0.5), Hover()])
+def test_while_it_lands_nobody_flies_it(bench: Bench, action: AnyAction) -> None:
+    """Neither its pilot nor a new one, by whatever priority; landing and the emergency stop stay possible."""
+    pilot = bench.airborne()
+    with ending(lambda: bench.proxy.end(LONG_S)):
+        land_told(bench)
+        other = bench.pilot("other", priority=1)
+        other.command(action)
+        pilot.command(action)
+        assert other.refusals() == [Refusal.WRONG_STATE]
+        assert bench.driver.told == [Land()]
+        other.command(Land())
+        assert other.refusals() == [Refusal.WRONG_STATE]
+        bench.driver.report(state=FlightState.HOVERING)
+        other.command(Land())
+        other.command(EmergencyStop())
+        assert bench.driver.told == [Land(), Land(), EmergencyStop()]
+    assert bench.driver.closed
+
+
+def test_what_stands_is_not_taken_off_while_another_one_lands() -> None:
+    """Both end by one signal, as those of a simulated world do."""
+    with Bench() as flying, Bench() as standing:
+        flying.airborne()
+        pilot = standing.pilot()
+        ended = threading.Event()
+
+        def end() -> None:
+            end_all([flying.proxy, standing.proxy], LONG_S, reason="it is late", hurry=lambda: False)
+            ended.set()
+
+        with ending(end):
+            land_told(flying)
+            pilot.closed_by.get(timeout=LONG_S)
+            assert not ended.is_set()
+            flying.driver.report(state=FlightState.LANDED)
+        assert standing.driver.told == []
+        assert standing.driver.closed
+
+
+def test_a_take_off_that_was_just_asked_for_is_called_off(bench: Bench) -> None:
+    """The vehicle does not show it yet; where it rises all the same, it is landed."""
+    bench.driver.answers = False
+    pilot = bench.pilot()
+    pilot.command(Takeoff())
+    with ending(lambda: bench.proxy.end(LONG_S)) as thread:
+        wait_until(lambda: len(bench.driver.told) > 2, "it is told to land more than once")
+        assert thread.is_alive()
+        bench.driver.report(state=FlightState.TAKING_OFF)
+        bench.driver.told.clear()
+        land_told(bench)
+        bench.driver.report(state=FlightState.LANDED)
+        wait_until(lambda: not thread.is_alive(), "it has ended")
+    assert set(bench.driver.told) == {Land()}
+
+
+def test_a_take_off_that_is_called_off_and_never_shows_is_waited_for_a_moment(bench: Bench) -> None:
+    bench.driver.answers = False
+    bench.pilot().command(Takeoff())
+    with ending(lambda: bench.proxy.end(LONG_S)) as thread:
+        land_told(bench)
+        assert thread.is_alive()
+        bench.clock.advance(3.1)
+    assert set(bench.driver.told) == {Takeoff(), Land()}
+
+
+def test_what_has_not_landed_in_time_goes_on_to_land_or_hovers(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.answers = False
+    assert not bench.proxy.end(0.05, unless_flying=True)
+    pilot.command(Velocity(0.5))
+    assert pilot.refusals() == [Refusal.WRONG_STATE], "it is served, and lands"
+    assert not bench.proxy.end(0.05)
+    assert bench.driver.told[-1] == Hover(), "it never showed that it lands"
+    assert bench.driver.closed
+
+
+def test_a_second_signal_waits_no_longer(bench: Bench) -> None:
+    bench.airborne()
+    hurry = threading.Event()
+    with ending(lambda: bench.proxy.end(LONG_S, hurry=hurry.is_set)):
+        land_told(bench)
+        hurry.set()
+    assert bench.driver.told == [Land()], "a landing in progress goes on"
+
+
+def test_a_vehicle_that_does_not_hover_by_itself_is_landed_at_a_second_signal_too() -> None:
+    with Bench({"velocity"}) as bench:
+        bench.driver.answers = False
+        bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)
+        bench.pilot().command(Hover())
+        with ending(lambda: bench.proxy.end(LONG_S, hurry=lambda: True)) as thread:
+            bench.run(1.0, lambda: bench.driver.report())
+            assert bench.driver.told[-1] == Velocity(up=-0.4)
+            assert thread.is_alive()
+            bench.driver.report(altitude_m=0.0, state=FlightState.LANDED)
+            bench.run(0.1)
+
+
+@pytest.mark.parametrize("native", ["velocity", "attitude"])
+def test_a_vehicle_that_does_not_hover_by_itself_is_left_at_a_standstill(native: str) -> None:
+    with Bench({native}) as bench:
+        bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)
+        pilot = bench.pilot()
+        pilot.command(Hover())
+        bench.run(0.1, lambda: bench.driver.report())
+        pilot.command(Velocity(1.0))
+        bench.run(0.1, lambda: bench.driver.report())
+        bench.proxy.end()
+        assert bench.driver.told[-1] == (Velocity() if native == "velocity" else Attitude())
+
+
+def test_a_landing_in_software_goes_on_when_the_proxy_ends() -> None:
+    with Bench({"velocity"}) as bench:
+        bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)
+        bench.pilot().command(Land())
+        bench.run(0.1, lambda: bench.driver.report(state=FlightState.FLYING))
+        bench.proxy.end()
+        assert bench.driver.told[-1] == Velocity(up=-0.4)
+
+
+def test_nothing_is_flown_while_the_end_waits_for_a_slow_request() -> None:
+    """Nobody guards the flight any more by then."""
+    done = threading.Event()
+    with Bench(parameters=[Parameter("slow", ParameterType.FLOAT, 1.0)]) as bench:
+        pilot = bench.airborne()
+        bench.driver.while_setting = lambda: assert_set(done)
+        pilot.post(SetParameter("slow", 2.0, pilot.lease))
+        pilot.command(Velocity(1.0), sync=False)
+        wait_until(lambda: bench.driver.told == [Velocity(1.0)], "it flies")
+        with ending(bench.proxy.end):
+            wait_until(lambda: Hover() in bench.driver.told, "it hovers")
+            for action in (Velocity(1.0), Takeoff(), Hover()):
+                pilot.command(action, sync=False)
+            wait_until(lambda: len(refused(pilot)) == 1, "they are refused")
+            assert bench.driver.told == [Velocity(1.0), Hover()]
+            done.set()
+
+
+def assert_set(event: threading.Event) -> None:
+    assert event.wait(LONG_S)
+
+
+def refused(app: App) -> list[object]:
+    return [event.data["reason"] for event in app.events if event.kind is EventKind.COMMAND_REFUSED]

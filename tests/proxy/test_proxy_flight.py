@@ -1,0 +1,214 @@
+"""Whether a vehicle flies that is steered in software: what shows it, and what is done until it does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from skyloop.clock import slept_ns
+from skyloop.messages import (
+    Attitude,
+    EventKind,
+    Failsafe,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    LinkState,
+    Refusal,
+    Takeoff,
+    Velocity,
+)
+from tests.proxy.fake import App, Bench
+
+VELOCITY = {"idle", "velocity", "emergency_stop", "reset_emergency"}
+ATTITUDE = {"idle", "attitude", "emergency_stop", "reset_emergency"}
+
+
+class Lift:
+    """A vehicle that does what it is told at 50 Hz, and says so unless it is out of reach. It knows no take-off."""
+
+    def __init__(self, actions: set[str], *, says: bool) -> None:
+        self.bench = Bench(actions)
+        self.says = says  #: whether it reports to fly or to stand
+        self.height = 0.0
+        self.heard = True
+        self.bench.driver.answers = False
+
+    @property
+    def climb(self) -> float:
+        told = self.bench.driver.told[-1] if self.bench.driver.told else None
+        return told.up if isinstance(told, Velocity) else told.climb if isinstance(told, Attitude) else 0.0
+
+    def fly(self) -> None:
+        if self.heard:  # else it stays where it is
+            self.height = max(0.0, self.height + self.climb * 0.02)
+            self.report()
+
+    def report(self) -> None:
+        state = FlightState.FLYING if self.height > 0.0 else FlightState.LANDED
+        self.bench.driver.report(altitude_m=self.height, state=state if self.says else FlightState.UNKNOWN)
+
+    def run(self, seconds: float, pilot: App | None = None) -> None:
+        def step() -> None:
+            self.fly()
+            if pilot is not None:
+                pilot.command(Idle())
+
+        self.bench.run(seconds, step)
+
+    def hear(self, heard: bool) -> None:
+        self.heard = heard
+        self.bench.driver.link(LinkState.UP if heard else LinkState.LOST)
+
+    @property
+    def told(self) -> str:
+        feedback = self.bench.proxy.publisher.feedback_now
+        assert feedback is not None
+        return feedback.state.value
+
+    def hovering(self) -> App:
+        self.report()
+        pilot = self.bench.pilot()
+        pilot.command(Takeoff())
+        self.run(4.0, pilot)
+        assert self.told == FlightState.HOVERING
+        return pilot
+
+
+@pytest.fixture(params=[(VELOCITY, False), (ATTITUDE, False), (VELOCITY, True)], ids=["velocity", "attitude", "says"])
+def lift(request: pytest.FixtureRequest) -> Iterator[Lift]:
+    actions, says = request.param
+    lift = Lift(actions, says=says)
+    with lift.bench:
+        yield lift
+
+
+def test_a_landing_lasts_while_the_vehicle_is_out_of_reach(lift: Lift) -> None:
+    """Its pilot is gone, and so is the link: it hangs where it is, and the ladder lands it when it is heard again."""
+    lift.hovering().end.close()
+    lift.hear(False)
+    lift.run(30.0)
+    assert (lift.told, lift.bench.proxy.handler.ladder.step) == (FlightState.LANDING, Failsafe.LAND)
+    assert lift.bench.proxy.handler.airborne, "the end of the proxy has something to land"
+    assert lift.height > 0.8
+    lift.hear(True)
+    lift.run(5.0)
+    assert lift.height == 0.0
+    assert lift.told == FlightState.LANDED
+    lift.run(1.2)
+    assert not lift.bench.proxy.handler.airborne
+
+
+def test_a_gap_in_the_feedback_late_in_a_long_landing_does_not_end_it(lift: Lift) -> None:
+    pilot = lift.hovering()
+    lift.height = 8.0
+    lift.report()
+    pilot.command(Land())
+    lift.run(15.5, pilot)
+    assert lift.told == FlightState.LANDING
+    lift.heard = False
+    lift.run(0.7, pilot)
+    assert lift.told == FlightState.LANDING
+    lift.heard = True
+    lift.run(8.0, pilot)
+    assert (lift.told, lift.height) == (FlightState.LANDED, 0.0)
+
+
+def test_what_others_landed_stands_and_is_not_taken_off_by_itself() -> None:
+    """A pilot takes the sticks, lands and disarms; later on somebody asks for a take-off, and gives the sticks away."""
+    lift = Lift(ATTITUDE, says=True)
+    driver = lift.bench.driver
+    with lift.bench:
+        pilot = lift.hovering()
+        driver.left = "RECEIVER"
+        driver.refuses = "arm it by the pilot's receiver"
+        lift.run(0.2, pilot)
+        assert lift.bench.proxy.handler.flight.others
+        lift.height = 0.0
+        driver.told.clear()
+        lift.run(2.0, pilot)  # its driver says that it stands, as it flies past it
+        assert lift.told == FlightState.FLYING
+        driver.left = ""
+        lift.run(2.0, pilot)
+        assert lift.told == FlightState.LANDED
+        pilot.command(Takeoff())
+        assert pilot.refusals()[-1] == Refusal.WRONG_STATE
+        assert "arm it by" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
+        lift.run(1.0, pilot)
+        assert driver.told == [], "nothing is steered, so nothing spools up"
+
+
+def test_a_drifting_altimeter_makes_no_flight_of_a_vehicle_that_reports_to_stand() -> None:
+    lift = Lift(ATTITUDE, says=True)
+    with lift.bench as bench:
+        bench.driver.report(altitude_m=0.6, state=FlightState.LANDED)
+        bench.run(2.0, lambda: bench.driver.report())
+        assert lift.told == FlightState.LANDED
+
+
+def test_a_vehicle_that_reports_to_fly_flies(lift: Lift) -> None:
+    """Also one that lands itself in nobody's mind: its driver's word is believed, and a hover is no take-off."""
+    lift.report()
+    pilot = lift.bench.pilot()
+    lift.bench.driver.report(altitude_m=0.0, state=FlightState.FLYING)
+    lift.bench.tick()
+    assert lift.told == FlightState.FLYING
+    pilot.command(Hover())
+    lift.bench.tick()
+    assert lift.climb == 0.0
+
+
+# A computer that slept -------------------------------------------------------------------------------------------
+
+
+def sleep(bench: Bench, seconds: float) -> None:
+    bench.slept_ns += round(seconds * 1e9)
+
+
+def test_what_was_asked_for_before_the_computer_slept_is_not_done_afterwards(bench: Bench) -> None:
+    """The program slept with it, and repeats its velocity as the first thing of all."""
+    pilot = bench.airborne()
+    pilot.command(Velocity(1.0))
+    sleep(bench, 1.0)
+    pilot.command(Velocity(1.0), repeat=True)
+    assert pilot.refusals() == [Refusal.NOT_FRESH]
+    assert bench.driver.told == [Velocity(1.0), Hover()]
+    pilot.command(Velocity(0.5))
+    assert bench.driver.told[-1] == Velocity(0.5)
+    assert "slept for 1.0 s" in bench.published(EventKind.VEHICLE_MESSAGE)[-1].text
+
+
+def test_a_command_that_waited_while_the_computer_slept_is_as_old_as_it_is(bench: Bench) -> None:
+    """It was received only now, and never before."""
+    pilot = bench.airborne()
+    sent_ns = bench.clock()
+    sleep(bench, 600.0)
+    bench.clock.advance(0.02)
+    bench.tick()
+    pilot.take_authority()
+    pilot.command(Velocity(1.0), sent_ns=sent_ns)
+    assert pilot.refusals() == [Refusal.STALE]
+    assert "it is 600.0" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
+
+
+def test_silence_counts_while_the_computer_sleeps(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(1.0))
+    sleep(bench, 6.0)
+    bench.run(0.02)
+    assert bench.driver.told[-1] == Land()
+    assert bench.proxy.handler.authority.holder is None
+
+
+def test_what_flies_after_a_long_sleep_may_be_somebody_elses(bench: Bench) -> None:
+    bench.airborne()
+    sleep(bench, 3600.0)
+    bench.run(6.0)
+    assert bench.driver.told == []
+    assert bench.proxy.handler.flight.others
+
+
+def test_the_computers_own_sleep_is_known_where_it_says_so() -> None:
+    assert -(10**9) < slept_ns() < 10 * 365 * 24 * 3600 * 10**9
