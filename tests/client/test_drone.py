@@ -162,7 +162,7 @@ def test_in_a_fork_a_drone_neither_lands_nor_releases_what_its_parent_flies(prox
         asked, commanded = list(proxy.requests), proxy.actions()
         with pytest.raises(ClosedError, match=r"belongs to process \d+, of which this one is a fork: connect here"):
             drone.velocity(forward=1.0)
-        drone._core.leave()
+        drone._core.end_flight()
         drone.close()
         assert proxy.requests == asked
         assert Land() not in proxy.actions()[len(commanded) :]

@@ -279,14 +279,14 @@ def test_a_safety_pilot_keeps_the_vehicle_whatever_becomes_of_the_program(
 
         def seen() -> bool:
             drone.velocity(forward=0.3)
-            return proxy.handler.ownership.others != ""
+            return proxy.handler.flight.others != ""
 
         wait_until(seen, "it is seen")
         end(drone)
         scene.watched(proxy, 100)
         assert scene.ours == []
         assert "RTL" in scene.mode or not scene.armed
-        assert proxy.handler.ownership.whose is not Whose.OURS
+        assert proxy.handler.flight.whose is not Whose.OURS
         drone.close()
 
 
@@ -311,7 +311,7 @@ def test_a_safety_pilot_keeps_the_vehicle_on_a_route(kind: Kind, note: Path) -> 
             assert flight.law.state is RouteState.PAUSED
             scene.watched(proxy, 100)
             assert scene.ours == []
-            assert proxy.handler.ownership.whose is not Whose.OURS
+            assert proxy.handler.flight.whose is not Whose.OURS
 
 
 @KINDS

@@ -125,7 +125,7 @@ class Behaviour(Controller):
             self.emit(text, Severity.WARNING if problem else Severity.INFO)
         try:
             if problem:
-                self.drone.hover()
+                self.drone._core.let_go(problem)
             else:
                 self.steer(wanted)
         except AuthorityError:
