@@ -9,8 +9,12 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.messages import Applied, Velocity
+from skyloop.cli.flight import Flight
+from skyloop.client import Drone
+from skyloop.control import Controller
+from skyloop.messages import Applied, Feedback, FlightState, Hover, Velocity
 from tests.cli.conftest import Run
+from tests.client.scripted import WAIT_S, background, flown, scripted
 from tests.processes.conftest import Process
 
 MINE = """
@@ -70,6 +74,76 @@ def speeds(seen: list[Applied]) -> list[float | str]:
     """What the pilot wanted, in order: the speed to the left, or the name of another action."""
     wanted = [one.asked for one in list(seen)]
     return [action.left if isinstance(action, Velocity) else type(action).__name__ for action in wanted]
+
+
+class Loaded:
+    """Stands for a reloader: what was loaded, in turn."""
+
+    age_s = 0.0
+
+    def __init__(self) -> None:
+        self.found: list[type[Controller]] = []
+
+    @property
+    def waiting(self) -> bool:
+        return bool(self.found)
+
+    def take(self) -> type[Controller]:
+        return self.found.pop(0)
+
+
+class Listening(Controller):
+    """Commands from a callback that it registered itself."""
+
+    speed = 0.1
+
+    def __init__(self, drone: Drone) -> None:
+        super().__init__(drone)
+        drone.on_feedback(lambda _: drone.velocity(forward=self.speed))
+
+
+class Second(Listening):
+    speed = 0.2
+
+
+class Broken(Listening):
+    speed = 0.3
+
+    def on_reload(self, before: Controller) -> None:
+        raise RuntimeError("not ready")
+
+
+class Failing(Listening):
+    speed = 0.4
+
+    def on_feedback(self, feedback: Feedback) -> None:
+        raise RuntimeError("in on_feedback")
+
+
+def test_the_callbacks_of_a_controller_that_was_replaced_or_failed_command_no_more() -> None:
+    with scripted() as proxy, flown(proxy) as drone:
+        proxy.state = FlightState.FLYING
+        drone.wait("flying", WAIT_S)
+        loaded, said = Loaded(), list[str]()
+        flight = Flight(drone, Listening(drone), said.append)
+        flying = background(lambda: flight.run_reloading(None, loaded, lambda found: found(drone)))  # type: ignore[arg-type]
+
+        def load(found: type[Controller], told: str, speed: float | None) -> None:
+            """After the change is told, so many commands are all of this speed."""
+            loaded.found.append(found)
+            proxy.until(lambda: any(told in line for line in said), told)
+            count = len(proxy.commands)
+            action = Hover() if speed is None else Velocity(speed)
+            proxy.until(lambda: proxy.actions()[count:].count(action) > 12, f"{action} is repeated")
+            after = proxy.actions()[count:]
+            assert set(after[after.index(action) :]) == {action}
+
+        load(Second, "reloaded Second", 0.2)
+        load(Broken, "the one before keeps flying", 0.2)
+        load(Failing, "the controller failed: hovering", None)
+        load(Listening, "reloaded Listening", 0.1)
+        drone.close()
+        flying.join(WAIT_S)
 
 
 @pytest.mark.process

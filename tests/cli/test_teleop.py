@@ -8,6 +8,7 @@ import select
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,39 +18,173 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import skyloop
-from skyloop.cli.keyboard import HOLD_S, KEY_MAP, ORDERS, STICKS, TWICE_S, Deflection, Sticks, split_keys
+from skyloop.cli.keyboard import (
+    HOLD_S,
+    KEY_MAP,
+    ORDERS,
+    STICKS,
+    TWICE_S,
+    Deflection,
+    Hands,
+    Keyboard,
+    Order,
+    Tokenizer,
+)
+from skyloop.cli.teleop import Teleop
+from skyloop.messages import EmergencyStop, FlightState, Hover, Land, Velocity
 from tests.cli.conftest import Run
+from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
 from tests.processes.conftest import Process
+
+FLYING, LANDED, LANDING = FlightState.FLYING, FlightState.LANDED, FlightState.LANDING
+FORWARD = Deflection(forward=1)
+
+
+class Fingers:
+    """Hands, and the time: each call is a step."""
+
+    def __init__(self) -> None:
+        self.hands = Hands()
+        self.now_s = 100.0
+
+    def press(self, *keys: str, after_s: float = 0.05, state: FlightState = FLYING) -> list[Order | Deflection]:
+        self.now_s += after_s
+        return self.hands.step(keys, self.now_s, state)
+
+    def wait(self, seconds: float, state: FlightState = FLYING) -> list[Order | Deflection]:
+        """Step as often as the loop does, without a key."""
+        wanted: list[Order | Deflection] = []
+        for _ in range(round(seconds / 0.05)):
+            wanted += self.press(state=state)
+        return wanted
+
+    def hold(self, key: str, seconds: float, every_s: float = 0.03) -> list[Order | Deflection]:
+        """A key that is down: a press, nothing for half a second, then repeats."""
+        wanted = self.press(key) + self.wait(0.5)
+        for _ in range(round(seconds / every_s)):
+            wanted += self.press(key, after_s=every_s)
+        return wanted
 
 
 def test_a_press_moves_its_stick_for_a_while_and_repeats_keep_it() -> None:
-    sticks = Sticks()
-    assert sticks.press("w", 1.0) is None
-    assert sticks.press("left", 1.2) is None
-    assert sticks.deflection(1.0 + HOLD_S - 0.01) == Deflection(forward=1, yaw_rate=1)
-    assert sticks.deflection(1.0 + HOLD_S) == Deflection(yaw_rate=1)
-    sticks.press("s", 2.0)
-    sticks.press("w", 2.1)
-    assert sticks.deflection(2.2) == Deflection(forward=1), "the newest press of an axis counts"
-    assert sticks.deflection(9.0) == Deflection()
+    fingers = Fingers()
+    assert fingers.press("w") == [FORWARD]
+    assert fingers.press("left", after_s=0.2) == [Deflection(forward=1, yaw_rate=1)]
+    assert fingers.press(after_s=HOLD_S - 0.21) == [Deflection(forward=1, yaw_rate=1)]
+    assert fingers.press(after_s=0.02) == [Deflection(yaw_rate=1)]
+    assert fingers.press(after_s=HOLD_S) == ["centre"]
+    assert fingers.press() == []
+    fingers.press("s")
+    assert fingers.press("w") == [FORWARD], "the newest press of an axis counts"
+    assert fingers.press("W", "x", "[") == [FORWARD]
 
 
-@pytest.mark.parametrize("key", ["h", "H", " ", "t", "l", "esc"])
+def test_sticks_do_nothing_on_the_ground_and_what_was_not_moved_is_not_let_go() -> None:
+    fingers = Fingers()
+    assert fingers.press("w", state=LANDED) == ["grounded"]
+    assert fingers.press(after_s=1.0, state=LANDED) == []
+
+
+@pytest.mark.parametrize("key", ["h", "H", " ", "t", "l", "esc", "alt"])
 def test_an_order_to_stop_lets_all_sticks_go(key: str) -> None:
-    sticks = Sticks()
-    sticks.press("w", 1.0)
-    sticks.press(key, 1.1)
-    assert sticks.deflection(1.1) == Deflection()
+    fingers = Fingers()
+    fingers.press("w")
+    (order,) = fingers.press(key)
+    assert order == {"t": "takeoff", "l": "land"}.get(key, "hover")
+    assert fingers.wait(1.0) == [], "nor is a hover sent after it, which would end a landing"
 
 
-def test_esc_hovers_and_twice_stops_the_motors() -> None:
-    sticks = Sticks()
-    assert sticks.press("esc", 5.0) == "hover"
-    assert sticks.press("esc", 5.0 + TWICE_S) == "stop"
-    assert Sticks().press("esc", 0.0) == "hover"
-    late = Sticks()
-    late.press("esc", 5.0)
-    assert late.press("esc", 5.1 + TWICE_S) == "hover"
+def test_a_landing_is_not_ended_by_a_stick_that_was_held_or_is_still() -> None:
+    """L during, or soon after, a stick key: the vehicle shows only after a while that it lands."""
+    fingers = Fingers()
+    fingers.hold("w", 0.3)
+    assert fingers.press("l") == ["land"]
+    for _ in range(40):
+        assert fingers.press("w") == [], "held, while the vehicle still seems to fly"
+    for _ in range(100):
+        assert fingers.press("w", state=LANDING) == []
+    assert fingers.press("w") == [], "still held, as somebody has ended the landing"
+    assert fingers.wait(1.0) == []
+    assert fingers.press("w") == [FORWARD], "pressed anew"
+
+
+def test_h_ends_a_landing_and_gives_the_sticks_back() -> None:
+    fingers = Fingers()
+    fingers.press("l")
+    assert fingers.press("h", state=LANDING) == ["hover"]
+    assert fingers.press("w") == [FORWARD]
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 0.03, 0.1, 0.15, 0.19, 0.3, 0.6, TWICE_S - 0.01])
+def test_esc_hovers_and_twice_stops_the_motors(gap_s: float) -> None:
+    fingers = Fingers()
+    assert fingers.press("esc") == ["hover"]
+    stopped = fingers.press("esc", after_s=gap_s)
+    assert stopped + fingers.wait(0.2) == ["stop"]
+    assert fingers.wait(2.0) == []
+
+
+def test_two_presses_of_esc_in_one_read_stop_the_motors() -> None:
+    fingers = Fingers()
+    assert fingers.press("esc", "esc") + fingers.wait(0.2) == ["hover", "stop"]
+    assert Fingers().press("esc", "esc", "l") == ["hover", "stop"], "another key shows that none is held"
+
+
+def test_a_late_second_press_is_a_first_one() -> None:
+    fingers = Fingers()
+    fingers.press("esc")
+    assert fingers.press("esc", after_s=TWICE_S + 0.01) == ["hover"]
+
+
+@pytest.mark.parametrize("every_s", [0.015, 0.03, 0.05, 0.092])
+def test_esc_that_is_held_stops_no_motors(every_s: float) -> None:
+    fingers = Fingers()
+    assert fingers.hold("esc", 3.0, every_s) == ["hover", "held"]
+    assert fingers.wait(0.5) == []
+    assert fingers.press("esc") == ["hover"], "which was one press, however long"
+    assert fingers.press("esc", after_s=0.15) == ["stop"], "pressed on purpose after it"
+
+
+def test_repeats_that_were_held_up_stop_no_motors() -> None:
+    """The program, or the network to it, stood still for a moment while Esc was held."""
+    fingers = Fingers()
+    fingers.press("esc")
+    fingers.press("esc", after_s=0.5)
+    assert fingers.press(*["esc"] * 9, after_s=0.4) + fingers.wait(0.5) == ["held"]
+    assert Fingers().press(*["esc"] * 9) == ["hover", "held"]
+
+
+@pytest.mark.parametrize("between", ["w", "alt", "h", "up", "x"])
+def test_esc_with_another_key_between_is_no_second_press(between: str) -> None:
+    fingers = Fingers()
+    fingers.press("esc")
+    fingers.press(between, after_s=0.3)
+    wanted = fingers.press("esc", after_s=0.3) + fingers.wait(0.5)
+    assert "stop" not in wanted
+    assert "hover" in wanted
+
+
+def test_nothing_takes_the_place_of_a_stop_that_is_not_shown_yet() -> None:
+    fingers = Fingers()
+    fingers.press("esc", "esc")
+    assert fingers.press("l", "w", "h", "t") == ["stop"]
+    assert fingers.press("l", "w", "h", "t") == []
+    assert fingers.press("esc") == ["stop"], "once more"
+    assert fingers.press("c", "q") == ["quit"]
+    assert fingers.press("t", state=FlightState.EMERGENCY) == ["takeoff"]
+
+
+@given(st.lists(st.tuples(st.sampled_from(["esc", "alt", *STICKS, *ORDERS]), st.floats(0.0, 2.0)), max_size=40))
+def test_motors_are_cut_only_by_two_presses_of_esc(presses: list[tuple[str, float]]) -> None:
+    fingers = Fingers()
+    stopped = False
+    for number, (key, after_s) in enumerate(presses):
+        wanted = fingers.press(key, after_s=after_s)
+        before = [name for name, _ in presses[max(0, number - 2) : number + 1]]
+        assert "stop" not in wanted or before.count("esc") >= 2 or stopped
+        stopped = stopped or "stop" in wanted
+        assert sum(isinstance(one, Deflection) for one in wanted) <= 1
+    assert "centre" in fingers.wait(1.0) or not any(fingers.wait(1.0))
 
 
 def test_each_key_that_is_told_does_something() -> None:
@@ -58,21 +193,125 @@ def test_each_key_that_is_told_does_something() -> None:
     assert keys == {*STICKS, *ORDERS, "esc"}
 
 
-def test_arrows_are_told_from_esc() -> None:
-    assert split_keys(b"w\x1b[A\x1bOB\x1b[C\x1b[Dt") == (["w", "up", "down", "right", "left", "t"], b"")
-    assert split_keys(b"\x1b") == ([], b"\x1b")
-    assert split_keys(b"\x1b[") == ([], b"\x1b[")
-    assert split_keys(b"\x1b\x1b") == (["esc"], b"\x1b")
-    assert split_keys(b"\x1bx") == (["esc", "x"], b"")
+@pytest.mark.parametrize(
+    ("data", "keys", "flushed"),
+    [
+        (b"w\x1b[A\x1bOB\x1b[C\x1b[Dt", ["w", "up", "down", "right", "left", "t"], None),
+        (b"\x1b", [], ["esc"]),
+        (b"\x1b\x1b", [], ["esc", "esc"]),
+        (b"\x1b[", [], ["alt"]),
+        (b"\x1bO", [], ["alt"]),
+        (b"\x1bw", ["alt"], None),
+        (b"\x1bw\x1bw\x1bw", ["alt", "alt", "alt"], None),
+        (b"\x1b\x1bx", ["esc", "alt"], None),
+        (b"\x1b\x1b[A", ["alt"], None),
+        (b"\x1b[1;5A\x1b[1;2D", [], None),
+        (b"\x1b[3~l\x1b[15~\x1bOP", ["l"], None),
+        (b"\x1b[1;5", [], ["alt"]),
+        (b"\x1b[\x1b", ["alt"], ["esc"]),
+        (b"\x13\x1a", ["\x13", "\x1a"], None),
+        (b"\x1b[" + b"1" * 60, None, None),
+    ],
+)
+def test_sequences_are_told_from_esc_and_from_letters(
+    data: bytes, keys: list[str] | None, flushed: list[str] | None
+) -> None:
+    """Ctrl with an arrow ends in a letter, and Alt with a letter begins with an Esc: neither is a press of either."""
+    tokens = Tokenizer()
+    found = tokens.feed(data)
+    if keys is not None:
+        assert found == keys
+    assert tokens.waits is (flushed is not None)
+    if flushed is not None:
+        assert tokens.flush() == flushed
+    assert not tokens.waits
+    assert "esc" not in found or b"\x1b\x1b" in data
 
 
-@given(st.binary(max_size=60))
-def test_whatever_a_terminal_sends_is_keys(data: bytes) -> None:
-    keys, rest = split_keys(data)
-    assert len(rest) <= 2
-    assert all(keys)
-    for at, key in enumerate(keys):
-        Sticks().press(key, float(at))
+def test_an_arrow_that_comes_slowly_is_an_arrow() -> None:
+    tokens = Tokenizer()
+    assert tokens.feed(b"\x1b") == []
+    assert tokens.feed(b"[") == []
+    assert tokens.feed(b"D") == ["left"]
+    tokens.feed(b"\x1b")
+    assert tokens.flush() == ["esc"]
+    assert tokens.feed(b"[Aw") == ["w"], "an arrow, and no letters"
+
+
+@given(st.lists(st.binary(max_size=60), max_size=5))
+def test_whatever_a_terminal_sends_is_keys(parts: list[bytes]) -> None:
+    tokens, hands = Tokenizer(), Hands()
+    for at, data in enumerate(parts):
+        keys = tokens.feed(data) + (tokens.flush() if tokens.waits else [])
+        assert all(keys)
+        hands.step(keys, float(at), FLYING)
+
+
+@pytest.fixture
+def line(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
+    """A terminal: the end of the person, and the one that is standard input."""
+    person, program = pty.openpty()
+    with os.fdopen(program, "rb", buffering=0) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        yield person, program
+    os.close(person)
+
+
+def test_ctrl_z_and_ctrl_s_are_keys_and_what_a_shell_makes_of_the_terminal_is_undone(line: tuple[int, int]) -> None:
+    person, program = line
+    before = termios.tcgetattr(program)
+    with Keyboard() as keyboard:
+        ours = termios.tcgetattr(program)
+        os.write(person, b"\x13\x1aw\x1b[A")
+        assert keyboard.keys(WAIT_S) == ["\x13", "\x1a", "w", "up"]
+        termios.tcsetattr(program, termios.TCSANOW, before)  # as a shell does before it continues a job
+        signal.raise_signal(signal.SIGCONT)
+        assert termios.tcgetattr(program) == ours
+        os.write(person, b"\x1b")
+        assert keyboard.keys(WAIT_S) == []
+        assert keyboard.keys(WAIT_S) == ["esc"]
+        assert keyboard.keys(0.0) == []
+    assert termios.tcgetattr(program) == before
+    assert signal.getsignal(signal.SIGCONT) is signal.SIG_DFL
+
+
+@pytest.fixture
+def proxy() -> Iterator[ScriptedProxy]:
+    with scripted() as proxy:
+        proxy.state = FLYING
+        yield proxy
+
+
+def test_what_the_hands_ask_for_is_flown(proxy: ScriptedProxy) -> None:
+    with flown(proxy) as drone:
+        drone.wait("flying", WAIT_S)
+        pilot = Teleop(drone, 0.5, 0.8)
+        pilot.obey("slower")
+        pilot.obey(Deflection(forward=1, yaw_rate=-1))
+        assert not proxy.until_commanded(Velocity(0.25, 0.0, 0.0, -0.4)).automatic
+        pilot.obey("centre")
+        assert proxy.until_commanded(Hover()).automatic, "nobody pressed a key for it"
+        count = len(proxy.commands)
+        pilot.obey("hover")
+        assert not proxy.until_commanded(Hover(), count + 1).automatic
+        pilot.obey(FORWARD)
+        pilot.obey("land")
+        pilot.obey("centre")
+        assert drone._core.commands.newest == Land()
+        pilot.obey("takeoff")
+        pilot.obey("stop")
+        proxy.until_commanded(EmergencyStop())
+        proxy.take_over("boss")
+        drone.wait(lambda _: drone.authority.state == "preempted", WAIT_S)
+        for order, told in (
+            (FORWARD, "boss took over the authority; it comes back when they give it back (C takes control)"),
+            ("grounded", "T takes off"),
+            ("held", "press it twice"),
+            ("release", "release"),
+        ):
+            pilot.obey(order)  # type: ignore[arg-type]
+            assert told in pilot._message
+        assert pilot.picture()
 
 
 def test_without_a_terminal_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,3 +405,30 @@ def test_esc_twice_cuts_the_motors_and_ctrl_c_ends(terminal: Terminal) -> None:
     with skyloop.connect("alpha") as pilot:
         pilot.reset_emergency()
         pilot.wait("landed", timeout_s=30.0)
+
+
+@pytest.mark.process
+def test_l_lands_while_a_stick_key_is_held_and_esc_that_is_held_cuts_nothing(terminal: Terminal) -> None:
+    """The stick's hover came after the landing, which autopilots break off for it."""
+    terminal.until("take off")
+    with skyloop.connect("alpha", access="observe") as drone:
+        terminal.press(b"t")
+        drone.wait("hovering", timeout_s=30.0)
+        for _ in range(6):
+            terminal.press(b"w")
+            time.sleep(0.05)
+        terminal.press(b"\x1b")
+        for _ in range(8):
+            terminal.press(b"\x1b")
+            time.sleep(0.03)
+        terminal.until("Esc is held")
+        for _ in range(4):
+            terminal.press(b"\x1bw")
+            time.sleep(0.03)
+        assert drone.feedback().state.airborne
+        terminal.press(b"w")
+        drone.wait("flying", timeout_s=10.0)
+        terminal.press(b"l")
+        drone.wait("landed", timeout_s=30.0)
+        terminal.press(b"q")
+        assert terminal.wait() == 0

@@ -320,7 +320,7 @@ def interrupt(_: Feedback) -> bool:
 @pytest.mark.parametrize(
     ("action", "state", "instead"),
     [
-        (Takeoff(), FlightState.LANDED, Idle()),
+        (Takeoff(), FlightState.LANDED, Land()),
         (Takeoff(), FlightState.TAKING_OFF, Hover()),
         (Position(1.0, 2.0, 1.5), FlightState.FLYING, Hover()),
         (Land(), FlightState.LANDING, Land()),

@@ -162,7 +162,7 @@ def test_in_a_fork_a_drone_neither_lands_nor_releases_what_its_parent_flies(prox
         asked, commanded = list(proxy.requests), proxy.actions()
         with pytest.raises(ClosedError, match=r"belongs to process \d+, of which this one is a fork: connect here"):
             drone.velocity(forward=1.0)
-        drone._core.leave()
+        drone._core.end_flight()
         drone.close()
         assert proxy.requests == asked
         assert Land() not in proxy.actions()[len(commanded) :]
@@ -465,7 +465,7 @@ def test_the_end_of_the_block_hovers_if_asked_to(proxy: ScriptedProxy) -> None:
 def test_an_error_in_the_block_comes_out_and_a_landing_that_fails_is_logged(
     proxy: ScriptedProxy, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_landing(*_: object) -> bool:
+    def no_landing(*_: object, **__: object) -> bool:
         raise NoAnswerError("it did not land")
 
     with flown(proxy) as drone:

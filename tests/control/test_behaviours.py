@@ -189,6 +189,7 @@ def test_pictures_that_stop_make_it_hover_and_say_so() -> None:
 
 def test_a_landing_goes_on_after_a_link_that_was_down_for_a_moment() -> None:
     with scripted() as proxy, flown(proxy) as drone:
+        proxy.state = FlightState.FLYING
         landing = LandOnMarker(drone)
         landing._landing_law.phase = LandingPhase.DOWN
         proxy.stop()

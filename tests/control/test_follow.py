@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
-from typing import Any
+from typing import Any, Self
 from unittest.mock import ANY
 
 import msgspec
@@ -46,7 +46,12 @@ class Recorder:
     def velocity(self, **values: float) -> None:
         self.velocities.append(values)
 
-    def hover(self) -> None:
+    @property
+    def _core(self) -> Self:
+        return self
+
+    def let_go(self, reason: str) -> None:
+        assert reason
         self.hovers += 1
 
     def emit(self, kind: EventKind, text: str, severity: Severity) -> None:

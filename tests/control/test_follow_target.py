@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -327,7 +327,12 @@ class Recorder:
     def command(self, attitude: Attitude) -> None:
         self.attitudes.append(attitude)
 
-    def hover(self) -> None:
+    @property
+    def _core(self) -> Self:
+        return self
+
+    def let_go(self, reason: str) -> None:
+        assert reason
         self.hovers += 1
 
     def emit(self, kind: EventKind, text: str, severity: Severity) -> None:

@@ -7,17 +7,23 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from skyloop.client import Drone
+from skyloop.cli import fly
+from skyloop.cli.teleop import Teleop
+from skyloop.client import Drone, Swarm
 from skyloop.client.drone import open_drone
+from skyloop.control import Controller, FlyRoute
+from skyloop.control.route import Route, RouteWaypoint
+from skyloop.control.route_law import RouteState
 from skyloop.drivers.registry import make_driver
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.errors import NoAnswerError, RefusedError
-from skyloop.messages import EventKind
+from skyloop.errors import NoAnswerError, RefusedError, SwarmError
+from skyloop.messages import EventKind, Feedback
 from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.core.flight import Whose
 from skyloop.proxy.flight_record import FlightRecord
@@ -212,6 +218,100 @@ def test_what_others_order_while_set_points_are_flown_stays_when_the_application
             scene.watched(proxy, 150)  # the set-point decays to hover, and the ladder loses its patience
             wait_until(lambda: not scene.armed, "it lands")
         assert scene.ours == []
+
+
+class Flying(Controller):
+    """Flies on whatever happens, until it fails."""
+
+    fails = False
+
+    def on_feedback(self, feedback: Feedback) -> None:
+        if self.fails:
+            raise ValueError("a bug of the user's")
+        self.drone.velocity(forward=0.3)
+
+
+def _controller(drone: Drone) -> None:
+    controller = Flying(drone)
+    controller.fails = True
+    with pytest.raises(ValueError, match="a bug"):
+        controller.run()
+
+
+def _teleop(drone: Drone) -> None:
+    Teleop(drone, 0.5, 0.8).obey("centre")
+
+
+def _fly(drone: Drone) -> None:
+    fly.land(drone)
+
+
+def _swarm(drone: Drone) -> None:
+    swarm = Swarm({"a": drone}, on_error="land")
+    swarm.hover()
+    with pytest.raises(SwarmError):
+        swarm.fail("another's photo", {"b": ValueError("no light")})
+
+
+def _block(drone: Drone) -> None:
+    with drone:
+        pass
+
+
+@KINDS
+@pytest.mark.parametrize("end", [_controller, _teleop, _fly, _swarm, _block])
+def test_a_safety_pilot_keeps_the_vehicle_whatever_becomes_of_the_program(
+    kind: Kind, end: Callable[[Drone], None], note: Path
+) -> None:
+    """A bug in a callback, a key that is let go, the end of ``skyloop fly``, of a swarm and of a block: by itself,
+    the library takes nothing out of the hands of who has selected a mode.
+    """
+    with Scene(kind, note) as scene:
+        proxy = scene.proxy()
+        drone = open_drone(scene.server.dial, app="me")
+        drone.wait(lambda f: bool((f.native or {}).get("mavlink.ready")), timeout_s=WAIT_S)
+        drone.takeoff(timeout_s=WAIT_S)
+        for _ in range(10):
+            drone.velocity(forward=0.3)
+            time.sleep(0.02)
+        scene.ours.clear()
+        scene.station_mode("RTL")
+
+        def seen() -> bool:
+            drone.velocity(forward=0.3)
+            return proxy.handler.flight.others != ""
+
+        wait_until(seen, "it is seen")
+        end(drone)
+        scene.watched(proxy, 100)
+        assert scene.ours == []
+        assert "RTL" in scene.mode or not scene.armed
+        assert proxy.handler.flight.whose is not Whose.OURS
+        drone.close()
+
+
+@KINDS
+def test_a_safety_pilot_keeps_the_vehicle_on_a_route(kind: Kind, note: Path) -> None:
+    """The route is paused when its place is refused, and that is no decision to take the vehicle back."""
+    with Scene(kind, note) as scene:
+        proxy = scene.proxy()
+        with taken_off(scene) as drone:
+            x, y, z = drone.feedback().position_m or (0.0, 0.0, 0.0)
+            flight = FlyRoute(drone, Route(waypoints=(RouteWaypoint(x + 20.0, y, z),)))
+
+            def take() -> None:
+                wait_until(lambda: flight.law.state is RouteState.FLYING and scene.set_points > 10, "it is on its way")
+                scene.ours.clear()
+                scene.station_mode("RTL")
+
+            taking = threading.Thread(target=take)
+            taking.start()
+            flight.run(seconds=WAIT_S, until=lambda: flight.law.state is RouteState.PAUSED)
+            taking.join()
+            assert flight.law.state is RouteState.PAUSED
+            scene.watched(proxy, 100)
+            assert scene.ours == []
+            assert proxy.handler.flight.whose is not Whose.OURS
 
 
 @KINDS

@@ -92,6 +92,7 @@ SAMPLES: dict[str, Sample] = {
     "command-idle": Command(1, 7, 1, 1_000_000_001, Idle()),
     "command-takeoff": Command(2, 7, 2, 1_000_000_002, Takeoff()),
     "command-hover": Command(3, 7, 3, 1_000_000_003, Hover()),
+    "command-hover-automatic": Command(13, 7, 13, 1_000_000_013, Hover(), True),
     "command-land": Command(4, 7, 4, 1_000_000_004, Land()),
     "command-emergency-stop": Command(5, 0, 5, 1_000_000_005, EmergencyStop()),
     "command-reset-emergency": Command(6, 7, 6, 1_000_000_006, ResetEmergency()),

@@ -73,6 +73,13 @@ def test_feedback_of_an_older_proxy_has_no_reason_of_its_link_and_nobody_else_wh
     assert older == msgspec.structs.replace(SAMPLES[name], **before)
 
 
+def test_a_command_of_an_older_client_was_asked_for_by_its_application() -> None:
+    older = decode((PACKETS / "older" / "command-hover.bin").read_bytes())
+    assert older == SAMPLES["command-hover"]
+    assert isinstance(older, Command)
+    assert not older.automatic
+
+
 @pytest.mark.parametrize("name", ["reply-value", "reply-page"])
 def test_an_older_proxy_marks_no_parameter_as_momentary(name: str) -> None:
     assert decode((PACKETS / "older" / f"{name}.bin").read_bytes()) == SAMPLES[name]
@@ -236,7 +243,7 @@ def test_ten_thousand_random_packets_are_all_refused() -> None:
 
 
 def test_fields_of_a_later_version_are_skipped_and_defaults_fill_missing_ones() -> None:
-    body = msgspec.msgpack.encode([1, 7, 3, 99, [7, 0.5], "a later field", {"more": [1, 2]}])
+    body = msgspec.msgpack.encode([1, 7, 3, 99, [7, 0.5], False, "a later field", {"more": [1, 2]}])
     assert decode(packet(Kind.COMMAND, body)) == Command(1, 7, 3, 99, Velocity(forward=0.5))
 
 

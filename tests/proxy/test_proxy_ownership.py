@@ -69,6 +69,52 @@ def test_a_new_order_takes_it_and_is_told(bench: Bench, action: AnyAction) -> No
     assert bench.driver.told[-1] == Hover(), "from here on it is this proxy's to look after"
 
 
+@pytest.mark.parametrize("action", [Hover(), Land()])
+def test_what_the_library_does_by_itself_takes_nothing_from_others(bench: Bench, action: AnyAction) -> None:
+    """A safety pilot switches the mode, and then a program ends, fails or lets a key go: its hover is not its own."""
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.driver.told.clear()
+    bench.driver.left = "RTL"
+    bench.driver.report(state=FlightState.FLYING)
+    bench.tick()
+    pilot.command(action, automatic=True)
+    bench.run(1.0, lambda: pilot.command(action, automatic=True, repeat=True))
+    assert bench.driver.told == []
+    assert set(pilot.refusals()) == {Refusal.WRONG_STATE}
+    assert "what the library does by itself does not take it back" in pilot.told(EventKind.COMMAND_REFUSED)[0].text
+    assert bench.proxy.handler.flight.others
+    pilot.command(action)
+    assert bench.driver.told == [action], "the application's own is a decision"
+
+
+def test_an_automatic_hover_flies_what_is_ours_and_breaks_off_no_landing(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Hover(), automatic=True)
+    assert bench.driver.told == [Hover()]
+    pilot.command(Land())
+    bench.driver.report(state=FlightState.LANDING)
+    pilot.command(Hover(), automatic=True)
+    assert bench.driver.told == [Hover(), Land()]
+    pilot.command(Hover())
+    assert bench.driver.told == [Hover(), Land(), Hover()], "a person may"
+
+
+def test_an_automatic_hover_does_not_end_the_landing_of_the_failsafe(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.run(5.2)
+    assert bench.driver.told[-1] == Land()
+    assert steps(pilot)[-1][0] == "land"
+    pilot.take_authority()
+    count = len(bench.driver.told)
+    bench.run(1.0, lambda: pilot.command(Hover(), automatic=True))
+    assert bench.driver.told[count:] in ([], [Land()])
+    assert steps(pilot)[-1][0] == "land"
+    pilot.command(Hover())
+    assert bench.driver.told[-1].name == "hover"
+
+
 @pytest.mark.parametrize("action", [Velocity(0.5), Attitude(0.1)])
 def test_a_set_point_does_not_take_it_and_is_refused_with_the_reason(bench: Bench, action: AnyAction) -> None:
     bench.driver.report(state=FlightState.FLYING)

@@ -413,6 +413,21 @@ def test_a_low_battery_brings_it_back_whatever_set_points_come() -> None:
         assert bench.driver.told[-1] == Takeoff()
 
 
+def test_no_hover_or_landing_of_the_librarys_own_ends_a_return_for_a_low_battery() -> None:
+    """A route's end, a page that closes half-way, a key that is let go: only a person's own command ends it."""
+    with Bench() as bench:
+        pilot = away(bench)
+        fall_below_the_charge_to_return_at(bench, pilot)
+        for action in (Hover(), Land()):
+            pilot.command(action, automatic=True)
+            bench.run(0.2, lambda action=action: pilot.command(action, automatic=True, repeat=True))  # type: ignore[misc]
+        assert {type(action) for action in bench.driver.told} == {Position}
+        assert set(pilot.refusals()) == {Refusal.WRONG_STATE}
+        assert steps(pilot) == [("land", "battery_return", True)]
+        pilot.command(Hover())
+        assert bench.driver.told[-1] == Hover()
+
+
 def test_the_pilot_takes_it_over_by_a_new_hover_until_it_was_charged() -> None:
     with Bench() as bench:
         pilot = away(bench)

@@ -76,7 +76,8 @@ def test_a_signal_lands_first_and_tells_why(start: Start, number: signal.Signals
     app.end.close()
 
 
-def test_the_end_of_the_parent_ends_it_at_once(start: Start) -> None:
+def test_the_end_of_the_parent_lands_what_flies(start: Start) -> None:
+    """A program that is killed over its private proxy leaves nobody who could fly, and nobody who starts it again."""
     reading, writing = os.pipe()
     try:
         process = start(str(reading), descriptors=(reading,))
@@ -86,7 +87,7 @@ def test_the_end_of_the_parent_ends_it_at_once(start: Start) -> None:
     finally:
         os.close(reading)
         os.close(writing)
-    assert rest_of(process) == ["told takeoff", "told hover", "closed", "served"]
+    assert rest_of(process) == ["told takeoff", "told land", "closed", "served"]
     app.closed_by.get(timeout=WAIT_S)
     app.end.close()
 

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -15,7 +15,7 @@ import typer
 
 from skyloop.cli import wording
 from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
-from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
+from skyloop.errors import AuthorityError, LinkError, NoAnswerError, SkyloopError, UsageError
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -25,7 +25,6 @@ LANDING_S: Final = 60.0  #: as long as a landing is waited for
 RETURN_S: Final = 600.0  #: as long as a return is waited for
 STOPPING_S: Final = 3.0  #: as long as a stop is repeated until the vehicle reports it
 _REPEAT_S: Final = 0.1
-_MOST_AT_ONCE: Final = 64
 LEAVE: Final = "take over with --priority 0, or ask them"
 
 PriorityOption = Annotated[
@@ -91,8 +90,7 @@ def return_to_start(
 
     def stay() -> None:
         for one in flown:
-            with suppress(SkyloopError):
-                one.hover()
+            one._core.let_go("its return was interrupted")
 
     _each(chosen, lambda name: _return(name, wanted, height, flown), "NOT returned", json, stay)
 
@@ -157,9 +155,11 @@ def _each(
             return Ending(name, True, end(name))
         except SkyloopError as error:
             return Ending(name, False, f"{failed}: {wording.of(error)}")
+        except Exception as error:  # noqa: BLE001  what happens to one keeps nobody from hearing of the others
+            return Ending(name, False, f"{failed}: {error!r}")
 
     ended = []
-    with ThreadPoolExecutor(max_workers=min(_MOST_AT_ONCE, len(names))) as pool:
+    with ThreadPoolExecutor(max_workers=len(names)) as pool:
         try:
             for one in pool.map(attempt, names):
                 ended.append(one)
@@ -182,9 +182,25 @@ def _land(name: str, priority: int) -> str:
     if over:
         return over
     authority = Authority(priority=priority)
-    with connect_pilot(name, LEAVE, name="skyloop land", authority=authority) as flown:
-        flown.land(timeout_s=LANDING_S)
+    try:
+        with connect_pilot(name, LEAVE, name="skyloop land", authority=authority) as flown:
+            flown.land(timeout_s=LANDING_S)
+    except AuthorityError as error:
+        if error.code != "busy" or not _lands_for_others(name):
+            raise
+        return "landed, by its pilot"
     return "landed"
+
+
+def _lands_for_others(name: str) -> bool:
+    """Return whether who flies it lands it already, as another ``skyloop land`` of the same priority; waits for it."""
+    from skyloop.client import connect
+    from skyloop.messages import FlightState
+
+    with connect(name, access="observe", name="skyloop land") as seen:
+        if seen.feedback().state is FlightState.LANDING:
+            seen.wait("landed", LANDING_S)
+        return _on_the_ground(seen)
 
 
 def _return(name: str, priority: int, height_m: float | None, flown: list[Drone]) -> str:
@@ -212,19 +228,21 @@ def _over_already(name: str, program: str) -> str:
 
 
 def _stop(name: str) -> str:
-    """Cut the motors. It needs no authority: the lowest priority takes it from nobody, and waits for nothing."""
-    from skyloop.client import Authority, connect
-    from skyloop.messages import LOWEST_PRIORITY, FlightState
+    """Cut the motors. It needs no authority, and waits for no answer but that of the connection."""
+    from skyloop.client import Drone
+    from skyloop.client.connect import prepare
+    from skyloop.messages import FlightState
 
-    authority = Authority(priority=LOWEST_PRIORITY, stay=True)
-    with connect(name, name="skyloop stop", authority=authority, on_exit="hover") as drone:
+    core, deadline_s = prepare(name, name="skyloop stop", on_exit="hover")
+    core.open(timeout_s=deadline_s - time.monotonic(), acquire=False, wait_for_state=False)
+    with closing(Drone(core)) as drone:
         if not drone.capabilities.actions:
             return "takes no commands: it shows a recording or a camera"
         end_s = time.monotonic() + STOPPING_S
         while time.monotonic() < end_s:
             drone.emergency_stop()
             time.sleep(_REPEAT_S)
-            if drone.feedback().state is FlightState.EMERGENCY:
+            if core.state.newest is not None and core.state.newest.state is FlightState.EMERGENCY:
                 return "motors off"
         if _on_the_ground(drone):
             return "motors off, on the ground"

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import SkyloopError
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
+    from skyloop.client.channels import Listener
     from skyloop.control import Controller
     from skyloop.control.reloading import Reloader
 
@@ -69,6 +70,8 @@ class Flight:
                 left = None if seconds is None else max(0.0, deadline - time.monotonic())
                 summary = self._controller.run(seconds=left, until=lambda: reloader.waiting)
             except Exception as error:  # noqa: BLE001  the user's code may raise anything
+                self._cancel(self._drone._core.listeners)  # they would fly on
+                self._drone._core.let_go("the controller failed")
                 self._report(what_failed(error))
                 self._report("the controller failed: hovering; save the file to continue, Ctrl-C lands")
                 if not self._await_mended(reloader, make, deadline):
@@ -89,19 +92,27 @@ class Flight:
         return True
 
     def _take(self, reloader: Reloader, make: Make) -> bool:
-        """Put what was loaded in the place of the present controller, if it can be."""
-        found = reloader.take()
+        """Put what was loaded in the place of the present controller, if it can be; whichever goes commands no more."""
+        found, core = reloader.take(), self._drone._core
+        older = list(core.listeners)
         try:
             if found is None or isinstance(found, SkyloopError):
                 raise found or SkyloopError("nothing was loaded")
             after = make(found)
             after.on_reload(self._controller)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
+            self._cancel([one for one in core.listeners if one not in older])
             self._report(what_failed(error))
             return False
+        self._cancel(older)
         self._controller = after
         self._report(f"reloaded {type(after).__name__}, {reloader.age_s:.2f} s after it was seen to be saved")
         return True
+
+    @staticmethod
+    def _cancel(listeners: Iterable[Listener[Any]]) -> None:
+        for one in list(listeners):
+            one.cancel()
 
 
 def what_failed(error: Exception) -> str:

@@ -142,19 +142,14 @@ def run(
 
 
 def land(drone: Drone) -> None:
-    """Land what is in the air and in our hands. Who interrupts that too leaves it to the proxy's failsafe."""
-    if not drone.feedback().state.airborne:
-        return
-    if drone.authority.state in ("queued", "preempted"):
-        say(f"{drone.authority.holder or 'another application'} took over: the drone is left to it")
-        return
-    say("landing")
+    """End the flight: land what is in the air and in our hands. Who interrupts that too leaves it to the proxy."""
     try:
-        drone.land()
+        problem = drone._core.end_flight(say)
     except KeyboardInterrupt:
         say("left in the air: its proxy lets it hover, then lands it")
-        drone.close()
         raise
+    if problem is not None:
+        raise problem
 
 
 def interrupt_by_signals() -> None:

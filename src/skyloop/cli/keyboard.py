@@ -1,4 +1,4 @@
-"""The keys of a terminal as a pilot's sticks and orders. :class:`Sticks` is pure; :class:`Keyboard` reads the terminal.
+"""The keys of a terminal as a pilot's sticks and orders: :class:`Hands` and :class:`Tokenizer` are pure.
 
 A terminal sends presses and repeats, never that a key was released. So a press moves its stick for :data:`HOLD_S`,
 longer than terminals wait before they repeat a key, and repeats keep it there.
@@ -6,19 +6,42 @@ longer than terminals wait before they repeat a key, and repeats keep it there.
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import select
+import signal
 import sys
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 from skyloop.errors import UnsupportedError, UsageError
+from skyloop.messages import FlightState
 
 HOLD_S: Final = 0.6  #: how long a press moves its stick
 TWICE_S: Final = 1.0  #: two presses of Esc within this cut the motors
+REPEAT_S: Final = 0.12  #: a key that is held repeats sooner than this, and no finger does
+DELAY_S: Final = 0.2  #: before that no keyboard begins to repeat
+LANDING_S: Final = 3.0  #: so long after L no stick is moved, as the vehicle may not show yet that it lands
+STOPPING_S: Final = 2.0  #: so long after a stop nothing else is asked for, unless it shows
 _ESC_ALONE_S: Final = 0.03  #: an arrow's other bytes come within this after its Esc
+_LONGEST: Final = 32  # bytes of a sequence; what is longer is none
 
-Order = Literal["takeoff", "hover", "land", "stop", "take", "release", "faster", "slower", "quit"]
+Order = Literal[
+    "takeoff",
+    "hover",
+    "land",
+    "stop",
+    "take",
+    "release",
+    "faster",
+    "slower",
+    "quit",
+    "centre",  #: the sticks were let go
+    "held",  #: Esc is held, which is no second press
+    "grounded",  #: a stick was moved on the ground
+]
 Axis = Literal["forward", "left", "up", "yaw_rate"]
 
 STICKS: Final[dict[str, tuple[Axis, int]]] = {
@@ -57,6 +80,9 @@ KEY_MAP: Final = (
     ("Q", "land if flying, and end"),
 )
 _ARROWS: Final = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}
+_ARROW: Final = re.compile(rb"\x1b[\[O]([ABCD])")
+_SEQUENCE: Final = re.compile(rb"\x1b+(?:\[[0-?]*[ -/]*[@-~]|O[0-9;]*[@-~])")
+_UNFINISHED: Final = re.compile(rb"\x1b+(?:\[[0-?]*[ -/]*|O[0-9;]*)?")
 
 
 class Deflection(NamedTuple):
@@ -68,50 +94,141 @@ class Deflection(NamedTuple):
     yaw_rate: int = 0
 
 
-class Sticks:
-    """The meaning of key presses over time; the time [s] is an argument."""
+class Hands:
+    """What a pilot's hands at a keyboard ask for. Pure: the time [s] is an argument."""
 
     def __init__(self) -> None:
+        self._stepped_s = -math.inf  # the last step
         self._pressed: dict[Axis, tuple[int, float]] = {}
-        self._escaped_s = -TWICE_S * 2
+        self._held_over: dict[str, float] = {}  # stick keys that were held while it landed, and their last repeat
+        self._moving = False  # whether a stick was moved at the last step
+        self._landed_s = -math.inf  # when L was pressed
+        self._stopped_s = -math.inf  # when the motors were cut
+        self._escaped_s = -math.inf  # the last press of Esc, with no other key since
+        self._second: tuple[float, float] | None = None  # a second one: when, and how long after the first
+        self._repeats = False  # Esc is held
 
-    def press(self, key: str, now_s: float) -> Order | None:
-        """Handle a press; return what it orders, None for a key that moves a stick or means nothing."""
-        if key == "esc":
-            twice = now_s - self._escaped_s <= TWICE_S
-            self._escaped_s = now_s
-            self._pressed.clear()
-            return "stop" if twice else "hover"
-        stick = STICKS.get(key.lower())
-        if stick is not None:
-            self._pressed[stick[0]] = (stick[1], now_s)
-            return None
-        order = ORDERS.get(key.lower())
-        if order in ("hover", "land", "takeoff"):
-            self._pressed.clear()
-        return order
+    def step(self, keys: Sequence[str], now_s: float, state: FlightState) -> list[Order | Deflection]:
+        """Return what is to be done, in this order; last where the sticks are, if one is moved.
 
-    def deflection(self, now_s: float) -> Deflection:
-        """Return where the sticks are now."""
-        return Deflection(**{axis: sign for axis, (sign, at_s) in self._pressed.items() if now_s - at_s < HOLD_S})
+        Args:
+            keys: Pressed since the last step.
+            now_s: The time now.
+            state: Of the vehicle.
+        """
+        wanted: list[Order | Deflection] = []
+        stalled = now_s - self._stepped_s > REPEAT_S  # keys may have waited, and tell no time
+        self._stepped_s = now_s
+        repeats = stalled and bool(keys) and keys[0] == "esc"
+        if self._second is not None and now_s - self._second[0] >= REPEAT_S and not repeats:
+            wanted.append(self._stop(now_s))
+        for key in keys:
+            order = self._escape(now_s) if key == "esc" else self._press(key, now_s, state)
+            if order in ("hover", "land", "takeoff", "stop"):
+                self._pressed.clear()
+                self._moving = False
+                self._landed_s = now_s if order == "land" else -math.inf
+            if order is not None:
+                wanted.append(order)
+        sticks = Deflection(**{axis: sign for axis, (sign, at_s) in self._pressed.items() if now_s - at_s < HOLD_S})
+        if any(sticks):
+            self._moving = state.airborne
+            wanted.append(sticks if state.airborne else "grounded")
+        elif self._moving:
+            self._moving = False
+            wanted.append("centre")
+        return wanted
 
-
-def split_keys(data: bytes) -> tuple[list[str], bytes]:
-    """Split what a terminal sent into keys, and what is left of a sequence that is not complete yet."""
-    keys: list[str] = []
-    while data:
-        if data[:1] != b"\x1b":
-            keys.append(data[:1].decode("ascii", "replace"))
-            data = data[1:]
-        elif len(data) == 1 or (len(data) == 2 and data[1:2] in b"[O"):
-            break
-        elif data[1:2] in (b"[", b"O"):
-            keys.append(_ARROWS.get(data[2:3], ""))
-            data = data[3:]
+    def _press(self, key: str, now_s: float, state: FlightState) -> Order | None:
+        second, self._second, self._escaped_s = self._second, None, -math.inf
+        if second is not None and second[1] < DELAY_S:
+            return self._stop(now_s)  # no key that is held repeats so soon: it was pressed twice
+        key = key.lower()
+        order = "hover" if key == "alt" else ORDERS.get(key)
+        if order == "quit":
+            return order
+        if now_s - self._stopped_s < STOPPING_S and state is not FlightState.EMERGENCY:
+            return None  # nothing takes the place of a stop that is not shown yet
+        if key not in STICKS:
+            return order
+        axis, sign = STICKS[key]
+        landing = state is FlightState.LANDING or now_s - self._landed_s < LANDING_S
+        if landing or now_s - self._held_over.get(key, -math.inf) < HOLD_S:
+            self._held_over[key] = now_s  # a landing is ended by H, by no stick and no key that was held meanwhile
         else:
-            keys.append("esc")
-            data = data[1:]
-    return [key for key in keys if key], data
+            self._pressed[axis] = (sign, now_s)
+        return None
+
+    def _escape(self, now_s: float) -> Order | None:
+        """Hover at the first press, and cut the motors at the second, which a key that is held does not make."""
+        if now_s - self._stopped_s < STOPPING_S:
+            return self._stop(now_s)  # once more, and no hover in its place
+        gap_s, self._escaped_s = now_s - self._escaped_s, now_s
+        if self._second is not None or (self._repeats and gap_s < REPEAT_S):
+            first, self._second, self._repeats = not self._repeats, None, True
+            return "held" if first else None
+        if gap_s > TWICE_S or self._repeats:
+            self._repeats = False
+            return "hover"
+        if REPEAT_S <= gap_s < DELAY_S:
+            return self._stop(now_s)
+        self._second = now_s, gap_s
+        return None
+
+    def _stop(self, now_s: float) -> Order:
+        self._second, self._escaped_s, self._stopped_s = None, -math.inf, now_s
+        self._pressed.clear()
+        self._moving = False
+        return "stop"
+
+
+class Tokenizer:
+    """Makes keys of what a terminal sends: letters, ``up`` … for arrows, ``esc``, and ``alt`` for Alt with any key.
+
+    Alt sends an Esc before its key, as do two keys pressed at almost the same time: ``alt`` hovers, and is no Esc.
+    """
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._alone = False  # an Esc was taken for one that stands alone
+
+    @property
+    def waits(self) -> bool:
+        """Whether there is the beginning of a sequence."""
+        return bool(self._rest)
+
+    def feed(self, data: bytes) -> list[str]:
+        """Return the keys that are complete."""
+        late = self._alone and data[:1] in (b"[", b"O")  # the rest of an arrow that came slowly
+        data, self._alone = self._rest + (b"\x1b" if late else b"") + data, False
+        keys: list[str] = []
+        while data:
+            if data[:1] != b"\x1b":
+                keys.append(data[:1].decode("ascii", "replace"))
+                data = data[1:]
+            elif found := _SEQUENCE.match(data):
+                arrow = _ARROW.fullmatch(found[0])
+                if arrow is not None and not late:
+                    keys.append(_ARROWS[arrow[1]])
+                elif data[:2] == b"\x1b\x1b":
+                    keys.append("alt")
+                data = data[found.end() :]
+            elif len(data) <= _LONGEST and _UNFINISHED.fullmatch(data):
+                break
+            elif data[1:2] == b"\x1b":
+                keys.append("esc")
+                data = data[1:]
+            else:
+                keys.append("alt")
+                data = data[2:]
+        self._rest = data
+        return keys
+
+    def flush(self) -> list[str]:
+        """Return what the beginning of a sequence was, as nothing more came."""
+        rest, self._rest = self._rest, b""
+        self._alone = rest == b"\x1b"
+        return ["esc"] * len(rest) if not rest.strip(b"\x1b") else ["alt"]
 
 
 class Keyboard:
@@ -136,16 +253,32 @@ class Keyboard:
             raise UsageError("standard input is no terminal: flying by keys needs one")
         self._fd = sys.stdin.fileno()
         self._before: list[Any] = termios.tcgetattr(self._fd)
-        self._rest = b""
+        self._tokens = Tokenizer()
+        self._continued: Any = None  # who else handles SIGCONT
 
     def __enter__(self) -> Self:
-        self._tty.setcbreak(self._fd)  # Ctrl-C still interrupts
+        self._set_mode()
+        self._continued = signal.signal(
+            signal.SIGCONT, lambda *_: self._set_mode()
+        )  # a shell has set its own meanwhile
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._termios.tcsetattr(self._fd, self._termios.TCSADRAIN, self._before)
+        signal.signal(signal.SIGCONT, self._continued)
+        self._termios.tcsetattr(self._fd, self._termios.TCSANOW, self._before)
+
+    def _set_mode(self) -> None:
+        """Read single keys; Ctrl-C still interrupts, Ctrl-Z does not suspend a flight and Ctrl-S holds nothing up."""
+        termios = self._termios
+        self._tty.setcbreak(self._fd, termios.TCSANOW)
+        mode = termios.tcgetattr(self._fd)
+        mode[0] &= ~termios.IXON
+        for name in ("VSUSP", "VDSUSP"):
+            if hasattr(termios, name):
+                mode[6][getattr(termios, name)] = bytes((os.fpathconf(self._fd, "PC_VDISABLE"),))
+        termios.tcsetattr(self._fd, termios.TCSANOW, mode)
 
     def keys(self, within_s: float) -> list[str]:
         """Return the keys that were pressed, as soon as there are any.
@@ -156,14 +289,12 @@ class Keyboard:
         Raises:
             EOFError: The terminal is gone.
         """
-        if not self._ready(_ESC_ALONE_S if self._rest else within_s):
-            alone, self._rest = self._rest, b""
-            return ["esc"] if alone else []
+        if not self._ready(_ESC_ALONE_S if self._tokens.waits else within_s):
+            return self._tokens.flush()
         data = os.read(self._fd, 1024)
         if not data:
             raise EOFError
-        keys, self._rest = split_keys(self._rest + data)
-        return keys
+        return self._tokens.feed(data)
 
     def _ready(self, within_s: float) -> bool:
         return bool(select.select([self._fd], [], [], within_s)[0])

@@ -10,7 +10,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from skyloop.cli.keyboard import KEY_MAP, Deflection, Keyboard, Order, Sticks
+from skyloop.cli.keyboard import KEY_MAP, Deflection, Hands, Keyboard, Order
 from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
 from skyloop.errors import AuthorityError, SkyloopError
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 ADVICE = "wait in the queue with --wait SECONDS, take over with a higher --priority, or observe: skyloop watch"
 PERIOD_S: Final = 0.05  #: how often a moved stick is sent again; sooner at each press
-REFRESH_S: Final = 0.125
+REFRESH_HZ: Final = 8
 EVENTS_SHOWN: Final = 3
 GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: that + and - step through
 
@@ -67,9 +67,8 @@ class Teleop:
         self._drone = drone
         self._speed, self._turn = speed, turn
         self._page = page
-        self._sticks = Sticks()
+        self._hands = Hands()
         self._gain = 1.0
-        self._moving = False  # whether a stick was moved when it was sent last
         self._message = ""
 
     def run(self, keyboard: Keyboard) -> None:
@@ -78,25 +77,24 @@ class Teleop:
         Raises:
             EOFError: The terminal is gone.
         """
-        shown_s = 0.0
-        with keyboard, Live(console=Console(), auto_refresh=False) as live:
+        # It is drawn on a thread of its own: a terminal that takes no more keeps no key waiting.
+        with keyboard, Live(console=Console(), get_renderable=self.picture, refresh_per_second=REFRESH_HZ):
             while True:
-                for key in keyboard.keys(PERIOD_S):
-                    order = self._sticks.press(key, time.monotonic())
+                keys = keyboard.keys(PERIOD_S)
+                for order in self._hands.step(keys, time.monotonic(), self._drone.feedback().state):
                     if order == "quit":
                         return
-                    if order is not None:
-                        self.obey(order)
-                now_s = time.monotonic()
-                self.steer(self._sticks.deflection(now_s))
-                if now_s - shown_s > REFRESH_S:
-                    shown_s = now_s
-                    live.update(self.picture(), refresh=True)
+                    self.obey(order)
 
-    def obey(self, order: Order) -> None:
-        """Carry out a key's order; one that is not possible is reported and changes nothing."""
+    def obey(self, order: Order | Deflection) -> None:
+        """Carry out what the hands ask for; what is not possible is reported and changes nothing."""
         try:
-            self._message = self._obey(order)
+            if isinstance(order, Deflection):
+                self._steer(order)
+            else:
+                self._message = self._obey(order) or self._message
+        except AuthorityError as error:
+            self._message = f"{error} (C takes control)"
         except SkyloopError as error:
             self._message = str(error)
 
@@ -109,12 +107,18 @@ class Teleop:
         if order == "stop":
             drone.emergency_stop()
             return "motors off"
+        if order == "grounded":
+            return "on the ground: T takes off"
+        if order == "held":
+            return "Esc is held, which stops no motors: press it twice"
+        if order == "centre":
+            drone._core.let_go("all keys are let go")
+            return ""
         if order == "takeoff":
             drone.takeoff(wait=False)
         elif order == "land":
             drone.land(wait=False)
         elif order == "hover":
-            self._moving = False
             if drone.feedback().state.airborne:
                 drone.hover()
         elif order == "take":
@@ -123,27 +127,14 @@ class Teleop:
             drone.release_authority()
         return order
 
-    def steer(self, sticks: Deflection) -> None:
-        """Send where the sticks are while one is moved, and one hover when all are released."""
-        moved = any(sticks)
-        if not moved and not self._moving:
-            return
-        try:
-            if not self._drone.feedback().state.airborne:
-                self._message = "on the ground: T takes off" if moved else self._message
-            elif moved:
-                speed, turn = self._speed * self._gain, self._turn * self._gain
-                self._drone.velocity(
-                    forward=sticks.forward * speed,
-                    left=sticks.left * speed,
-                    up=sticks.up * speed,
-                    yaw_rate=sticks.yaw_rate * turn,
-                )
-            else:
-                self._drone.hover()
-        except AuthorityError as error:
-            self._message = f"{error} (C takes control)"
-        self._moving = moved
+    def _steer(self, sticks: Deflection) -> None:
+        speed, turn = self._speed * self._gain, self._turn * self._gain
+        self._drone.velocity(
+            forward=sticks.forward * speed,
+            left=sticks.left * speed,
+            up=sticks.up * speed,
+            yaw_rate=sticks.yaw_rate * turn,
+        )
 
     def picture(self) -> Group:
         """Return all that is shown at one time, what matters most on top: what does not fit is cut at the bottom."""

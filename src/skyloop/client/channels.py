@@ -16,7 +16,7 @@ from skyloop.client.frame import Arrival, Frame, SmallArrival
 from skyloop.client.link_monitor import StallWatch
 from skyloop.client.mailbox import Holder, Mailbox
 from skyloop.client.statistics import ChannelCounter, ChannelStats
-from skyloop.errors import DecodeError
+from skyloop.errors import ClosedError, DecodeError
 from skyloop.messages import CameraInfo, EventKind, FrameHeader, Severity, VideoRequest
 from skyloop.messages.video import FrameFilter, VideoEncoding
 from skyloop.transport.base import Pixels, video
@@ -24,7 +24,7 @@ from skyloop.transport.base import Pixels, video
 T = TypeVar("T")
 
 #: Called with the name of a listener and the exception that its function raised.
-Report = Callable[[str, Exception], None]
+Report = Callable[[str, Exception | SystemExit], None]
 
 
 class Emit(Protocol):
@@ -333,6 +333,10 @@ class Listener(Generic[T]):
         self._calls += 1
         try:
             self._function(sample)
+        except ClosedError:  # its drone was closed, or the flight is at its end: nothing is wrong with the function
+            self.errors += 1
+        except SystemExit as error:  # would end this thread, and nobody else would hear of it
+            self._report(self.name, error)
         except Exception as error:  # noqa: BLE001  (an application's function may raise anything)
             self.errors += 1
             self._failed(error)

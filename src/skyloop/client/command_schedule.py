@@ -67,6 +67,7 @@ class Unsent(NamedTuple):
     action: AnyAction
     intent: int
     since_ns: int
+    automatic: bool = False
 
 
 class CommandSchedule:
@@ -97,6 +98,7 @@ class CommandSchedule:
         self._keep_ns = nanoseconds(keep_s)
         self.action: AnyAction = _IDLE
         self.intent = 0  #: number of the newest intent
+        self.automatic = False  #: the newest set-point is the library's own, not the application's
         self.over: Outcome | None = None  #: what ended it, once it is over
         self.owed: Unsent | None = None  #: what was asked for once, and not sent
         self._asked_ns = 0
@@ -109,10 +111,15 @@ class CommandSchedule:
         self._failsafe = Failsafe.NONE
         self._reset_asked_ns: int | None = None  # while a stop was under way
 
-    def ask(self, action: AnyAction, now_ns: int) -> int:
+    def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
         """Make ``action`` the set-point of the application; return the number of this intent.
 
         Ask :meth:`may_ask` before.
+
+        Args:
+            action: The action.
+            now_ns: On this process's clock.
+            automatic: The application did not ask for it itself.
         """
         resets = isinstance(action, ResetEmergency)
         self._reset_asked_ns = now_ns if resets and self.stopping else None
@@ -121,6 +128,7 @@ class CommandSchedule:
         stops = type(action) is Hover and type(self.action) is not Hover
         self.action, self.over = action, None
         self.intent += 1
+        self.automatic = automatic
         self._asked_ns = now_ns
         if stops or type(action) in _DONE_IN:  # rare and important: at once
             self._due_ns = now_ns
@@ -163,7 +171,7 @@ class CommandSchedule:
         if now_ns < self._due_ns:
             return None
         if self._decays(now_ns):
-            self.action = _HOVER
+            self.action, self.automatic = _HOVER, True
         elif self._expired(now_ns):
             self.action, self.owed = _IDLE, None
         if not self._is_sent:
@@ -180,7 +188,7 @@ class CommandSchedule:
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
         """Note that there was no room for what :meth:`next` returned: set-points follow anyway, a landing may not."""
         if not _is_periodic(action):
-            self.owed = Unsent(action, self.intent, now_ns)
+            self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
         """Return :attr:`owed` if it is to be sent before ``action``, which neither repeats nor revokes it."""
@@ -231,16 +239,6 @@ class CommandSchedule:
             self.over = outcome
         if type(self.action) is not EmergencyStop:
             self.action = _IDLE
-
-    def give_up(self, now_ns: int, *, flies: bool) -> None:
-        """Hover, or want nothing on the ground, under the present number: so it takes the vehicle from nobody.
-
-        Args:
-            now_ns: On this process's clock.
-            flies: Whether the vehicle is in the air.
-        """
-        if type(self.action) is not EmergencyStop:
-            self.action, self._due_ns = _HOVER if flies else _IDLE, now_ns
 
     def resume(self, now_ns: int) -> None:
         """Start to send (again): drop a set-point that is too old."""

@@ -13,7 +13,7 @@ from skyloop.client.channels import Emit
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.statistics import ChannelCounter
-from skyloop.errors import AuthorityError, Hint, LinkError, NoAnswerError, RefusedError, UsageError
+from skyloop.errors import AuthorityError, ClosedError, Hint, LinkError, NoAnswerError, RefusedError, UsageError
 from skyloop.messages import (
     ACTION_NAMES,
     AnswerTakeover,
@@ -53,6 +53,8 @@ ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for th
 #: time after which a silent one loses the authority.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
+#: What an application asked for and no hover of the library's own may end.
+LANDING: Final = (Land, EmergencyStop)
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 _REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: so ended, the next set-point is most likely refused, too
 #: What a program sends again and again: that one of them is not sent is no error.
@@ -103,6 +105,7 @@ class CommandSender:
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
+        self.barred = False  #: the end of the flight has begun: only the library's own commands and a stop pass
         self._told: Outcome | None = None  # the newest outcome of ours
         self._first_set_point = 0  # number of the first in the present row of set-points; 0: the newest is none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
@@ -129,9 +132,19 @@ class CommandSender:
         return self._schedule.open_ns
 
     @property
+    def newest(self) -> AnyAction:
+        """What is repeated now; idle where nothing is."""
+        return self._schedule.action
+
+    @property
     def wants_flight(self) -> bool:
         """Whether the newest set-point keeps, or brings, the vehicle in the air."""
         return self._schedule.wants_flight
+
+    def bar(self) -> None:
+        """Let no more commands of the application pass but an emergency stop: when this returns, none is on its way."""
+        with self._lock:
+            self.barred = True
 
     @property
     def stopping(self) -> bool:
@@ -174,9 +187,9 @@ class CommandSender:
 
     # The application's side ------------------------------------------------------------------------------------
 
-    def command(self, action: AnyAction, *, now: bool = False) -> bool:
+    def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
         """Make ``action`` the newest set-point; see :meth:`ask`, and False also while set-points are refused."""
-        intent, sent = self.ask(action, now=now)
+        intent, sent = self.ask(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
             self._first_set_point = 0
             return sent
@@ -184,18 +197,20 @@ class CommandSender:
         self._first_set_point = self._first_set_point or intent
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
 
-    def ask(self, action: AnyAction, *, now: bool = False) -> tuple[int, bool]:
+    def ask(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> tuple[int, bool]:
         """Make ``action`` the newest set-point.
 
         Args:
             action: The action.
             now: Raise if it can't be sent now. A landing is then kept for when it can, anything else is dropped.
+            automatic: The library asks for it by itself: the proxy takes no vehicle from others for it.
 
         Returns:
             The number of the intent; and False if it can't be sent now, because the link is down or the authority is
             still awaited, or because an emergency stop of this application has not shown yet.
 
         Raises:
+            ClosedError: After :meth:`bar`.
             RefusedError: If such a stop keeps back what is to be done once, or what is to be sent ``now``.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
                 with ``now`` also while the authority is still awaited.
@@ -204,6 +219,10 @@ class CommandSender:
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
+            if self.barred and not (stop or automatic):
+                raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
+            if automatic and type(action) is not Land and type(self._schedule.action) in LANDING:
+                return self._schedule.intent, False
             authority = self._authority
             may_send = authority.held or stop
             if (
@@ -219,7 +238,7 @@ class CommandSender:
                     text = f"{action.name} was not sent: the emergency stop of this application has not shown yet"
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return self._schedule.intent, False
-            intent = self._schedule.ask(action, now_ns)
+            intent = self._schedule.ask(action, now_ns, automatic=automatic)
             if not may_send or not self._connection.connected:
                 if now:
                     if type(action) is not Land:  # what was refused now must not be carried out later
@@ -238,20 +257,10 @@ class CommandSender:
                 return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
             return self._schedule.over
 
-    def give_up(self, intent: int, *, flies: bool) -> None:
-        """Hover, or want nothing, instead of an intent that its caller no longer waits for; leave a newer one alone.
-
-        It is no new intent, so a vehicle that others took meanwhile stays theirs.
-
-        Args:
-            intent: Number of the intent.
-            flies: Whether the vehicle is in the air.
-        """
+    def drop(self) -> None:
+        """Clear the set-point: nothing of it is sent later."""
         with self._lock:
-            schedule = self._schedule
-            if schedule.intent == intent or (not flies and isinstance(schedule.action, SET_POINTS)):
-                schedule.give_up(self._clock(), flies=flies)
-        self._connection.poke()
+            self._schedule.clear(Fate.WITHDRAWN)
 
     def request(self, request: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
         """Request the authority and wait for it; see :meth:`skyloop.client.drone.Drone.request_authority`.
@@ -409,20 +418,21 @@ class CommandSender:
         if action is None:
             return False
         first = None if schedule.owed is None else schedule.first(action, now_ns)
-        if first is None or self._transmit(first.action, first.intent):
+        if first is None or self._transmit(first.action, first.intent, first.automatic):
             schedule.owed = None
-            if self._transmit(action, schedule.intent):
+            if self._transmit(action, schedule.intent, schedule.automatic):
                 self.sends.add(0, now_ns, now_ns)
                 return True
         self.sends.dropped += 1
         schedule.not_sent(action, now_ns)
         return False
 
-    def _transmit(self, action: AnyAction, intent: int) -> bool:
+    def _transmit(self, action: AnyAction, intent: int, automatic: bool) -> bool:
         self._seq += 1
         connection = self._connection
         sent_ns = self._clock() + connection.offset_ns
-        return connection.transmit(encode(Command(self._seq, self._authority.status.lease, intent, sent_ns, action)))
+        lease = self._authority.status.lease
+        return connection.transmit(encode(Command(self._seq, lease, intent, sent_ns, action, automatic)))
 
     def _answered(self, answer: AnyReply | LinkError) -> None:
         """Handle the answer to a request for the authority, on the receiving thread."""

@@ -16,7 +16,6 @@ from skyloop.errors import (
     ClosedError,
     NoAnswerError,
     RefusedError,
-    SkyloopError,
     UnsupportedError,
 )
 from skyloop.messages import (
@@ -128,9 +127,6 @@ class ActionWait:
     def wait(self, timeout_s: float, deadline_s: float) -> None:
         """Wait until the action is done.
 
-        A take-off that is not done in time is withdrawn. So is one, or a flight to a place, whose caller waits no
-        longer, as after Ctrl-C: the vehicle hovers if it is in the air.
-
         Args:
             timeout_s: What the caller gave [s], for the error.
             deadline_s: Until when, on ``time.monotonic``.
@@ -142,27 +138,10 @@ class ActionWait:
             UnsupportedError: If the vehicle does not support it.
             RefusedError: If the proxy refuses it in the present state, or something ends it.
         """
-        kind = type(self._action)
-        try:
-            if not self._state.notifier.wait_for(self._over, deadline_s - time.monotonic()):
-                raise NoAnswerError(self._not_reached(timeout_s))
-            if self._problem is not None:
-                raise self._problem
-        except NoAnswerError:
-            if kind is Takeoff:
-                self._give_up()
-            raise
-        except SkyloopError:
-            raise
-        except BaseException:
-            if kind is not Land:
-                self._give_up()
-            raise
-
-    def _give_up(self) -> None:
-        newest = self._state.newest
-        flies = newest is not None and newest.state is not FlightState.LANDED
-        self._commands.give_up(self._intent, flies=flies)
+        if not self._state.notifier.wait_for(self._over, deadline_s - time.monotonic()):
+            raise NoAnswerError(self._not_reached(timeout_s))
+        if self._problem is not None:
+            raise self._problem
 
     def _over(self) -> bool:
         """Whether it is done, or waiting longer can't help."""

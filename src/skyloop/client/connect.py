@@ -129,10 +129,41 @@ def connect(
         UsageError: If an argument is out of range, or the address makes no sense.
         MissingExtraError: If the network is asked for and the extra ``network`` is not installed.
     """
-    if not isinstance(target, str) or not target:
-        raise UsageError(f"{target!r} is neither the name of a proxy nor a vehicle's address such as sim://")
     if not isinstance(authority, Authority | None):
         raise UsageError(f"authority is {authority!r:.80} and must be a skyloop.Authority, as Authority(priority=4)")
+    core, deadline = prepare(
+        target,
+        access=access,
+        name=name,
+        timeout_s=timeout_s,
+        rate_hz=rate_hz,
+        stall_s=stall_s,
+        on_exit=on_exit,
+        network=network,
+        warm_s=warm_s,
+    )
+    core.open(timeout_s=deadline - time.monotonic(), authority=authority)
+    return Drone(core)
+
+
+def prepare(
+    target: str,
+    *,
+    access: Access = "pilot",
+    name: str | None = None,
+    timeout_s: float | None = None,
+    rate_hz: float = 32.0,
+    stall_s: float = 1.0,
+    on_exit: OnExit = "land",
+    network: NetworkChoice = None,
+    warm_s: float = PERIOD_S,
+) -> tuple[DroneCore, float]:
+    """Return a drone that is not connected yet, and until when that may take, on ``time.monotonic``.
+
+    A private proxy is started. Arguments and errors are those of :func:`connect`.
+    """
+    if not isinstance(target, str) or not target:
+        raise UsageError(f"{target!r} is neither the name of a proxy nor a vehicle's address such as sim://")
     if timeout_s is not None:
         check_seconds("timeout_s", timeout_s)
     keep_warm = keeper(warm_s)
@@ -162,8 +193,7 @@ def connect(
         if end is not None:
             end()
         raise
-    core.open(timeout_s=deadline - time.monotonic(), authority=authority)
-    return Drone(core)
+    return core, deadline
 
 
 def _connector(uri: str) -> Connector:
@@ -323,7 +353,7 @@ def swarm(
 
     drones, errors = in_parallel({name: join(target) for name, target in chosen.items()})
     if errors and (missing == "raise" or not drones):
-        in_parallel({name: drone._core.leave for name, drone in drones.items()})
+        in_parallel({name: drone._core.end_flight for name, drone in drones.items()})
         raise SwarmError("connecting", errors, len(chosen))
     return Swarm(drones, on_error=on_error, missing=errors)
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import secrets
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Final, Literal, Protocol, TypedDict
 
 from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
 from skyloop.client.channels import Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
-from skyloop.client.commands import CommandSender
+from skyloop.client.commands import LANDING, CommandSender
 from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.logbook import Logbook
@@ -27,6 +30,7 @@ from skyloop.errors import (
     ClosedError,
     LinkError,
     NoAnswerError,
+    RefusedError,
     SkyloopError,
     UnknownNameError,
     UnsupportedError,
@@ -37,16 +41,20 @@ from skyloop.messages import (
     Capabilities,
     EmergencyStop,
     EventKind,
+    Failsafe,
     Feedback,
     FlightState,
     Hello,
     Hover,
+    Idle,
     Land,
     LinkState,
     Position,
+    ReturnPhase,
     ReturnToStart,
     Role,
     Severity,
+    Takeoff,
 )
 from skyloop.messages.result import MAX_CODE
 from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
@@ -61,6 +69,15 @@ STOP_S: Final = 2.0  #: how long closing waits for an emergency stop to show
 DOWN: Final = frozenset({FlightState.LANDED})
 _ENDED: Final = EndedSessions()  #: of all drones of this process
 LANDING_S: Final = 20.0  #: how long a landing is waited for
+OTHERS_S: Final = 1.0  #: within which feedback says who took a vehicle whose landing was refused
+RETURN_S: Final = 180.0  #: how long a return that the proxy began is waited for
+_ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
+_SINKING: Final = (*_ENDED_IN, FlightState.LANDING)
+_log = logging.getLogger("skyloop")
+
+
+def _silent(step: str) -> None:
+    """Report nothing."""
 
 
 class Closable(Protocol):
@@ -137,6 +154,7 @@ class DroneCore:
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
         self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
+        self._end = threading.Lock()  # one end of the flight, whoever asks for it
         self._on_exit = on_exit
         self._on_close = on_close
         self._to_close: list[Closable] = []  # what ends with the drone
@@ -182,6 +200,7 @@ class DroneCore:
         timeout_s: float = 5.0,
         authority: Authority | None = None,
         acquire: bool = True,
+        wait_for_state: bool = True,
     ) -> None:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone if anything fails.
 
@@ -189,6 +208,7 @@ class DroneCore:
             timeout_s: Time for the proxy to answer and to send its first feedback [s].
             authority: How a pilot asks for the authority; None: ``Authority()``.
             acquire: Whether a pilot asks for the authority now; if False it does so when it wants.
+            wait_for_state: Whether to wait for feedback.
 
         Raises:
             NoAnswerError: If no answer or no feedback comes in time.
@@ -200,7 +220,7 @@ class DroneCore:
             deadline = time.monotonic() + timeout_s
             self.supervisor.start(timeout_s)
             left_s = max(0.1, deadline - time.monotonic())
-            if not self.state.notifier.wait_for(self._known, left_s):
+            if wait_for_state and not self.state.notifier.wait_for(self._known, left_s):
                 raise NoAnswerError(f"{self.name} answered, but reported no vehicle state within {timeout_s:g} s")
             if acquire and self.role is Role.PILOT:
                 self.check_open()
@@ -216,7 +236,7 @@ class DroneCore:
     def close(self) -> None:
         """Release the authority, then end the connection, all threads and a private proxy. Does not land. Idempotent.
 
-        Threads that wait for this drone get :class:`ClosedError`.
+        A private proxy lands what flies. Threads that wait for this drone get :class:`ClosedError`.
         """
         if self.closed:
             return
@@ -237,6 +257,11 @@ class DroneCore:
             if self._on_close is not None:
                 self._on_close()
 
+    @property
+    def ending(self) -> bool:
+        """Whether the end of the flight has begun, or it is closed."""
+        return self.closed or self.commands.barred
+
     def forked(self) -> None:
         """Leave the vehicle and the connection to the parent process; in a child made by ``os.fork``."""
         if not self.closed:
@@ -246,27 +271,88 @@ class DroneCore:
             )
             self.connection.forked()
 
-    def leave(self) -> SkyloopError | None:
-        """Do what the end of a block does: land what this application flies, or hover (see ``on_exit``), and close.
+    def let_go(self, reason: str, *, land: bool = False) -> bool:
+        """Hover, or land, because the library finds that it has to: the only place where it does so by itself.
 
-        Waits until the vehicle has landed. Idempotent.
+        Nobody decided that, so a vehicle that others fly, that lands or that returns is left alone, here and by the
+        proxy, and so is what the application itself has landed or stopped. A take-off that does not show is ended.
+
+        Args:
+            reason: Why, for the log.
+            land: Land, rather than hover.
+
+        Returns:
+            Whether something was sent.
+        """
+        commands, feedback, kind = self.commands, self.state.newest, type(self.commands.newest)
+        if self.closed or kind in LANDING or (kind is Hover and not land):
+            return False
+        leave = feedback is None or feedback.others or _returns(feedback)
+        if land or (kind is Takeoff and feedback is not None and feedback.state is FlightState.LANDED):
+            action: AnyAction = Idle() if leave else Land()
+        else:
+            action = Idle() if leave or (feedback is not None and feedback.state in _SINKING) else Hover()
+        try:
+            if commands.status.state != "held":
+                commands.drop()
+                return False
+            sent = commands.command(action, automatic=True)
+        except SkyloopError:
+            return False
+        if type(action) is not Idle:
+            _log.info("%s: %s, because %s", self.name, action.name, reason)
+        return sent
+
+    def end_flight(self, report: Callable[[str], object] = _silent) -> SkyloopError | None:
+        """End the flight: land what this application flies, or hover (see ``on_exit``), then close.
+
+        From its first line on commands of the application's other threads raise :class:`ClosedError`; only an emergency
+        stop still passes. Waits until the vehicle has landed. A second call waits for the first. Idempotent.
+
+        Args:
+            report: Called with each step, for people.
 
         Returns:
             What went wrong; None if nothing did.
         """
-        problem = None
+        if self.closed:  # also in a fork, where somebody may have held the locks
+            return None
+        self.commands.bar()
+        with self._end:
+            try:
+                land = self._on_exit == "land"
+                return None if self.closed else self.bring_down("its flight ends", report, land=land)
+            finally:
+                self.close()
+
+    def bring_down(
+        self, reason: str, report: Callable[[str], object] = _silent, *, land: bool = True
+    ) -> SkyloopError | None:
+        """Land what this application flies and wait until it has landed, or let it go; see :meth:`end_flight`."""
+        self._finish_stop()
+        feedback = self.state.newest
+        if not self._flies():
+            if feedback is not None and feedback.state.airborne and (whose := self._others_hands()):
+                report(f"{whose}: the drone is left to it")
+            return None
         try:
-            self._finish_stop()
-            if not self.closed and self._flies():
-                if self._on_exit == "land":
-                    self.complete(Land(), lambda feedback: feedback.state in DOWN, True, LANDING_S)
-                else:
-                    self.command(Hover())
+            if not land:
+                self.let_go(reason)
+            elif feedback is not None and _returns(feedback):
+                report("it returns to its start and lands")
+                self.check_may_wait()
+                if not self.state.notifier.wait_for(self._is_down, RETURN_S):
+                    return NoAnswerError(f"the vehicle has not returned and landed within {RETURN_S:g} s")
+            else:
+                report("landing")
+                self.complete(Land(), lambda newest: newest.state in _ENDED_IN, True, LANDING_S, automatic=True)
+        except RefusedError as error:
+            if not self.state.notifier.wait_for(lambda: self._others_hands() != "", OTHERS_S):
+                return error
+            report(f"{self._others_hands()}: the drone is left to it")  # who took it a moment ago, too
         except SkyloopError as error:
-            problem = error
-        finally:
-            self.close()
-        return problem
+            return error
+        return None
 
     def sample_notifier(self) -> Notifier:
         """Return a notifier for a thread that waits for nothing but samples of this drone."""
@@ -308,6 +394,17 @@ class DroneCore:
         """Whether feedback has come and the link's state was judged."""
         return self.state.newest is not None and self.state.status.application is not LinkState.CONNECTING
 
+    def _is_down(self) -> bool:
+        newest = self.state.newest
+        return self.closed or newest is None or newest.state in _ENDED_IN
+
+    def _others_hands(self) -> str:
+        """Return who flies the vehicle in place of this application; empty if nobody took it."""
+        status, newest = self.commands.status, self.state.newest
+        if status.state in ("queued", "preempted"):
+            return f"{status.holder or 'another application'} took over"
+        return "" if newest is None else newest.others or ""
+
     def _flies(self) -> bool:
         """Whether this application has the vehicle in the air, or has just commanded a take-off."""
         newest = self.state.newest
@@ -320,23 +417,27 @@ class DroneCore:
 
     # Commands ----------------------------------------------------------------------------------------------------
 
-    def command(self, action: AnyAction, *, now: bool = False) -> bool:
+    def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
         """Make ``action``, whose numbers were checked, the newest set-point; see :class:`Drone`.
 
         Args:
             action: The action.
             now: See :meth:`CommandSender.ask`.
+            automatic: See :meth:`CommandSender.ask`; it passes when the end of the flight has begun, too.
+
+        Raises:
+            ClosedError: After :meth:`close`, and from the beginning of :meth:`end_flight` on.
         """
         self._check_can_do(action)
-        return self.commands.command(action, now=now)
+        return self.commands.command(action, now=now, automatic=automatic)
 
-    def ask(self, action: AnyAction) -> int:
+    def ask(self, action: AnyAction, *, automatic: bool = False) -> int:
         """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
 
         ``commands.outcome`` tells what became of it.
         """
         self._check_can_do(action)
-        return self.commands.ask(action)[0]
+        return self.commands.ask(action, automatic=automatic)[0]
 
     def _check_can_do(self, action: AnyAction) -> None:
         if self.closed:
@@ -350,17 +451,46 @@ class DroneCore:
         if welcome is not None and type(action) in LATER_ACTIONS:
             _check_knows(welcome.capabilities, action)
 
-    def complete(self, action: AnyAction, is_done: Callable[[Feedback], bool], wait: bool, timeout_s: float) -> None:
-        """Send the command and, if ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`."""
+    def complete(
+        self,
+        action: AnyAction,
+        is_done: Callable[[Feedback], bool],
+        wait: bool,
+        timeout_s: float,
+        *,
+        automatic: bool = False,
+    ) -> None:
+        """Send the command and, if ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`.
+
+        A take-off that is not done in time lets the vehicle go. So does a caller that waits no longer, as after Ctrl-C,
+        but for a landing.
+        """
         if not wait:
             self.command(action, now=True)
             return
         if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
             self.check_may_wait()
         deadline_s = time.monotonic() + timeout_s
-        waiting = ActionWait(action, is_done, self.ask, lambda: self.closed, self.commands, self.state, self.connection)
-        self.check_may_wait()
-        waiting.wait(timeout_s, deadline_s)
+        try:
+            waiting = ActionWait(
+                action,
+                is_done,
+                partial(self.ask, automatic=automatic),
+                lambda: self.closed or (self.ending and not automatic),
+                self.commands,
+                self.state,
+                self.connection,
+            )
+            self.check_may_wait()
+            waiting.wait(timeout_s, deadline_s)
+        except SkyloopError as error:
+            if isinstance(error, NoAnswerError) and type(action) is Takeoff:
+                self.let_go("it did not take off in time")
+            raise
+        except BaseException:
+            if type(action) is not Land:
+                self.let_go(f"nobody waits for {action.name} any more")
+            raise
 
     # Consumers -----------------------------------------------------------------------------------------------------
 
@@ -531,10 +661,14 @@ class DroneCore:
         if listener in self.listeners:
             self.listeners.remove(listener)
 
-    def report(self, where: str, error: Exception) -> None:
-        """Emit an event that a callback of the application raised an exception."""
+    def report(self, where: str, error: Exception | SystemExit) -> None:
+        """Emit an event that a callback of the application raised an exception; ``sys.exit()`` ends the flight."""
         text = f"{where} raised {type(error).__name__}: {error}"
         self.state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
+        if isinstance(error, SystemExit) and not self.ending:
+            self.commands.bar()
+            # No daemon: the interpreter waits for the landing.
+            threading.Thread(target=self.end_flight, name="skyloop-end").start()
 
 
 def _check_knows(capabilities: Capabilities, action: AnyAction) -> None:
@@ -544,6 +678,11 @@ def _check_knows(capabilities: Capabilities, action: AnyAction) -> None:
             f"{action.name} is not possible: neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a "
             "place; a proxy of an earlier version must be updated"
         )
+
+
+def _returns(feedback: Feedback) -> bool:
+    """Whether a failsafe flies the vehicle back to its start."""
+    return feedback.failsafe is Failsafe.LAND and feedback.return_phase is not ReturnPhase.NONE
 
 
 def _let_be(flies: bool) -> None:

@@ -102,8 +102,12 @@ class Drone:
     """A connected vehicle, made by :func:`skyloop.connect`.
 
     It is a context manager, and every method may be called from any thread. At the end of its block a drone that is in
-    the air and whose authority this application holds is landed, and the authority released. A lost proxy is
-    reconnected to for as long as it takes; then everything is restored except old set-points.
+    the air and whose authority this application holds is landed, and the authority released; from the beginning of that
+    end on, commands of other threads raise :class:`ClosedError`, but an emergency stop passes. One that others fly is
+    left to them, and one that returns for its battery to its return. ``sys.exit()`` in a callback ends the flight in
+    the same way. Ctrl-C, or a notebook's *Stop*, in a call that waits makes the vehicle hover; in :meth:`land` it lands
+    on. A call with ``wait=False`` has nothing to interrupt. A lost proxy is reconnected to for as long as it takes;
+    then everything is restored except old set-points.
 
     Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
     it is sent at once and repeated at ``rate_hz`` until the next one. Each command but :meth:`takeoff` and :meth:`land`
@@ -115,7 +119,7 @@ class Drone:
     - :class:`AuthorityError` while another application holds the authority or none was requested,
     - :class:`UsageError` for numbers that are not finite,
     - :class:`UnsupportedError` for a vehicle that takes no commands,
-    - :class:`ClosedError` after :meth:`close`.
+    - :class:`ClosedError` after :meth:`close`, and once the end of the block has begun.
 
     The names of the reading methods say what they give: the newest sample (:meth:`feedback`, :meth:`frame`), the next
     unread one (:meth:`next_feedback`, :meth:`next_frame`), or all that come (:meth:`frames`, :meth:`on_feedback`).
@@ -1080,7 +1084,8 @@ class Drone:
     def close(self) -> None:
         """Release the authority, then end the connection, all threads and a private proxy.
 
-        Does not land. Idempotent. Threads that wait for this drone get :class:`ClosedError`.
+        Does not land, except that a private proxy lands what flies before it ends. Idempotent. Threads that wait for
+        this drone get :class:`ClosedError`.
         """
         self._core.close()
 
@@ -1091,7 +1096,7 @@ class Drone:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        problem = self._core.leave()
+        problem = self._core.end_flight()
         if problem is not None:
             _log.warning("%s could not be left as it should: %s", self.name, problem)
 

@@ -7,8 +7,10 @@ import os
 import re
 import select
 import sys
+import threading
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Final
 
 from skyloop.child_process import GRACE_S, ChildProcess
@@ -18,14 +20,15 @@ from skyloop.transport.base import ClientHandler, Dialer, TransportClient
 
 _USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address; it prints why in one line
 _LOOK_S: Final = 0.05
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: as long as the child waits for its vehicle to land
 _numbers = itertools.count(1)
 
 
 class PrivateProxy:
     """Runs ``python -m skyloop proxy URI`` as a child process.
 
-    The child ends with :meth:`close`, and with this process, however that ends. Ctrl-C reaches only the application,
-    which can then land.
+    The child ends with :meth:`close`, and with this process, however that ends; a vehicle that still flies then on a
+    flight of ours it lands first. Ctrl-C reaches only the application, which can then land.
     """
 
     def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
@@ -40,6 +43,7 @@ class PrivateProxy:
         self.reach = self.name
         self.uri = uri
         self.scheduler = Scheduler()
+        self._served = False  # it may have a vehicle in the air
         self._process = ChildProcess([*command, uri, "--name", self.name, "--parent-fd", "0"])
         self.pid = self._process.pid  #: process id of the child
 
@@ -55,34 +59,37 @@ class PrivateProxy:
         from skyloop.transport.local import dial as local_dial
 
         inner = local_dial(self.name)
-        served = False
 
         def dial(handler: ClientHandler) -> TransportClient:
-            nonlocal served
             while True:
                 try:
                     end = inner(handler)
                 except (LinkError, UsageError) as error:
                     self._check_alive()
                     if time.monotonic() > deadline_s:
-                        if served:
+                        if self._served:
                             raise
                         raise NoAnswerError(
                             f"the proxy for {self.uri} did not start in time{self._process.quoted_output}"
                         ) from error
                     self._wait_for_output()
                 else:
-                    served = True
+                    self._served = True
                     return end
 
         return dial
 
     def close(self) -> None:
-        """End the child and wait for it. Idempotent.
+        """End the child and wait for it, 4 s at most while it lands what flies. Idempotent.
 
-        After 4 s it is terminated, after another 4 s killed.
+        One that never served is terminated after 4 s, and killed after another 4 s.
         """
-        self._process.close(GRACE_S, GRACE_S)
+        self._process.part()
+        if not self._served or self._process.wait(GRACE_S) is not None:
+            self._process.close(GRACE_S, GRACE_S)
+        else:
+            end = partial(self._process.close, ORPHAN_LANDS_WITHIN_S + GRACE_S, GRACE_S)
+            threading.Thread(target=end, name="skyloop-private-proxy", daemon=True).start()
 
     def _check_alive(self) -> None:
         child = self._process

@@ -7,7 +7,6 @@ import threading
 import time
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Literal, Self, TypeVar, get_args
@@ -30,7 +29,18 @@ from skyloop.errors import (
     UnknownNameError,
     UsageError,
 )
-from skyloop.messages import AnyAction, Attitude, Feedback, Hover, Idle, LinkState, Position, ResetEmergency, Velocity
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    Feedback,
+    Hover,
+    Idle,
+    Land,
+    LinkState,
+    Position,
+    ResetEmergency,
+    Velocity,
+)
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -197,8 +207,11 @@ class Swarm:
         self.each(lambda drone: drone.land(wait=wait, timeout_s=timeout_s), "land")
 
     def hover(self) -> dict[str, bool]:
-        """Stop and hold the position, with all active drones."""
-        return self.command(Hover())
+        """Stop and hold the position, with all active drones.
+
+        One that others fly is left to them: only its own ``drones[name].hover()`` takes it back.
+        """
+        return self.send(dict.fromkeys(self.active, Hover()))
 
     def idle(self) -> dict[str, bool]:
         """Ask for nothing: keep the authority and leave the vehicles as they are."""
@@ -327,7 +340,8 @@ class Swarm:
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
         """Make each action the newest set-point of the drone of its name, all sent together.
 
-        Drones that are set aside are left out. :attr:`spread` is how far apart the first and the last command left.
+        Drones that are set aside are left out. A hover takes no drone from others, see :meth:`hover`. :attr:`spread` is
+        how far apart the first and the last command left.
 
         Args:
             actions: By name of the drone.
@@ -351,7 +365,12 @@ class Swarm:
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
-            handed = ready[name].command(actions[name])
+            action, core = actions[name], ready[name]._core
+            if type(action) is Hover:  # of all, which is no decision to take one from a safety pilot
+                automatic = type(core.commands.newest) is not Land
+                handed = core.command(action, automatic=automatic)
+            else:
+                handed = ready[name].command(action)
             if handed:
                 stamps.append(time.monotonic_ns())
             return handed
@@ -520,17 +539,17 @@ class Swarm:
         if self.on_error == "continue":
             self._aside.update(errors)
             for name in errors:
-                _halt(self._drones[name])
+                self._drones[name]._core.let_go(f"{what} failed")
             if self.active:
                 return
             errors = dict(self._aside)
         others = {name: drone for name, drone in self._drones.items() if name not in errors}
         if self.on_error == "stop":
             for drone in others.values():
-                _halt(drone)
+                drone._core.let_go(f"{what} of another drone failed")
         elif self.on_error == "land":
-            _, more = in_parallel({name: drone.land for name, drone in others.items()})
-            errors = {**errors, **more}
+            reason = f"{what} of another drone failed"
+            errors = {**errors, **_problems(others, lambda drone: drone._core.bring_down(reason))}
         raise SwarmError(what, errors, len(self))
 
     # The end ---------------------------------------------------------------------------------------------------
@@ -546,8 +565,10 @@ class Swarm:
         if self._closed:
             return {}
         self._closed = True
-        left, errors = in_parallel({name: drone._core.leave for name, drone in self._drones.items()})
-        return errors | {name: problem for name, problem in left.items() if problem is not None}
+        for drone in self._drones.values():
+            if not drone.closed:
+                drone._core.commands.bar()  # all before the first lands
+        return _problems(self._drones, lambda drone: drone._core.end_flight())
 
     def close(self) -> None:
         """End all connections. Does not land. Idempotent."""
@@ -587,15 +608,28 @@ class Swarm:
 
 
 def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[str, R], dict[str, Exception]]:
-    """Call ``function`` for each item in turn: what it returned, and the :class:`SkyloopError` it raised, by name."""
+    """Call ``function`` for each item in turn: what it returned, and the :class:`SkyloopError` it raised, by name.
+
+    Any other exception is raised when all had their turn.
+    """
     results: dict[str, R] = {}
-    errors: dict[str, Exception] = {}
+    raised: dict[str, Exception] = {}
     for name, item in items.items():
         try:
             results[name] = function(item)
-        except SkyloopError as error:
-            errors[name] = error
-    return results, errors
+        except Exception as error:  # noqa: BLE001  (the others get theirs first)
+            raised[name] = error
+    return results, _expected(raised)
+
+
+def _expected(raised: Mapping[str, BaseException]) -> dict[str, Exception]:
+    """Return what was raised if it is all of Skyloop's own; raise the first that is not."""
+    errors: dict[str, Exception] = {}
+    for name, error in raised.items():
+        if not isinstance(error, SkyloopError):
+            raise error
+        errors[name] = error
+    return errors
 
 
 def _place(name: str, numbers: Sequence[float], speed: float | None) -> Position:
@@ -630,11 +664,14 @@ def _is(drone: Drone, predicate: Callable[[Feedback], bool]) -> bool:
     return drone.link.application in _THERE and predicate(drone.feedback())
 
 
-def _halt(drone: Drone) -> None:
-    """If the authority is held, hover in the air, else idle, so that a failed take-off is not carried out later."""
-    with suppress(SkyloopError):
-        if drone.authority.state == "held":
-            drone.hover() if drone.feedback().state.airborne else drone.idle()
+def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError | None]) -> dict[str, Exception]:
+    """End the flights of all at the same time; return what went wrong, by name."""
+
+    def job(drone: Drone) -> Callable[[], SkyloopError | None]:
+        return lambda: end(drone)
+
+    ended, errors = in_parallel({name: job(drone) for name, drone in drones.items()})
+    return errors | {name: problem for name, problem in ended.items() if problem is not None}
 
 
 def _not_sent(drone: Drone) -> LinkError:
@@ -682,11 +719,5 @@ def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict
     except BaseException:  # Ctrl-C: a take-off must not be carried out later
         interrupted.set()
         raise
-    errors: dict[str, Exception] = {}
-    for name in jobs:
-        error = raised.get(name)
-        if isinstance(error, SkyloopError):
-            errors[name] = error
-        elif error is not None:
-            raise error
+    errors = _expected({name: raised[name] for name in jobs if name in raised})
     return {name: results[name] for name in jobs if name in results}, errors

@@ -92,7 +92,7 @@ class Behaviour(Controller):
             if not self.blind:
                 self.blind = True
                 self.emit("no frames arrive: hovering", Severity.WARNING)
-            self.drone.hover()
+            self.drone._core.let_go("no frames arrive")
 
     def on_frame(self, frame: Frame) -> None:
         """Search the frame, send the law's set-point, and draw what was found."""
@@ -125,7 +125,7 @@ class Behaviour(Controller):
             self.emit(text, Severity.WARNING if problem else Severity.INFO)
         try:
             if problem:
-                self.drone.hover()
+                self.drone._core.let_go(problem)
             else:
                 self.steer(wanted)
         except AuthorityError:
@@ -153,7 +153,7 @@ class Behaviour(Controller):
         """
         self.done = True
         self.emit(text, severity)
-        self.drone.hover()
+        self.drone._core.let_go(text)
         self._end()
 
     def emit(self, text: str, severity: Severity = Severity.INFO) -> None:

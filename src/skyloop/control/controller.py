@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from skyloop.clock import NS_PER_S, nanoseconds
-from skyloop.errors import AuthorityError, SkyloopError, UsageError
+from skyloop.errors import AuthorityError, ClosedError, UsageError
 from skyloop.messages import LinkState
 
 if TYPE_CHECKING:
@@ -128,10 +127,10 @@ class Controller:
     def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
         """Call the callbacks until the time is over, ``until()`` is true, :meth:`stop` is called or the drone closes.
 
-        An exception in a callback makes an airborne vehicle hover, if this client holds authority, and is raised from
-        here. An :class:`AuthorityError` because another client took over does not end the run: :meth:`on_authority` is
-        called instead. A ready-made controller that has reached its end flies no second time: its next run returns at
-        once.
+        An exception in a callback, Ctrl-C and ``sys.exit()`` make an airborne vehicle hover, if this client flies it,
+        and are raised from here. An :class:`AuthorityError` because another client took over does not end the run:
+        :meth:`on_authority` is called instead. A ready-made controller that has reached its end flies no second time:
+        its next run returns at once.
 
         Args:
             seconds: How long to run, 0 or more; None sets no limit.
@@ -163,6 +162,9 @@ class Controller:
             with inbox:
                 self._inbox = inbox
                 return _Run(self, inbox, self._stopped).go(seconds, until)
+        except BaseException as error:
+            self.drone._core.let_go(f"{type(self).__name__} ended by {type(error).__name__}")
+            raise
         finally:
             self._inbox = None
 
@@ -209,7 +211,7 @@ class _Run:
     def _over(self, deadline_ns: int | None, until: Callable[[], bool] | None) -> Reason | None:
         if self._stopped.is_set():
             return "stopped"
-        if self._drone.closed or self._ended():
+        if self._drone._core.ending or self._ended():
             return "closed"
         if deadline_ns is not None and self._inbox.clock() >= deadline_ns:
             return "time"
@@ -236,14 +238,10 @@ class _Run:
 
     def _call(self, callback: Callable[[Any], None], sample: Any) -> None:
         dropped = self._dropped()
-        try:
-            if self._lost and self._drone.authority.state == "held":
-                self._lost = False
-                self._controller.on_authority(self._drone.authority)
-            self._guarded(callback, sample)
-        except BaseException:
-            self._hover()
-            raise
+        if self._lost and self._drone.authority.state == "held":
+            self._lost = False
+            self._controller.on_authority(self._drone.authority)
+        self._guarded(callback, sample)
         if self._dropped() > dropped:
             self._overruns += 1
 
@@ -253,6 +251,9 @@ class _Run:
     def _guarded(self, callback: Callable[[Any], None], sample: Any) -> None:
         try:
             callback(sample)
+        except ClosedError:
+            if not self._drone._core.ending:
+                raise
         except AuthorityError:
             status = self._drone.authority
             if status.state == "none":
@@ -260,9 +261,3 @@ class _Run:
             if not self._lost and status.state != "held":
                 self._lost = True
                 self._controller.on_authority(status)
-
-    def _hover(self) -> None:
-        """Make the vehicle hover if this client holds authority and it is airborne."""
-        with contextlib.suppress(SkyloopError):
-            if self._drone.authority.state == "held" and self._drone.feedback().state.airborne:
-                self._drone.hover()

@@ -8,7 +8,7 @@ from skyloop.control.behaviour import Behaviour
 from skyloop.control.landing_law import LandingLaw, LandingPhase
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.errors import UsageError
-from skyloop.messages import FlightState, Land, Polyline, Severity, Text
+from skyloop.messages import FlightState, Polyline, Severity, Text
 from skyloop.messages.annotation import Colour, Shape
 from skyloop.vision import MarkerDetector
 
@@ -117,6 +117,7 @@ class LandOnMarker(Behaviour):
     def steer(self, wanted: Velocity | Attitude) -> None:
         """Send velocities until the law is down; then let the vehicle's own landing stop the motors."""
         if self.phase is LandingPhase.DOWN:
-            self.drone.command(Land())  # each step anew: a link that is down for a moment ends no landing
+            # Each step anew: a link that is down for a moment ends no landing.
+            self.drone._core.let_go("it is down on its marker", land=True)
         else:
             super().steer(wanted)

@@ -297,7 +297,7 @@ class OnnxPolicy(Behaviour):
         if self._phase is PolicyPhase.FLYING:
             super().steer(wanted)
         else:
-            self.drone.hover()
+            self.drone._core.let_go("the policy gives no action")
 
     def _written(self, wanted: Velocity | Attitude) -> Text:
         names = ACTIONS[self.network.action]

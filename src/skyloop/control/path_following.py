@@ -18,7 +18,7 @@ from skyloop.control.path_law import PathLaw, PathSettings
 from skyloop.control.position import Fix, PositionSource, fix_of
 from skyloop.control.waypoint import Waypoint, lacking
 from skyloop.errors import AuthorityError, UsageError
-from skyloop.messages import EventKind, Feedback, Hover, Severity, Vector, Velocity
+from skyloop.messages import EventKind, Feedback, Severity, Vector, Velocity
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -111,7 +111,7 @@ class _PathFlyer(Controller):
 
     def _finish(self) -> None:
         self.done = True
-        self.drone.hover()
+        self.drone._core.let_go("the path is flown")
         self._end()
 
     def _lose(self) -> None:
@@ -120,9 +120,9 @@ class _PathFlyer(Controller):
             self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is not known: hovering", Severity.WARNING)
         if self._law is not None:
             self._law.pause()
-        self._send(Hover())
+        self.drone._core.let_go("the position is not known")
 
-    def _send(self, action: Velocity | Hover) -> None:
+    def _send(self, action: Velocity) -> None:
         """Send a set-point; while others have the authority the law pauses."""
         try:
             self.drone.command(action)

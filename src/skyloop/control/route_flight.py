@@ -113,12 +113,12 @@ class FlyRoute(Controller):
         for effect in effects:
             if isinstance(effect, Command):
                 self._leg = None
-                if isinstance(effect.action, Land):
-                    self.drone.land(wait=False)
-                elif isinstance(effect.action, Position):
+                if isinstance(effect.action, Position):
                     self._leg = self.drone._core.ask(effect.action)
-                else:
-                    self.drone.command(effect.action)
+                else:  # it hovers or lands because of how the route goes, not of a person
+                    self.drone._core.let_go(
+                        f"the route is {self.law.state.value}", land=isinstance(effect.action, Land)
+                    )
             elif isinstance(effect, TakePhoto):
                 threading.Thread(target=self._photograph, args=(effect,), name="skyloop-photo", daemon=True).start()
             else:

@@ -188,6 +188,9 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
         int  #: when it was sent, on the proxy's clock; not bounded, as an emergency stop counts whatever its time is
     )
     action: AnyAction
+    automatic: bool = (
+        False  #: asked for by the library, not by a person or a program: it never takes a vehicle from others
+    )
 
 
 class Applied(msgspec.Struct, frozen=True, array_like=True):

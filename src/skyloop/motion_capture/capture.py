@@ -372,7 +372,7 @@ class MotionCapture:
             raise ClosedError("this motion capture was closed")
 
 
-def _reported_by_the_log(name: str, error: Exception) -> None:
+def _reported_by_the_log(name: str, error: Exception | SystemExit) -> None:
     """Add nothing to what a listener logs: a motion capture has no events for programs' errors."""
 
 

@@ -356,8 +356,12 @@ class CommandHandler:
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
         intent.action = action  # a set-point may have decayed to hover
-        known = vehicle.feedback_now
-        decision = checks.decide(action, intent, state, vehicle.link_state, known, now_ns, new=new)
+        vehicle_now = vehicle.feedback_now
+        automatic = command.automatic
+        new = new and not automatic  # what the library does by itself is nobody's decision
+        decision = checks.decide(
+            action, intent, state, vehicle.link_state, vehicle_now, now_ns, new=new, automatic=automatic
+        )
         if decision.refusal is not None:
             if decision.action is not None:
                 self._stop_instead(decision.action, now_ns)
@@ -385,7 +389,7 @@ class CommandHandler:
             checks.back = None
         self._tell(session, intent)
         applied_ns = self._count_applied(command)
-        if not self.ladder.idle:
+        if not (self.ladder.idle or (command.automatic and self.ladder.step is Failsafe.LAND)):
             self._apply_failsafe(self.ladder.fresh_command(), now_ns)
         return applied, applied_ns
 

@@ -26,6 +26,7 @@ from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: how long a signalled proxy waits for its vehicle to land
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy does whose program is gone
 _POLL_S: Final = 0.2
 GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this; until then nothing is printed about waiting
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
@@ -105,7 +106,7 @@ def serve(
     ``serving`` while it is not, and then, whenever that changes, what is waited for, why it failed last and what to do
     (not with ``parent_fd``). Ends on SIGINT or
     SIGTERM, landing first for at most ``land_within_s`` [s] if the vehicle flies; a second signal waits no longer. With
-    ``parent_fd``, the reading end of a pipe: ends at once when that reads end of file, which the death of the parent
+    ``parent_fd``, the reading end of a pipe: lands and ends when that reads end of file, which the death of the parent
     causes, and leaves SIGINT to the parent, as a terminal sends it to both. ``look`` is called some times a second:
     what it returns about the keys is logged, and published as an event.
 
@@ -169,7 +170,10 @@ def run(
         for proxy in proxies:
             proxy.start()
         if parent_fd is not None:
-            on_parent_end(partial(shutdown.request, "its parent process ended", hurry=True), parent_fd)
+            # Nobody starts a private one again, or can fly what it leaves in the air.
+            on_parent_end(partial(shutdown.request, "its parent process ended", hurry=records), parent_fd)
+            if not records:
+                land_within_s = max(land_within_s, ORPHAN_LANDS_WITHIN_S)
         lines = [_announced(proxy) for proxy in proxies]
         # Looks up now and then: the kernel may hand a signal to any thread, and that does not wake this one.
         while not shutdown.requested.wait(_POLL_S):

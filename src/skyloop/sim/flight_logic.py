@@ -50,6 +50,7 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
     _S.HOVERING: _IN_FLIGHT,
     _S.FLYING: _IN_FLIGHT,
     _S.LANDING: {
+        _H.HOVER: _S.HOVERING,  # as autopilots do: it breaks the landing off
         _H.TAKEOFF: _S.TAKING_OFF,
         _H.TOUCHED_GROUND: _S.LANDED,
         _H.STOP: _S.EMERGENCY,

@@ -143,6 +143,7 @@ class CommandChecks:
         now_ns: int,
         *,
         new: bool,
+        automatic: bool = False,
     ) -> Decision:
         """Decide what the vehicle does of a command whose intent is under way. Not for an emergency stop.
 
@@ -153,13 +154,16 @@ class CommandChecks:
             link: the state of the link to the vehicle.
             feedback: the newest sample, for altitude and position; None: none came yet.
             now_ns: the time now, on the proxy's clock [ns].
-            new: whether the application newly asked for it; else the library repeats it.
+            new: whether the application newly asked for it; else the library repeats it, or asks for it by itself.
+            automatic: whether the library asks for it by itself.
         """
         kind = type(action)
         policy = STATE_POLICIES[kind][state]
         if new and kind is ReturnToStart:
             self.back = None
-        problem = self._problem(action, policy, state, link, new)
+        if automatic and (state is FlightState.LANDING or self._ladder.step is Failsafe.LAND):
+            policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
+        problem = self._problem(action, policy, state, link, new=new, automatic=automatic)
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
@@ -210,9 +214,15 @@ class CommandChecks:
         decision = flight.step(self.airspace.apart(), feedback, now_ns)
         return decision.why if decision.action is None and decision.refusal is not None else ""
 
-
     def _problem(
-        self, action: AnyAction, policy: StatePolicy, state: FlightState, link: LinkState, new: bool
+        self,
+        action: AnyAction,
+        policy: StatePolicy,
+        state: FlightState,
+        link: LinkState,
+        *,
+        new: bool,
+        automatic: bool,
     ) -> tuple[Refusal, str] | None:
         """What forbids a command of the holder, whatever the policy of the flight state is."""
         kind = type(action)
@@ -225,11 +235,12 @@ class CommandChecks:
             others = self._flight.others
             if kind in SET_POINTS:
                 return Refusal.WRONG_STATE, f"{others}: hover, take off or land first to take it over"
-            if not new and policy is not StatePolicy.HOLD and kind in _TAKING:
-                return Refusal.WRONG_STATE, f"{others}, and a repeated command does not take it back: send a new one"
+            if not new and (automatic or policy is not StatePolicy.HOLD) and kind in _TAKING:
+                what = "what the library does by itself" if automatic else "a repeated command"
+                return Refusal.WRONG_STATE, f"{others}, and {what} does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
-        if self._ladder.lands_for_battery and kind in SET_POINTS:
+        if self._ladder.lands_for_battery and (kind in SET_POINTS or automatic):
             what = "returns to its start" if self._ladder.returning else "lands"
             return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
         if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:

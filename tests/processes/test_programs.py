@@ -1,0 +1,71 @@
+"""Programs that end in flight without having landed: killed over their own proxy, or at the end of their script."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+
+import pytest
+
+import skyloop
+from skyloop.errors import UnknownNameError
+from tests.processes.conftest import Process, eventually
+
+pytestmark = pytest.mark.process
+
+SIM = "sim://?world=empty&cameras=none&speed=3&wind=0"
+BEGINS = """
+import atexit, sys, threading, time
+import skyloop
+
+drone = skyloop.connect(sys.argv[1], name="program")
+drone.takeoff()
+
+def fly():
+    while True:
+        drone.velocity(forward=0.2)
+        time.sleep(0.05)
+
+threading.Thread(target=fly, daemon=True).start()
+drone.wait("flying")
+print("flying", drone.name, "end", flush=True)
+"""
+STAYS = BEGINS + "time.sleep(60)"
+LEAVES = BEGINS
+LANDS_AT_EXIT = BEGINS.replace("drone.takeoff()", "drone.takeoff()\natexit.register(drone.__exit__, None, None, None)")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP])
+def test_a_program_that_is_killed_over_its_own_proxy_leaves_a_drone_that_lands(
+    start: Callable[..., Process], number: signal.Signals
+) -> None:
+    program = start("-c", STAYS, SIM)
+    program.until("end")
+    name = program.text.split()[1]
+    with skyloop.connect(name, access="observe") as observer:
+        states: list[str] = []
+        observer.on_feedback(lambda feedback: states.append(feedback.state.value), inline=True)
+        program.signal(number)
+        eventually(lambda: "landed" in states, "it lands")
+        assert "landing" in states
+        eventually(lambda: observer.link.application.value == "lost", "its proxy ends")
+    with pytest.raises(UnknownNameError):
+        skyloop.connect(name, access="observe")
+
+
+@pytest.mark.parametrize(("program", "last"), [(LEAVES, "none"), (LANDS_AT_EXIT, "program")])
+def test_a_script_that_ends_in_flight_leaves_a_drone_that_lands(
+    start: Callable[..., Process], proxy: Callable[..., Process], program: str, last: str
+) -> None:
+    """Its thread is a daemon and commands on; the end of the interpreter ends it, or what it registered lands."""
+    proxy()
+    with skyloop.connect("alpha", access="observe") as observer:
+        owners: list[str] = []
+        observer.on_feedback(
+            lambda feedback: owners.append(feedback.owner or "none") if feedback.state == "landing" else None,
+            inline=True,
+        )
+        script = start("-c", program, "alpha")
+        assert script.wait(60.0) == 0, script.text
+        observer.wait("landed", timeout_s=30.0)
+        assert (last == "program") is (owners[0] == "program")
