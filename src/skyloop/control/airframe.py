@@ -17,7 +17,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -110,10 +110,8 @@ class Airframe:
         self.by_tilt = False
         self.interruptions = 0
         self._needs = needs
-        self._known_ns: dict[Part, int] = {}
+        self._known: dict[Part, tuple[int, Any]] = {}  # when, and what
         self._history: deque[Motion] = deque()
-        self._altitude: float | None = None
-        self._position: Vector | None = None
         self._reckoning = TiltVelocity()
         self._tilts: deque[tuple[int, float, float]] = deque()
 
@@ -133,22 +131,22 @@ class Airframe:
             while seconds(at_ns - self._tilts[0][0]) > _TILTING_S:
                 self._tilts.popleft()
         if yaw is not None:
-            self._known_ns[Part.YAW] = at_ns
+            self._known[Part.YAW] = at_ns, yaw
             if roll is not None and pitch is not None:
-                self._known_ns[Part.ATTITUDE] = at_ns
+                self._known[Part.ATTITUDE] = at_ns, (roll, pitch, yaw)
             velocity = self._reckoning.step(feedback) if self.by_tilt else feedback.velocity_m_s
             if velocity is not None:
-                self._known_ns[Part.VELOCITY] = at_ns
+                self._known[Part.VELOCITY] = at_ns, velocity
                 self._integrate(feedback, velocity, yaw)
         if feedback.altitude_m is not None:
-            self._known_ns[Part.HEIGHT], self._altitude = at_ns, feedback.altitude_m
+            self._known[Part.HEIGHT] = at_ns, feedback.altitude_m
         if feedback.position_m is not None:
-            self._known_ns[Part.POSITION], self._position = at_ns, feedback.position_m
+            self._known[Part.POSITION] = at_ns, feedback.position_m
 
     def age_s(self, part: Part, now_ns: int) -> float:
         """Return how long ago a part of the motion was reported [s]; infinite if it never was."""
-        known_ns = self._known_ns.get(part)
-        return math.inf if known_ns is None else seconds(now_ns - known_ns)
+        known = self._known.get(part)
+        return math.inf if known is None else seconds(now_ns - known[0])
 
     def missing(self, now_ns: int) -> str:
         """Return what of the needed parts is not known now, as a sentence; empty if nothing is missing."""
@@ -157,11 +155,18 @@ class Airframe:
 
     def altitude_m(self, now_ns: int) -> float | None:
         """Return the newest height above the ground [m]; None while it is not known."""
-        return self._altitude if self.age_s(Part.HEIGHT, now_ns) <= STALE_S else None
+        altitude: float | None = self._newest(Part.HEIGHT, now_ns)
+        return altitude
 
-    def position_m(self, now_ns: int) -> Vector | None:
-        """Return the newest position in world axes [m]; None while it is not known."""
-        return self._position if self.age_s(Part.POSITION, now_ns) <= STALE_S else None
+    def yaw_rad(self, now_ns: int) -> float | None:
+        """Return the newest yaw [rad]; None while it is not known."""
+        yaw: float | None = self._newest(Part.YAW, now_ns)
+        return yaw
+
+    def position_m(self, now_ns: int, *, longest_s: float = STALE_S) -> Vector | None:
+        """Return the newest position in world axes [m]; None if it was not reported for longer than ``longest_s``."""
+        position: Vector | None = self._newest(Part.POSITION, now_ns, longest_s)
+        return position
 
     @property
     def newest(self) -> Motion | None:
@@ -205,6 +210,9 @@ class Airframe:
             return 0.0
         _, rolls, pitches = zip(*self._tilts, strict=True)
         return math.hypot(max(rolls) - min(rolls), max(pitches) - min(pitches)) / (_TILTING_S / 2)
+
+    def _newest(self, part: Part, now_ns: int, longest_s: float = STALE_S) -> Any:
+        return self._known[part][1] if self.age_s(part, now_ns) <= longest_s and part in self._known else None
 
     def _integrate(self, feedback: Feedback, levelled: Vector, yaw: float) -> None:
         last, at_ns = self.newest, feedback.captured_ns
