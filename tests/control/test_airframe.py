@@ -23,6 +23,7 @@ from skyloop.control.landing_law import LandingLaw, LandingPhase
 from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Attitude, Feedback, FlightState, Velocity
 from skyloop.sim.camera import FRONT_CAMERA
+from skyloop.vision import BlobSighting
 
 GRAVITY = 9.80665
 STILL: dict[str, Any] = {
@@ -146,6 +147,20 @@ def test_what_is_not_finite_counts_as_missing(name: str, wrong: float) -> None:
     assert airframe.feedback is not None
     assert getattr(airframe.feedback, name) is None
     assert all(getattr(airframe.feedback, other) == STILL[other] for other in STILL if other != name)
+
+
+def test_samples_after_one_that_was_stamped_ahead_are_not_ignored() -> None:
+    airframe = Airframe(Part.VELOCITY)
+    airframe.add(state(1.0, velocity_m_s=(1.0, 0.0, 0.0)))
+    airframe.add(state(1.1, velocity_m_s=(1.0, 0.0, 0.0)))
+    airframe.add(state(9.0))
+    assert airframe.missing(nanoseconds(1.2)) == "the vehicle's velocity is not known"
+    airframe.add(state(1.2))
+    assert airframe.missing(nanoseconds(1.2)) == ""
+    motion = airframe.at(nanoseconds(1.2))
+    assert motion is not None
+    assert motion.position[0] == pytest.approx(0.1, abs=0.3), "near where it was"
+    assert airframe.interruptions >= 1
 
 
 # Laws --------------------------------------------------------------------------------------------------------------
@@ -284,6 +299,16 @@ def test_nan_anywhere_yields_no_set_point_that_is_not_finite_or_grows(
             assert max(map(abs, (setpoint.forward, setpoint.left, setpoint.up, setpoint.yaw_rate))) < 9.0
         else:
             assert max(map(abs, (setpoint.roll, setpoint.pitch, setpoint.climb))) < 1.0
+
+
+def test_an_obstacle_whose_edge_the_lens_can_not_tell_counts_as_close() -> None:
+    """It ended the flight by an error about a fuzzy variable."""
+    law = AvoidLaw(9.0)
+    law.feedback(state(1.0))
+    law.see([BlobSighting((0.0, 0.0, 9.0, 9.0), math.nan, 0.1)], nanoseconds(1.0))
+    law.step(nanoseconds(1.0))
+    assert law.phase is AvoidPhase.AVOIDING
+    assert law.step(nanoseconds(1.2)).left < 0.0, "away from it"
 
 
 def test_of_the_phases_that_a_law_ends_in_none_is_reached_while_it_is_blind() -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Final
 
@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.clock import seconds
+from skyloop.clock import nanoseconds, seconds
 from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped
 from skyloop.messages import Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler, wrap_angle
@@ -119,10 +119,13 @@ class Airframe:
         """Update with the next sample; one that is not newer than the last is ignored.
 
         Args:
-            feedback: Numbers in it that are not finite count as missing.
+            feedback: Numbers in it that are not finite count as missing. One that is older by seconds begins anew: the
+                one before was stamped ahead, or the proxy's clock was set back.
         """
         at_ns = feedback.captured_ns
-        if self.feedback is not None and at_ns <= self.feedback.captured_ns:
+        if self.feedback is not None and seconds(self.feedback.captured_ns - at_ns) > _HISTORY_S:
+            self._begin_anew(at_ns)
+        elif self.feedback is not None and at_ns <= self.feedback.captured_ns:
             return
         self.feedback = feedback = _finite(feedback)
         roll, pitch, yaw = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
@@ -150,7 +153,7 @@ class Airframe:
 
     def missing(self, now_ns: int) -> str:
         """Return what of the needed parts is not known now, as a sentence; empty if nothing is missing."""
-        old = [part.value for part in self._needs if self.age_s(part, now_ns) > STALE_S]
+        old = [part.value for part in self._needs if abs(self.age_s(part, now_ns)) > STALE_S]
         return f"the vehicle's {' and '.join(old)} {'is' if len(old) == 1 else 'are'} not known" if old else ""
 
     def altitude_m(self, now_ns: int) -> float | None:
@@ -212,7 +215,17 @@ class Airframe:
         return math.hypot(max(rolls) - min(rolls), max(pitches) - min(pitches)) / (_TILTING_S / 2)
 
     def _newest(self, part: Part, now_ns: int, longest_s: float = STALE_S) -> Any:
-        return self._known[part][1] if self.age_s(part, now_ns) <= longest_s and part in self._known else None
+        return self._known[part][1] if abs(self.age_s(part, now_ns)) <= longest_s and part in self._known else None
+
+    def _begin_anew(self, at_ns: int) -> None:
+        """Keep nothing but where it was last: in odometry axes it is somewhere near that."""
+        self._known.clear()
+        self._tilts.clear()
+        self._reckoning = TiltVelocity()
+        if self._history:
+            before = replace(self._history[-1], at_ns=at_ns - nanoseconds(STALE_S))
+            self._history = deque([before])
+            self.interruptions += 1
 
     def _integrate(self, feedback: Feedback, levelled: Vector, yaw: float) -> None:
         last, at_ns = self.newest, feedback.captured_ns

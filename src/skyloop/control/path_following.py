@@ -88,7 +88,7 @@ class _PathFlyer(Controller):
         fix = fix_of(feedback) if self._source is None else self._source()
         if self._source is None and fix is None and self._law is None:
             raise UsageError(f"it can't fly a path: {lacking(feedback)}; or give the controller a source of positions")
-        if fix is None or not fix.finite or feedback.captured_ns - fix.at_ns > self._max_age_ns:
+        if fix is None or not fix.finite or abs(feedback.captured_ns - fix.at_ns) > self._max_age_ns:
             self._lose()
             return
         if self.lost:
