@@ -67,6 +67,9 @@ def test_a_landing_that_others_took_over_does_not_go_on_where_they_give_it_back(
         pilot.run(seconds=1.0)
         assert not pilot.landed
         assert drone.feedback().state is FlightState.FLYING
+        drone.land()
+        assert pilot.run(seconds=5.0).reason == "stopped", "others have landed it"
+        assert not pilot.landed
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
 from skyloop.clock import nanoseconds
-from skyloop.control.airframe import AirframeLaw
+from skyloop.control.airframe import AirframeLaw, taken_over
 from skyloop.control.controller import Controller
 from skyloop.errors import AuthorityError, UnknownNameError, UsageError
 from skyloop.messages import Attitude, CameraInfo, EventKind, Feedback, Severity, Velocity
@@ -114,11 +114,14 @@ class Behaviour(Controller):
             now_ns: On the proxy's clock.
         """
         law = self._law
+        known = law.airframe.feedback if isinstance(law, AirframeLaw) else None
+        if isinstance(law, AirframeLaw) and known is not None and taken_over(known):
+            law.pause()
         wanted = law.step(now_ns)
         self._report_phase()
         if self.done:
             return
-        problem = law.problem if isinstance(law, AirframeLaw) and law.airframe.feedback is not None else ""
+        problem = law.problem if isinstance(law, AirframeLaw) and known is not None else ""
         if problem != self.problem:
             self.problem = problem
             text = f"{problem}: hovering" if problem else "the vehicle's motion is known again: flying on"

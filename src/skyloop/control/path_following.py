@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds
+from skyloop.control.airframe import taken_over
 from skyloop.control.controller import Controller
 from skyloop.control.heading import FixedYaw, YawMode
 from skyloop.control.path import Path, Polyline
@@ -96,6 +97,8 @@ class _PathFlyer(Controller):
             self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is known again: flying on", Severity.INFO)
         if self._law is None:
             self._law = self._begin(fix)
+        if taken_over(feedback):
+            self._law.pause()
         wanted = self._law.step(fix)
         self._look(self._law, fix)
         if not self.done:
