@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from skyloop.client import Drone
 from skyloop.control import Circle, DeadReckoning, Fix, FixedYaw, FollowPath, Polyline, Waypoint, Waypoints
 from skyloop.errors import AuthorityError, UsageError
-from skyloop.messages import AnyAction, Failsafe, Feedback
+from skyloop.messages import Failsafe, Feedback
 from skyloop.stepping.rehearsal import Radio, rehearse
 
 CALM = "sim://?world=empty&cameras=none&wind=0"
@@ -164,17 +164,12 @@ def test_while_others_fly_it_a_path_waits_and_integrates_nothing() -> None:
         assert flight._law is not None
         taken = flight._law.time_s
 
-        def refused(action: AnyAction) -> bool:
-            raise AuthorityError(f"{action.name} refused: taken over")
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(drone, "command", refused)
-            patch.setattr(drone._core, "command", refused)
-            feedback = drone.feedback()
-            for k in range(1, 400):
-                later = replace(feedback, captured_ns=feedback.captured_ns + k * 25_000_000, position_m=(0.0, 0.4, 1.0))
-                with pytest.raises(AuthorityError):
-                    flight.on_feedback(later)
+        drone.release_authority()
+        feedback = drone.feedback()
+        for k in range(1, 400):
+            later = replace(feedback, captured_ns=feedback.captured_ns + k * 25_000_000, position_m=(0.0, 0.4, 1.0))
+            with pytest.raises(AuthorityError):
+                flight.on_feedback(later)
         assert flight._law.time_s == taken
         assert not flight._law._loop.integral.any()
 

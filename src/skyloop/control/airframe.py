@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped
-from skyloop.messages import Failsafe, Feedback, FlightState, Vector, Velocity
+from skyloop.messages import Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler, wrap_angle
 
 Array = NDArray[np.float64]
@@ -360,11 +360,6 @@ class VelocityLaw(AirframeLaw):
     def _setpoint(self, now_ns: int) -> Array:
         """Return forward, left, up [m/s] and yaw rate [rad/s], (4,), before the limits."""
         raise NotImplementedError
-
-
-def taken_over(feedback: Feedback) -> bool:
-    """Whether set-points have no effect, because another controller or a failsafe has the vehicle."""
-    return bool(feedback.others) or feedback.failsafe is not Failsafe.NONE
 
 
 def _yaw_rate(feedback: Feedback, yaw: float, last: Motion | None) -> float:

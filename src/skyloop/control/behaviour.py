@@ -7,9 +7,9 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
 from skyloop.clock import nanoseconds
-from skyloop.control.airframe import AirframeLaw, taken_over
+from skyloop.control.airframe import AirframeLaw
 from skyloop.control.controller import Controller
-from skyloop.errors import AuthorityError, UnknownNameError, UsageError
+from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Attitude, CameraInfo, EventKind, Feedback, Severity, Velocity
 from skyloop.messages.annotation import Shape
 
@@ -115,7 +115,7 @@ class Behaviour(Controller):
         """
         law = self._law
         known = law.airframe.feedback if isinstance(law, AirframeLaw) else None
-        if isinstance(law, AirframeLaw) and known is not None and taken_over(known):
+        if isinstance(law, AirframeLaw) and known is not None and self._is_overruled(known):
             law.pause()
         wanted = law.step(now_ns)
         self._report_phase()
@@ -126,15 +126,10 @@ class Behaviour(Controller):
             self.problem = problem
             text = f"{problem}: hovering" if problem else "the vehicle's motion is known again: flying on"
             self.emit(text, Severity.WARNING if problem else Severity.INFO)
-        try:
-            if problem:
-                self.drone.hover()
-            else:
-                self.steer(wanted)
-        except AuthorityError:
-            if isinstance(law, AirframeLaw):
-                law.pause()  # others fly it now
-            raise
+        if problem:
+            self.drone.hover()
+        else:
+            self.steer(wanted)
 
     def steer(self, wanted: Velocity | Attitude) -> None:
         """Send a set-point to the vehicle.

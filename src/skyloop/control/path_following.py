@@ -11,15 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds
-from skyloop.control.airframe import taken_over
 from skyloop.control.controller import Controller
 from skyloop.control.heading import FixedYaw, YawMode
 from skyloop.control.path import Path, Polyline
 from skyloop.control.path_law import PathLaw, PathSettings
 from skyloop.control.position import Fix, PositionSource, fix_of
 from skyloop.control.waypoint import Waypoint, lacking
-from skyloop.errors import AuthorityError, UsageError
-from skyloop.messages import EventKind, Feedback, Hover, Severity, Vector, Velocity
+from skyloop.errors import UsageError
+from skyloop.messages import EventKind, Feedback, Severity, Vector
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -97,12 +96,12 @@ class _PathFlyer(Controller):
             self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is known again: flying on", Severity.INFO)
         if self._law is None:
             self._law = self._begin(fix)
-        if taken_over(feedback):
+        if self._is_overruled(feedback):
             self._law.pause()
         wanted = self._law.step(fix)
         self._look(self._law, fix)
         if not self.done:
-            self._send(wanted)
+            self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def _begin(self, fix: Fix) -> PathLaw:
         """Return the law for the first fix."""
@@ -123,16 +122,7 @@ class _PathFlyer(Controller):
             self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is not known: hovering", Severity.WARNING)
         if self._law is not None:
             self._law.pause()
-        self._send(Hover())
-
-    def _send(self, action: Velocity | Hover) -> None:
-        """Send a set-point; while others have the authority the law pauses."""
-        try:
-            self.drone.command(action)
-        except AuthorityError:
-            if self._law is not None:
-                self._law.pause()
-            raise
+        self.drone.hover()
 
 
 class FollowPath(_PathFlyer):
