@@ -270,6 +270,25 @@ def test_what_was_seen_before_a_gap_is_not_flown_to_after_it() -> None:
     assert (follow.mode, gate.phase, landing.phase) == (Mode.SEARCHING, GatePhase.SEARCHING, LandingPhase.SEARCHING)
 
 
+@pytest.mark.parametrize("number", [0, 1, 4])
+def test_after_a_while_without_set_points_they_begin_from_rest(number: int) -> None:
+    """Frames had stopped, and the vehicle hovered: what it was asked for before is not what it does."""
+    law, fastest = laws()[number], 0.0
+    for k in range(80):
+        at_s = 1.0 + 0.05 * k
+        sample = state(at_s)
+        law.feedback(sample)
+        see(law, sample, AHEAD + np.array([1.0, 0.0, 0.0]))
+        if k < 40 or k > 60:
+            setpoint = step(law, at_s)
+            assert isinstance(setpoint, Velocity)
+            if k < 40:
+                fastest = max(fastest, setpoint.forward)
+            elif k == 61:
+                assert (setpoint.forward, setpoint.left) == (0.0, 0.0)
+    assert fastest > 0.3
+
+
 ANY = st.one_of(st.floats(-3.0, 3.0), st.sampled_from([math.nan, math.inf, -math.inf]))
 SAMPLES = st.fixed_dictionaries(
     {

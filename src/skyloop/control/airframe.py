@@ -314,10 +314,10 @@ class AirframeLaw:
         """Forget what was noted in odometry axes, because the motion was interrupted."""
 
     def _ready(self, now_ns: int) -> bool:
-        """Whether all is known that the law needs; else it pauses."""
+        """Whether all is known that the law needs. Else it pauses, and where its last set-point was long ago."""
         self.problem = self.airframe.missing(now_ns)
         self._altitude = self.airframe.altitude_m(now_ns)
-        if self.problem:
+        if self.problem or (self._last_ns is not None and seconds(now_ns - self._last_ns) > STALE_S):
             self.pause()
         return not self.problem
 
