@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from contextlib import suppress
 from typing import Self
 
@@ -10,8 +11,10 @@ from skyloop.client.commands import ANSWER_S
 from skyloop.client.core import DroneCore
 from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError, RefusedError, SkyloopError
-from skyloop.messages import AnswerTakeover, AnyAction, FlightState, LinkState, Refused
+from skyloop.messages import AnswerTakeover, AnyAction, Failsafe, FlightState, Hover, Land, LinkState, Refused
 from skyloop.transport.base import Dialer
+
+_log = logging.getLogger(__name__)
 
 
 class PilotConnection(Drone):
@@ -92,11 +95,38 @@ class PilotConnection(Drone):
         """Whether a failsafe, a lost link or a lost lease ended this action, while it was the newest."""
         return self._core.commands.lapsed(action)
 
-    def hover_if_held(self) -> None:
-        """Hover; if somebody else has the authority, or the link is lost, the proxy sees to it."""
+    def let_go(self, reason: str, *, land: bool = False) -> bool:
+        """Hover, or land, because the cockpit finds that it has to: the only place where it does so by itself.
+
+        Nobody decided that, so it takes the vehicle from nobody who flies it by other means, and ends no failsafe, as a
+        return because the battery is low. Never raises; if somebody else has the authority, or the link is lost, the
+        proxy sees to it.
+
+        Args:
+            reason: Why, for the log.
+            land: Land, rather than hover.
+
+        Returns:
+            Whether it was sent.
+        """
+        feedback = None
+        with suppress(LinkError):
+            feedback = self.feedback()
         with suppress(SkyloopError):
-            if self.authority.state == "held":
-                self.hover()
+            if self.authority.state != "held":
+                return False
+            left = feedback is not None and bool(feedback.others or feedback.failsafe is not Failsafe.NONE)
+            if not left and self.command(Land() if land else Hover()):
+                _log.info("%s: %s, because %s", self.name, "lands" if land else "hovers", reason)
+                return True
+            self.idle()  # what was flown before is over, and what was not sent now must not be sent later
+        return False
+
+    def knows_since(self, at_ns: int) -> bool:
+        """Whether there is feedback from after a time on the proxy's clock."""
+        with suppress(LinkError):
+            return self.feedback().published_ns > at_ns
+        return False
 
     @property
     def is_flying(self) -> bool:
