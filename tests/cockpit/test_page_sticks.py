@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -35,7 +36,7 @@ def speed(drone: Drone) -> float:
 
 
 @contextmanager
-def flown(deck: Deck, *names: str, **options: object) -> Iterator[tuple[DronePage, dict[str, DronePage], list[Drone]]]:
+def flown(deck: Deck, *names: str, **options: Any) -> Iterator[tuple[DronePage, dict[str, DronePage], list[Drone]]]:
     """A page with these drones in the air, all flown by it; the page of each, and who watches it."""
     for name in names:
         deck.proxy(name)
@@ -66,7 +67,7 @@ def stays(page: DronePage, drone: Drone, seconds: float = 1.5) -> bool:
 
 
 def until_it_flies(page: DronePage, drone: Drone, push: Callable[[], object], let_go: Callable[[], object]) -> None:
-    """Push, and again where a busy machine stalled the page: what is held then has to be let go first."""
+    """Push, and again where a busy machine stalled the page: what is held then is let go first."""
     pushed_s = 0.0
 
     def flies() -> bool:
@@ -74,6 +75,7 @@ def until_it_flies(page: DronePage, drone: Drone, push: Callable[[], object], le
         if time.monotonic() - pushed_s > 3.0:
             if pushed_s:
                 let_go()
+                page.take_off()  # where control ran out meanwhile
                 page.page.wait_for_timeout(300)
             push()
             pushed_s = time.monotonic()
@@ -110,7 +112,7 @@ def test_a_finger_on_another_drone_flies_that_one_with_nothing_and_lifted_finger
         assert other is not None
         with fingers.on(page.page) as hand:
             thumb = Thumb(pages["left"], hand)
-            until_it_flies(page, left, thumb.push, thumb.lift)
+            until_it_flies(pages["left"], left, thumb.push, thumb.lift)
             hand.put("other", other["x"] + 4, max(other["y"] + 5, 700.0))  # its margin, where it can be seen
             hand.lift("other")
             page.until(lambda: pages["right"].pane.get_attribute("data-selected") == "true", "it is selected")
@@ -143,12 +145,12 @@ def test_a_key_that_is_held_for_one_drone_does_not_fly_another(deck: Deck) -> No
     with flown(deck, "one", "two", viewport={"width": 1400, "height": 1900}) as (page, pages, (one, two)):
         pages["one"].pane.locator("h2").click()
         keyboard = page.page.keyboard
-        until_it_flies(page, one, lambda: keyboard.down("w"), lambda: keyboard.up("w"))
+        until_it_flies(pages["one"], one, lambda: keyboard.down("w"), lambda: keyboard.up("w"))
         pages["two"].pane.locator("h2").click()
         page.until(lambda: one.feedback().state is FlightState.HOVERING, "it hovers")
         assert stays(page, two)
         keyboard.up("w")
-        until_it_flies(page, two, lambda: keyboard.down("w"), lambda: keyboard.up("w"))
+        until_it_flies(pages["two"], two, lambda: keyboard.down("w"), lambda: keyboard.up("w"))
         keyboard.up("w")
 
 

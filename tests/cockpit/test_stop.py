@@ -44,7 +44,7 @@ def test_a_stop_whose_first_packets_are_lost_comes_while_the_sticks_are_held(cli
             pilot.wait("done", do="stop")
             assert node.flyer.state is FlightState.EMERGENCY
             assert node.stops_lost == 0
-            assert "motors are being stopped" in next(
+            assert "emergency stop is under way" in next(
                 told["why"] for told in pilot.told if told.get("do") == "fly" and told["type"] == "refused"
             )
     kinds = [type(action) for action in node.flyer.applied]
@@ -65,7 +65,7 @@ def test_a_stop_that_does_not_show_is_never_done_and_the_drone_hovers(
             pilot.say("stop", n=71)
             pilot.wait("sent", do="stop", n=71)
             pilot.say("land")
-            assert "being stopped" in pilot.wait("refused", do="land")["why"], "nothing takes its place meanwhile"
+            assert "under way" in pilot.wait("refused", do="land")["why"], "nothing takes its place meanwhile"
             assert "has not shown" in pilot.wait("refused", do="stop", n=71)["why"]
             until(lambda: node.flyer.applied[-1] == Hover(), "what it flew is not flown on")
             assert not [told for told in pilot.told if told["type"] == "done" and told["do"] == "stop"]

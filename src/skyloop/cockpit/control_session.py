@@ -407,7 +407,7 @@ class ControlSession:
         if pilot is None or pilot.authority.state == "none":
             raise AuthorityError("take control first", code="no_authority")
         if self._station.is_stopping:
-            raise RefusedError("its motors are being stopped")
+            raise RefusedError("an emergency stop is under way: nothing else is commanded before it shows")
         if pilot.authority.state != "held":
             raise AuthorityError(f"{pilot.authority.holder or 'another application'} has control", code="no_authority")
         return pilot
@@ -567,11 +567,10 @@ class ControlSession:
         """Start work that takes a moment, after what was started before."""
         self._start_job(self._run(command, work))
 
-    def _start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def _start_job(self, work: Coroutine[Any, Any, None]) -> None:
         job = asyncio.create_task(work)
         self._jobs.add(job)
         job.add_done_callback(self._jobs.discard)
-        return job
 
     async def _run(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         try:

@@ -6,7 +6,7 @@ import asyncio
 import secrets
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from skyloop.clock import monotonic_ns, seconds
 from skyloop.cockpit.broadcast import ROW_HZ, Cancellable, PeriodicBroadcast
@@ -24,7 +24,6 @@ from skyloop.messages import FlightState
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.cockpit.control_session import ControlSession
     from skyloop.cockpit.pilot_connection import PilotConnection
     from skyloop.messages import Feedback
 
@@ -32,8 +31,18 @@ TELEMETRY_HZ: Final = 18.0
 FRESH_S: Final = 0.2  #: for feedback of a vehicle's present state to come
 PILOT_S: Final = 2.0  #: for a pilot's connection to be made
 RECORDINGS: Final = ("replay:", "video:")  #: how addresses of what was recorded begin
-SHOWN_S: Final = 3.0  #: for the vehicle to show that its motors are stopped
+SHOWN_S: Final = 8.0  #: for the vehicle to show that its motors are stopped: as long as the stop may be repeated
 RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
+
+
+class FlyingSession(Protocol):
+    """What a page flies the drone by."""
+
+    def stand_down(self, why: str) -> None:
+        """Command nothing any more."""
+
+    def let_go(self, why: str) -> None:
+        """Hover, if the page has the vehicle under way."""
 
 
 class Station:
@@ -54,7 +63,7 @@ class Station:
         self.streams: dict[tuple[str, Form], EncodedFeed] = {}  #: as H.264, by camera and form
         self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by the name of the application that does
         self.routes = CheckedRoutes()
-        self.sessions: set[ControlSession] = set()  #: of pages that may fly it
+        self.sessions: set[FlyingSession] = set()  #: of pages that may fly it
         self.pilots: set[PilotConnection] = set()  #: pilots' connections of pages
         self.thresholds = ThresholdReader(drone)
         self.view = TelemetryView(self)
