@@ -27,6 +27,7 @@ window.other = (axes) => pad("other", 1, axes);
 window.pads = [];
 navigator.getGamepads = () => window.pads;
 """
+BLIND = "sim://?world=empty&cameras=none"  # pictures are no matter here, and cost a busy machine much
 MOVES_M_S = 0.15
 
 
@@ -39,7 +40,7 @@ def speed(drone: Drone) -> float:
 def flown(deck: Deck, *names: str, **options: Any) -> Iterator[tuple[DronePage, dict[str, DronePage], list[Drone]]]:
     """A page with these drones in the air, all flown by it; the page of each, and who watches it."""
     for name in names:
-        deck.proxy(name)
+        deck.proxy(name, BLIND)
     page = deck.page(*names, **options)
     pages = {name: DronePage(page.page, name) for name in names}
     drones = [skyloop.connect(name, access="observe", name="test") for name in names]
@@ -142,7 +143,7 @@ def test_a_stick_that_is_let_go_where_it_is_not_shown_is_let_go(deck: Deck) -> N
 
 
 def test_a_key_that_is_held_for_one_drone_does_not_fly_another(deck: Deck) -> None:
-    with flown(deck, "one", "two", viewport={"width": 1400, "height": 1900}) as (page, pages, (one, two)):
+    with flown(deck, "one", "two") as (page, pages, (one, two)):
         pages["one"].pane.locator("h2").click()
         keyboard = page.page.keyboard
         until_it_flies(pages["one"], one, lambda: keyboard.down("w"), lambda: keyboard.up("w"))
@@ -156,7 +157,7 @@ def test_a_key_that_is_held_for_one_drone_does_not_fly_another(deck: Deck) -> No
 
 def test_a_gamepad_that_is_unplugged_beside_another_one_hovers_and_a_waking_press_is_no_command(deck: Deck) -> None:
     """The other one flew at once, by whatever its sticks said; and the press that wakes a gamepad took off."""
-    deck.proxy("pads")
+    deck.proxy("pads", BLIND)
     page = deck.page("pads", prepare=PADS)
     with skyloop.connect("pads", access="observe", name="test") as drone:
         page.take_control()
@@ -178,6 +179,25 @@ def test_a_gamepad_that_is_unplugged_beside_another_one_hovers_and_a_waking_pres
         axis(other, 0)()
         page.page.wait_for_timeout(200)
         until_it_flies(page, drone, axis(other, -0.8), axis(other, 0))
+
+
+def test_a_stop_by_gamepad_with_its_stick_held_is_shown_and_nothing_flies_on_after_its_reset(deck: Deck) -> None:
+    deck.proxy("stopped", BLIND)
+    page = deck.page("stopped", prepare=PADS)
+    with skyloop.connect("stopped", access="observe", name="test") as drone:
+        page.take_off()
+        usual = "pads = [usual([0, 0, 0, %s]%s)]"
+        until_it_flies(
+            page, drone, lambda: page.page.evaluate(usual % (-0.8, "")), lambda: page.page.evaluate(usual % (0, ""))
+        )
+        page.page.evaluate(usual % (-0.8, ", 4, 5"))
+        page.until(lambda: drone.feedback().state is FlightState.EMERGENCY, "the motors stand")
+        page.wait_for_text(".notice", "motors are stopped")
+        page.page.evaluate(usual % (-0.8, ""))
+        page.pane.get_by_role("button", name="Reset").click()
+        page.until(lambda: drone.feedback().state is FlightState.LANDED, "it is reset")
+        page.take_off()
+        assert stays(page, drone), "the stick is still held from before"
 
 
 def test_control_that_comes_back_while_a_stick_is_held_flies_nothing(deck: Deck) -> None:
