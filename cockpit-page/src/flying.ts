@@ -119,11 +119,12 @@ export class Flying {
   }
 
   private round(): void {
+    const now_ms = performance.now();
+    if (now_ms - this.read_ms > STOOD_STILL_MS) this.rest();
+    this.read_ms = now_ms;
     const selected = this.cabin.selected();
     const reading = this.pad.read(chosen(plugged(), this.pad.pad, selected?.pilot.mine ?? false), settings.get("mode"));
-    const now_ms = performance.now();
-    if (reading.lost || now_ms - this.read_ms > STOOD_STILL_MS) this.rest();
-    this.read_ms = now_ms;
+    if (reading.lost) this.rest();
     const focused = document.hasFocus() && !document.hidden;
     const modal = isModalOpen();
     if (focused && !modal) for (const deed of reading.deeds) this.cabin.act(deed);
