@@ -19,6 +19,7 @@ from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedEr
 from skyloop.messages import (
     AnyAction,
     Attitude,
+    AuthorityGranted,
     Command,
     Done,
     EmergencyStop,
@@ -300,6 +301,16 @@ def test_a_take_off_that_runs_out_of_time_is_withdrawn(proxy: ScriptedProxy, dro
     later = [command for command in proxy.commands[after + 1 :] if command.action != Takeoff()]
     assert Takeoff() not in proxy.actions()[after + 1 :]
     assert {command.intent for command in later} == {number}, "no new intent: it takes the vehicle from nobody"
+
+
+def test_another_priority_under_the_same_lease_does_not_withdraw_a_take_off(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.answers[RequestAuthority] = AuthorityGranted(drone.authority.lease)
+    drone.takeoff(wait=False)
+    proxy.until(lambda: proxy.actions().count(Takeoff()) > 20, "more than half a second passed")
+    drone.request_authority(5)
+    after = len(proxy.commands)
+    proxy.until(lambda: len(proxy.commands) > after + 4, "it goes on")
+    assert set(proxy.actions()[after + 1 :]) == {Takeoff()}
 
 
 def interrupt(_: Feedback) -> bool:

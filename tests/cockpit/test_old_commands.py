@@ -187,7 +187,10 @@ def test_a_ping_is_answered_whatever_its_time() -> None:
     assert untimely(Alive(), NOW_S), "it is no sign of life"
 
 
-def test_a_take_off_that_came_to_nothing_is_not_repeated_for_ever(client: TestClient, node: Node) -> None:
+def test_a_take_off_that_came_to_nothing_is_not_repeated_for_ever(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skyloop.cockpit.control_session._BEGUN_NS", 1_000_000_000)
     with page(client) as pilot:
         node.flyer.deaf = True  # as if all packets were lost on the way
         pilot.take().say("takeoff")

@@ -107,13 +107,15 @@ def tello(data: bytes) -> None:
 
 
 def mavlink(data: bytes) -> None:
-    """What comes from a MAVLink vehicle, in one datagram and as a stream."""
+    """What comes from a MAVLink vehicle, in one datagram, as a stream, and as one that was cut into datagrams."""
     from skyloop.wire.mavlink.codec import Codec
 
     Codec(1, 1).decode(data, whole=True)
-    stream = Codec(1, 1)
-    for part in _parts(data):
+    stream, cut, signed = Codec(1, 1), Codec(1, 1), Codec(1, 1, key=bytes(32))
+    for number, part in enumerate(_parts(data)):
         stream.decode(part)
+        cut.decode(part, whole=True, source=number % 3)
+        signed.decode(part, whole=True)
 
 
 def msp(data: bytes) -> None:

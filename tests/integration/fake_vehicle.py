@@ -24,6 +24,7 @@ from skyloop.messages import (
     LinkState,
     ResetEmergency,
     Takeoff,
+    Vector,
     Velocity,
 )
 
@@ -48,6 +49,7 @@ class FakeVehicle(Driver):
         self.state = FlightState.LANDED
         self.applied: list[AnyAction] = []
         self.link_state = LinkState.UP
+        self.position_m: Vector | None = None
         self.mute = threading.Event()  #: tells nothing while set
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
@@ -83,7 +85,10 @@ class FakeVehicle(Driver):
                 continue
             number += 1
             now_ns = time.monotonic_ns()
-            sink.feedback(Feedback(captured_ns=now_ns, state=self.state, yaw_rad=number * 0.01, altitude_m=1.0))
+            yaw_rad, position_m = number * 0.01, self.position_m
+            sink.feedback(
+                Feedback(captured_ns=now_ns, state=self.state, yaw_rad=yaw_rad, altitude_m=1.0, position_m=position_m)
+            )
             if sink.wants("front"):
                 picture = np.full((24, 32, 3), number % 256, np.uint8)
                 sink.frame("front", picture, now_ns, width=32, height=24)

@@ -501,7 +501,8 @@ def test_a_vehicle_that_was_disarmed_in_the_air_is_flown_no_more() -> None:
     assert seen(autopilot, FlightState.LANDED, STEP_NS, 0.0) is not None, "it is about to rise"
     seen(autopilot, FlightState.FLYING, 2 * STEP_NS, 1.0)
     assert autopilot.flight.state(FlightState.FLYING) is FlightState.HOVERING
-    assert seen(autopilot, FlightState.LANDED, 3 * STEP_NS, 0.1) is None
+    assert seen(autopilot, FlightState.LANDED, 3 * STEP_NS, 0.1) == Attitude(), "no climb stays in force"
+    assert seen(autopilot, FlightState.LANDED, 4 * STEP_NS, 0.1) is None
     assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
 
 
@@ -509,7 +510,20 @@ def test_a_take_off_that_never_leaves_the_ground_ends() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     assert seen(autopilot, FlightState.LANDED, 14 * NS_PER_S, 0.0) is not None
-    assert seen(autopilot, FlightState.LANDED, 15 * NS_PER_S, 0.0) is None
+    assert seen(autopilot, FlightState.LANDED, 15 * NS_PER_S, 0.0) == Attitude(), "no climb stays in force"
+    assert seen(autopilot, FlightState.LANDED, 15 * NS_PER_S + STEP_NS, 0.0) is None
+    assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
+
+
+@pytest.mark.parametrize("action", [Hover(), Velocity(0.5)])
+def test_what_is_steered_on_the_ground_without_a_take_off_ends(action: Hover | Velocity) -> None:
+    """It was disarmed at the moment at which the software began to steer it: an upward velocity would arm it again."""
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(action, 0, None)
+    seen(autopilot, FlightState.LANDED, STEP_NS, 0.0)
+    assert autopilot.flight.state(FlightState.LANDED).airborne, "its driver may not have heard of it yet"
+    for step in range(2, 60):
+        seen(autopilot, FlightState.LANDED, step * STEP_NS, 0.0)
     assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
 
 

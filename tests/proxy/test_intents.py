@@ -354,6 +354,29 @@ def test_a_take_off_that_shows_is_not_broken_off_by_a_lost_lease(bench: Bench) -
     assert bench.driver.told == [Takeoff()]
 
 
+def test_an_order_that_shows_whose_the_flight_is_takes_it_at_once(bench: Bench) -> None:
+    pilot = bench.pilot()
+    bench.driver.report(state=S.FLYING)  # by others, and nothing has looked since
+    pilot.command(Hover())
+    assert bench.driver.told == [Hover()]
+
+
+def test_a_hover_that_withdraws_a_take_off_is_told_to_be_done(bench: Bench) -> None:
+    pilot = pending(bench)
+    pilot.command(Hover())
+    bench.driver.report()
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.intent, outcome.fate) == (pilot.intent, Fate.COMPLETED)
+
+
+def test_after_a_stop_of_the_motors_nothing_else_is_sent(bench: Bench) -> None:
+    pilot = pending(bench)
+    pilot.command(EmergencyStop())
+    repeats(bench, pilot, Takeoff())
+    assert bench.driver.told == [Takeoff(), EmergencyStop()]
+
+
 def test_nothing_is_withdrawn_from_a_vehicle_that_others_took(bench: Bench) -> None:
     pilot = pending(bench)
     bench.driver.left = "STABILIZE"
@@ -426,6 +449,15 @@ def test_a_landing_that_a_driver_fails_at_once_is_tried_again(bench: Bench) -> N
     assert bench.driver.told == [Land()]
 
 
+def test_a_reset_that_comes_before_the_emergency_is_known_is_done_when_it_is(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(ResetEmergency())
+    assert pilot.refusals() == [Refusal.WRONG_STATE]
+    bench.driver.report(state=S.EMERGENCY)
+    pilot.command(ResetEmergency(), repeat=True)
+    assert bench.driver.told == [ResetEmergency()]
+
+
 def test_a_landing_wanted_while_others_land_does_not_take_the_vehicle_by_a_repeat(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.left = "LAND"
@@ -493,3 +525,25 @@ def test_a_driver_that_refuses_at_once_says_why_to_a_repeat(bench: Bench, monkey
     monkeypatch.undo()
     pilot.command(Takeoff(), repeat=True)
     assert bench.driver.told == []
+
+
+def test_a_software_take_off_that_the_vehicle_refuses_is_over() -> None:
+    """One that was disarmed before it rose: the software autopilot armed it again, 50 times a second."""
+    with Bench(actions={"attitude"}) as bench:
+        bench.driver.answers = False
+        bench.driver.report(altitude_m=0.0)
+        pilot = bench.pilot()
+        pilot.command(Takeoff())
+        bench.run(0.1, lambda: pilot.command(Takeoff(), repeat=True))
+        assert pilot.last_feedback().state is S.TAKING_OFF
+        bench.driver.refuses = "the flight controller disarmed before it had taken off"
+        bench.run(0.1, lambda: pilot.command(Takeoff(), repeat=True))
+        assert pilot.last_feedback().state is S.LANDED
+        bench.driver.refuses = ""
+        bench.driver.told.clear()
+        bench.run(2.0, lambda: pilot.command(Takeoff(), repeat=True))
+        assert not [told for told in bench.driver.told if isinstance(told, Attitude) and told.climb > 0]
+        outcome = pilot.last_feedback().outcome
+        assert outcome is not None
+        assert outcome.fate is Fate.REFUSED
+        assert "disarmed before it had taken off" in outcome.text

@@ -84,6 +84,20 @@ def test_what_stands_is_not_taken_off_while_another_one_lands() -> None:
         assert standing.driver.closed
 
 
+def test_one_that_fails_to_close_keeps_no_other_one_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Bench() as broken, Bench() as good:
+
+        def fail() -> None:
+            raise RuntimeError("close is broken")
+
+        monkeypatch.setattr(broken.driver, "_close", fail)
+        with pytest.raises(RuntimeError, match="close is broken"):
+            end_all([broken.proxy, good.proxy], 1.0, reason="it is late", hurry=lambda: False)
+        assert good.driver.closed
+        assert good.proxy.ended
+        assert broken.proxy.end(), "it ends once"
+
+
 def test_a_take_off_that_was_just_asked_for_is_called_off(bench: Bench) -> None:
     """The vehicle does not show it yet; where it rises all the same, it is landed."""
     bench.driver.answers = False

@@ -314,6 +314,17 @@ def test_goals_of_other_frames_and_without_a_height_are_refused(rig: Rig) -> Non
     assert not any(isinstance(each, Position) for each in rig.vehicle.applied)
 
 
+def test_a_goal_that_is_refused_is_not_flown_to_by_its_repeats(rig: Rig) -> None:
+    rig.vehicle.position_m = (0.0, 0.0, 1.0)
+    rig.node.call("authority/request")
+    assert rig.node.call("takeoff").success
+    rig.commands.subscriptions["goal_pose"](goal(1.0, 0.0, -4.0))
+    until(lambda: any("below the ground" in event.text for event in rig.drone.recent_events()), "it is refused")
+    seq = rig.drone.feedback().seq
+    rig.drone.wait(lambda feedback: feedback.seq > seq + 20, WAIT_S)
+    assert not any(isinstance(each, Position) for each in rig.vehicle.applied)
+
+
 def test_goals_are_places_with_a_heading(rig: Rig) -> None:
     from skyloop.ros.pilot import Pilot
 

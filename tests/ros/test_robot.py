@@ -361,3 +361,54 @@ def test_jpeg_is_handed_on_as_it_came() -> None:
     rig.session.on_image(Message(header=stamp(rig.system()), format="jpeg", data=b"\xff\xd8\x00"))
     assert ["'png'" in rig.sink.events[0].text, "how large" in rig.sink.events[1].text] == [True, True]
     assert not rig.sink.problems
+
+
+def test_odometry_that_ends_while_images_go_on_is_told_and_ends_the_velocity() -> None:
+    rig = Rig()
+    rig.tell(z=1.0)
+    rig.session.command(Velocity(forward=0.5))
+    for _ in range(40):
+        rig.clock.advance(0.05)
+        rig.session.on_image(image(rig.system()))
+        rig.session.tick()
+    assert rig.sink.links[-1][0] is LinkState.DEGRADED
+    assert "nothing came on /robot/odom for 1." in rig.sink.links[-1][1]
+    assert len(rig.sink.links) == 2, "told once"
+    assert rig.robot.sent[-1] == Velocity()
+    assert sum(each != Velocity() for each in rig.robot.sent) < 25
+    assert rig.sink.newest is not None
+    assert rig.sink.newest.altitude_m is None
+    assert rig.sink.newest.state is FlightState.UNKNOWN
+    rig.session.command(Velocity(up=-0.3))
+    for _ in range(3):
+        rig.session.tick()
+    assert rig.robot.sent[-1] == Velocity(up=-0.3), "who still commands is obeyed, as it may be the way down"
+    rig.session.command(Land())
+    assert rig.robot.called == ["/robot/land"]
+    rig.answer(True)
+    rig.tell()
+    assert rig.sink.link_state is LinkState.UP
+
+
+def test_a_robot_with_planar_odometry_is_landed() -> None:
+    """Its z is always 0: only its services tell whether it flies."""
+    rig = Rig()
+    rig.tell()
+    rig.session.command(Takeoff())
+    rig.answer(True)
+    assert rig.tell() is FlightState.HOVERING
+    rig.session.command(Land())
+    assert rig.robot.called == ["/robot/takeoff", "/robot/land"]
+    assert rig.tell() is FlightState.LANDING
+    rig.answer(True)
+    assert rig.tell() is FlightState.LANDED
+
+
+def test_a_robot_of_which_nothing_shows_whether_it_flies_is_landed() -> None:
+    """It may have been up before the proxy was started; its odometry was never seen above the ground."""
+    rig = Rig()
+    rig.tell()
+    rig.session.command(Land(), new=False)
+    assert rig.robot.called == []
+    rig.session.command(Land())
+    assert rig.robot.called == ["/robot/land"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from skyloop.messages import Refusal
+from skyloop.messages.intent import ENDINGS
 from tests.docs.pages import rows, section
 from tests.security import test_doors, test_replays
 from tests.security.deeds import DEEDS
@@ -67,3 +68,7 @@ def test_each_row_about_replays_is_a_test() -> None:
     assert table == [[words, f"`{reason}`"] for words, (_, reason) in REPLAYS.items()]
     for name, _ in REPLAYS.values():
         assert callable(getattr(test_replays, f"test_{name}")), name
+
+
+def test_the_list_of_what_ends_an_order_is_the_one_of_the_code() -> None:
+    assert f"\n{'; '.join(ENDINGS.values())}.\n" in section(PAGE, "## Replayed commands")

@@ -461,7 +461,8 @@ class CommandSender:
         status = self.status
         with self._lock:
             if status.state == "held":
-                self._schedule.resume(now_ns)
+                if (before.state, before.lease) != ("held", status.lease):
+                    self._schedule.resume(now_ns)
             elif before.state == "held":
                 self._schedule.clear(Fate.AUTHORITY)
         if status.state == "held" and status.lease != before.lease:

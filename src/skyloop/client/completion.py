@@ -120,6 +120,7 @@ class ActionWait:
         self._connection = connection
         self._problem: Exception | None = None
         self._why = ""  # it was not done yet, for people
+        self._flew = False  # it was in the air meanwhile
         self._asked_ns = state.scheduler.clock()
         self._intent = ask(action)
 
@@ -152,15 +153,19 @@ class ActionWait:
     def _done(self) -> bool:
         """Whether feedback from after it shows that it is done."""
         newest = self._state.newest
-        if newest is None or not self._is_done(newest):
+        if newest is None:
+            return False
+        self._flew = self._flew or newest.state.airborne
+        if not self._is_done(newest):
             return False
         outcome = newest.outcome
         if outcome is None:
             return self._state.received_ns - self._asked_ns > _STALE_NS
-        mine = outcome.app_id == self._commands.app_id
-        if mine and outcome.intent == self._intent and type(self._action) is Land:
-            return outcome.over
-        return mine and outcome.intent >= self._intent
+        if outcome.app_id != self._commands.app_id or outcome.intent < self._intent:
+            return False
+        if outcome.intent == self._intent and type(self._action) is Land and not self._flew:
+            return outcome.over  # it stood already: a take-off may have been on its way
+        return True
 
     def _why_not(self) -> Exception | None:
         """Why waiting longer can't help; None if it can. Asks again for what may be possible then."""

@@ -75,7 +75,8 @@ GONE_S: Final = (
 )
 _REFUSE_AGAIN_S: Final = 1.0  # the same refusal of sticks, which come twenty times a second
 _DOWN: Final = frozenset({FlightState.LANDED})
-_TAKEOFF_NS: Final = 1_000_000_000  # a take-off is repeated for so long, in case packets are lost
+_TAKEOFF_NS: Final = 1_000_000_000  # a take-off that the proxy does not tell of by then is not wanted any more,
+_BEGUN_NS: Final = 6_000_000_000  # nor is one that the vehicle does not begin by then
 _numbers = itertools.count(1)
 
 Json = dict[str, Any]
@@ -455,10 +456,12 @@ class ControlSession:
             self._send(message)
         if self._awaited is not None and pilot is not None:
             do, states, from_ns = self._awaited
-            if do == TakeOff().do and pilot.proxy_now_ns - from_ns > _TAKEOFF_NS and not self._repeated:
-                self._repeated = True
-                with suppress(SkyloopError):
-                    pilot.idle()  # what has begun goes on; what has not must not begin when a slow link is back
+            if do == TakeOff().do and not self._repeated:
+                patience_ns = _BEGUN_NS if pilot.is_told else _TAKEOFF_NS
+                if pilot.proxy_now_ns - from_ns > patience_ns:
+                    self._repeated = True
+                    with suppress(SkyloopError):
+                        pilot.idle()  # what has begun goes on; what has not must not begin when a slow link is back
             with suppress(LinkError):
                 feedback = pilot.feedback()
                 if feedback.captured_ns >= from_ns and feedback.state in states:

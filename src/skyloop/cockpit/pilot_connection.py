@@ -103,6 +103,13 @@ class PilotConnection(Drone):
         outcome = self._core.commands.outcome(intent) if newest is action else None
         return outcome is not None and outcome.fate in OVERRULED
 
+    @property
+    def is_told(self) -> bool:
+        """Whether the proxy tells what becomes of the newest command: it has arrived there."""
+        newest, (_, intent) = self._state.newest, self._newest
+        outcome = None if newest is None else newest.outcome
+        return outcome is not None and outcome.app_id == self.app_id and outcome.intent >= intent
+
     def hover_if_held(self) -> None:
         """Hover; if somebody else has the authority, or the link is lost, the proxy sees to it."""
         with suppress(SkyloopError):

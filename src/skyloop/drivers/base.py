@@ -10,14 +10,15 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.uri import VehicleUri
-from skyloop.errors import ParameterError, UnknownNameError, UnsupportedError, UsageError
+from skyloop.errors import DriverError, ParameterError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages import (
     AnyAction,
     Capabilities,
@@ -157,6 +158,9 @@ class ServedLink(Protocol):
         """Release its resources."""
 
 
+AHEAD_NS: Final = nanoseconds(0.05)  #: a pose may be stamped so far ahead: two hosts' clocks are known no better
+
+
 @dataclass(frozen=True, slots=True)
 class ExternalPose:
     """Where something outside of the vehicle, such as motion capture, saw it.
@@ -181,6 +185,20 @@ class ExternalPose:
 
     def __post_init__(self) -> None:
         check_pose(self.position_m, self.quaternion, self.position_std_m, self.attitude_std_rad)
+
+    def bounded(self, now_ns: int) -> ExternalPose:
+        """Return the pose with a time that is not in the future; drivers take no other.
+
+        Args:
+            now_ns: The present time, on this host's monotonic clock.
+
+        Raises:
+            DriverError: It is stamped more than 50 ms ahead: a wrong clock, and all that follow would look old.
+        """
+        ahead_ns = self.captured_ns - now_ns
+        if ahead_ns > AHEAD_NS:
+            raise DriverError(f"a pose is stamped {seconds(ahead_ns):.2g} s ahead of this host's clock, at most 0.05 s")
+        return self if ahead_ns <= 0 else replace(self, captured_ns=now_ns)
 
 
 class Driver(ABC):

@@ -16,14 +16,21 @@ class NameLookup:
 
     Args:
         family: Of the address that is wanted.
+        wait_s: How long :meth:`address` may block [s]; 0 on a thread that others need too.
     """
 
-    def __init__(self, family: socket.AddressFamily = socket.AF_INET) -> None:
+    def __init__(self, family: socket.AddressFamily = socket.AF_INET, wait_s: float = WAIT_S) -> None:
         self._family = family
+        self._wait_s = wait_s
         self._asking: _Question | None = None
 
+    @property
+    def answered(self) -> bool:
+        """Whether what was not known yet is known now: it is worth asking again."""
+        return self._asking is not None and self._asking.answered.is_set()
+
     def address(self, host: str) -> str:
-        """Return a host's first address. Blocks for :data:`WAIT_S` at most.
+        """Return a host's first address. Blocks for ``wait_s`` at most.
 
         Args:
             host: A name, or an address, which is returned at once.
@@ -38,7 +45,7 @@ class NameLookup:
         if self._asking is None:
             self._asking = _Question(host, self._family)
         question = self._asking
-        if not question.answered.wait(WAIT_S):
+        if not question.answered.wait(self._wait_s):
             raise OSError(errno.ETIMEDOUT, f"the name {host} is still being looked up")
         self._asking = None
         if isinstance(question.answer, OSError):

@@ -76,6 +76,7 @@ class Flight:
             settled = (FlightState.HOVERING, FlightState.FLYING)
             self.until(lambda f: f.state in settled, self.suite.takeoff_timeout_s, "hovering after take-off")
             return
+        self.driver.check(Takeoff())  # as the proxy does before it climbs
         self.set_point(up=self.suite.climb)
         self.until(lambda f: f.altitude_m is None or f.altitude_m > 0.6, self.suite.takeoff_timeout_s, "0.6 m high")
         self.set_point()

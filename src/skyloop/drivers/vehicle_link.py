@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Final, Generic, Protocol, TypeVar
+from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import ServedLink, Sink
@@ -26,6 +26,7 @@ MAX_DATAGRAM: Final = 65_536
 BURST: Final = 32  #: datagrams that are read before commands get their turn
 
 S = TypeVar("S", bound=VehicleSession)
+C = TypeVar("C", bound="Readable")
 
 
 class Readable(Protocol):
@@ -71,7 +72,7 @@ class VehicleLink(ABC, Generic[S]):
         self._stopping = threading.Event()
         self._selector = selectors.DefaultSelector()
         self._awake, self._waker = socket.socketpair()
-        self._lookup = NameLookup(family)
+        self._lookup = NameLookup(family) if serve is None else NameLookup(family, wait_s=0.0)
         self._awake_ns = 0  # when its thread looks again at the latest
         self._opened_ns: int | None = None  # when sockets were opened last, or tried to
         self._close_s = close_s
@@ -214,7 +215,9 @@ class VehicleLink(ABC, Generic[S]):
         now_ns = self._clock()
         with self.lock:
             pace_ns = self._renewal_ns()
-        if pace_ns is None or (self._opened_ns is not None and now_ns - self._opened_ns < pace_ns):
+        if pace_ns is None:
+            return
+        if self._opened_ns is not None and now_ns - self._opened_ns < pace_ns and not self._lookup.answered:
             return
         self._opened_ns = now_ns
         try:
@@ -291,6 +294,75 @@ class VehicleLink(ABC, Generic[S]):
         with suppress(OSError):
             while self._awake.recv(4096):
                 pass
+
+
+class ConnectionLink(VehicleLink[S], Generic[S, C]):
+    """A link over one connection, which is opened again where it broke, and where nothing comes on it.
+
+    A kind of vehicle writes :meth:`_connect`, :meth:`_read` and :meth:`_send_due`.
+    """
+
+    RETRY_NS: ClassVar[int]  #: between attempts to connect
+
+    _silent_ns: int | None = None  # one on which nothing comes for so long is opened again; None: not for that
+    _connection: C | None = None
+    _broken = False  # nothing can be sent any more
+
+    @abstractmethod
+    def _connect(self) -> C:
+        """Open a connection. On the link's thread, with the lock free.
+
+        Raises:
+            OSError: It can't be opened; tried again.
+        """
+
+    @abstractmethod
+    def _read(self, connection: C) -> None:
+        """Give the session what came. On the link's thread, with the lock free.
+
+        Raises:
+            OSError: Nothing more will come.
+        """
+
+    def _on_end(self, connection: C) -> None:
+        """Send what is due before the connection is closed for good. With the lock held."""
+
+    def _on_broken(self, error: OSError, now_ns: int) -> None:
+        """Handle that nothing more can be sent. With the lock held."""
+        self._broken = True
+        self.session.broken(error, now_ns)
+
+    def _renewal_ns(self) -> int | None:
+        if self._connection is None or self._broken:
+            return self.RETRY_NS
+        return None if self.session.is_receiving else self._silent_ns
+
+    def _open_sockets(self) -> None:
+        with self.lock:
+            self._close_sockets()
+        made = self._connect()
+        with self.lock:
+            self._connection = made
+            self.session.connected()
+        self._watch(made, self._receive)
+
+    def _receive(self) -> None:
+        connection = self._connection
+        if connection is None:
+            return
+        try:
+            self._read(connection)
+        except OSError as error:
+            with self.lock:
+                self.session.failed(error)
+                self._close_sockets()
+
+    def _close_sockets(self) -> None:
+        connection, self._connection, self._broken = self._connection, None, False
+        if connection is not None:
+            if self._stopping.is_set():
+                self._on_end(connection)
+            self._forget(connection)
 
 
 def _report_failure(error: Exception, sink: Sink) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from typing import ClassVar, Final, TypeAlias
 
 from skyloop.clock import nanoseconds, seconds
@@ -46,6 +47,57 @@ def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: 
         **data: More for programs.
     """
     return VehicleEvent(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})
+
+
+class Arrival(Enum):
+    """What a packet's own number says of it."""
+
+    NEW = auto()
+    LATE = auto()  #: others overtook it
+    RESTARTED = auto()  #: the vehicle counts from the beginning again: it was started anew
+
+
+RESTART_RUN: Final = 5  #: so many packets that are behind, in order among themselves, show a new count
+RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: and that they did not arrive in one burst
+
+
+class RestartWatch:
+    """Tells a vehicle that was started anew from packets that arrive late, by a number that grows in it. Pure.
+
+    Args:
+        tolerance: One that is behind by no more is taken as it comes.
+        wrap: The number begins at 0 again there; 0: never.
+    """
+
+    def __init__(self, tolerance: int = 0, wrap: int = 0) -> None:
+        self._tolerance, self._wrap = tolerance, wrap
+        self._newest: int | None = None
+        self._behind: tuple[int, int, int] | None = None  # the last that was behind, how many, when the first came
+
+    def forget(self) -> None:
+        """Take whatever comes next for new: the vehicle was silent."""
+        self._newest = self._behind = None
+
+    def update(self, number: int, now_ns: int) -> Arrival:
+        """Judge a packet that arrived now by its number."""
+        step = 0 if self._newest is None else self._step(self._newest, number)
+        if step >= -self._tolerance:
+            self._newest, self._behind = number if step >= 0 else self._newest, None
+            return Arrival.NEW
+        last, count, since_ns = self._behind or (number, 0, now_ns)
+        if self._step(last, number) < 0:
+            count, since_ns = 0, now_ns
+        self._behind = number, count + 1, since_ns
+        if count + 1 < RESTART_RUN or now_ns - since_ns < RESTART_SPAN_NS:
+            return Arrival.LATE
+        self._newest, self._behind = number, None
+        return Arrival.RESTARTED
+
+    def _step(self, before: int, number: int) -> int:
+        step = number - before
+        if abs(step) < 0.99 * self._wrap or not self._wrap:
+            return step
+        return step + self._wrap if step < 0 else step - self._wrap
 
 
 class VehicleSession(ABC):
@@ -108,6 +160,21 @@ class VehicleSession(ABC):
         """Note an error of a socket or port, with what a person can do about it."""
         trouble = self._trouble(error)
         self._unreachable, self._remedy = trouble.reason, trouble.remedy
+
+    def connected(self) -> None:  # noqa: B027  most connections need nothing
+        """Handle a new connection: nothing of an older one follows."""
+
+    def broken(self, error: OSError, now_ns: int) -> None:
+        """Handle that nothing can be sent any more on an open connection: the vehicle is lost, whatever it still sends.
+
+        Args:
+            error: Of the connection, which is opened again.
+            now_ns: The present time.
+        """
+        self.failed(error)
+        self.due_ns = now_ns
+        if self._received_ns is not None:
+            self._lose(f"the connection failed: {self._unreachable}", now_ns)
 
     def drain(self) -> list[SinkCallback]:
         """Return the callbacks for the sink that are pending since the last call, in order."""

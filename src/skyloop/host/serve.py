@@ -33,7 +33,7 @@ def serve(
 
     Writes a line for each vehicle to standard output as ``skyloop proxy`` does, ``failed NAME: …`` for one that can't
     be served, and ``hosting …`` when all were tried. Ends on SIGINT or SIGTERM, landing all that fly first, for at
-    most ``land_within_s`` [s]; a second signal ends at once.
+    most ``land_within_s`` [s]; a second signal waits no longer.
 
     Args:
         fleet: The vehicles.

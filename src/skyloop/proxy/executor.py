@@ -58,6 +58,7 @@ class ActionExecutor:
         self.guarded = False
         self._driver = driver
         self._vehicle = publisher
+        self.gave_up = ""  #: why the vehicle refused to go on with a software take-off; the reader clears it
 
     @property
     def state(self) -> FlightState:
@@ -168,7 +169,9 @@ class ActionExecutor:
         except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
             self._vehicle.driver_failed("autopilot", error)
             if isinstance(error, DriverError):
+                before = self.autopilot.mode
                 self.autopilot.refused(self._vehicle.reported_state)
+                self.gave_up = str(error) if self.autopilot.mode is not before else ""
             return None
 
     def _start(self, action: AnyAction, now_ns: int) -> None:

@@ -68,7 +68,7 @@ from skyloop.proxy.core.flight_events import (
     taken_event,
     thin_zones_event,
 )
-from skyloop.proxy.core.intents import INSISTENT, TAKEOFF_NS, Intent
+from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
 from skyloop.proxy.core.limits import Clamp, Episodes
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
@@ -81,7 +81,6 @@ from skyloop.zones import Space
 
 _LAND: Final = Land()
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
-_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: what may be different with the next repeat
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
 #: So much more sleep of the computer than was known is one: shorter ones are not told from a delay.
@@ -265,6 +264,10 @@ class CommandHandler:
             steered = self._executor.step(now_ns)
             if steered is not None:
                 self._echo_own(steered, now_ns)
+            why, self._executor.gave_up = self._executor.gave_up, ""
+            if why and session is not None:
+                session.intents.newest.end(Fate.REFUSED, why, Refusal.WRONG_STATE)
+                self._tell(session, session.intents.newest)
 
     def order_landing(self, now_ns: int) -> bool:
         """Land because the proxy is about to end; from now on only landing and emergency stop are accepted.
@@ -324,7 +327,10 @@ class CommandHandler:
         vehicle, checks, flight = self._vehicle, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
+        if not flight.ours:
+            self._observe_flight(now_ns)
         intents = session.intents
+        state = self._observe_intent(session, now_ns)  # what ends intents before this one came does not end this one
         refusal = checks.receive(command, intents, session.app_id, now_ns)
         if refusal is not None:
             if session.role is not Role.PILOT:
@@ -332,9 +338,6 @@ class CommandHandler:
             return self._refuse(session, command, refusal, checks.explain(refusal, command, intents, now_ns)), now_ns
         action = command.action
         kind = type(action)
-        if not flight.ours:
-            self._observe_flight(now_ns)
-        state = self._observe_intent(session, now_ns)
         intent, new = intents.receive(command, state, now_ns)
         if kind not in _LEAVE_A_TAKEOFF:
             if self._withdraw_takeoff(now_ns):
@@ -348,16 +351,14 @@ class CommandHandler:
             self._tell(session, intents.newest)
             return _NOTHING, self._count_applied(command)
         if intent.over:
+            self._tell(session, intents.newest)
             if intent.reason is None:  # it was done
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
         intent.action = action  # a set-point may have decayed to hover
-        vehicle_now = vehicle.feedback_now
-        automatic = command.automatic
+        known, automatic = vehicle.feedback_now, command.automatic
         new = new and not automatic  # what the library does by itself is nobody's decision
-        decision = checks.decide(
-            action, intent, state, vehicle.link_state, vehicle_now, now_ns, new=new, automatic=automatic
-        )
+        decision = checks.decide(action, intent, state, vehicle.link_state, known, now_ns, new=new, automatic=automatic)
         if decision.refusal is not None:
             if decision.action is not None:
                 self._stop_instead(decision.action, now_ns)
@@ -412,6 +413,7 @@ class CommandHandler:
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         if in_time and self.holds(session, command.lease):
             self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent meanwhile
+        self._rising = None  # nothing but the stop is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
@@ -467,8 +469,7 @@ class CommandHandler:
         self, session: Session, command: Command, intent: Intent, reason: Refusal, why: str, now_ns: int
     ) -> AnyAction:
         """Refuse what the holder asked for, which is over with it: its repeats get the same answer."""
-        if type(command.action) not in INSISTENT or reason not in _PASSING:
-            intent.end(Fate.REFUSED, why, reason)
+        intent.refuse(reason, why)
         self._tell(session, intent)
         if type(command.action) is Takeoff:
             self._withdraw_takeoff(now_ns)
@@ -486,9 +487,9 @@ class CommandHandler:
     def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
         """End, or complete, what a holder asked for by what the vehicle does; return the flight state."""
         state, intent = self._executor.state, session.intents.newest
-        if state is not intent.state:
-            self._observe_flight(now_ns)  # a landing may be others': then that is what ended it
         if not intent.over:
+            if state is not intent.state:
+                self._observe_flight(now_ns)  # a landing may be others': then that is what ended it
             intent.observe(state, now_ns)
             if intent.over:
                 self._tell(session, intent)
@@ -499,7 +500,7 @@ class CommandHandler:
             self._rising = None  # it has left the ground
         elif rising is not None and now_ns - rising.asked_ns >= TAKEOFF_NS:
             self._withdraw_takeoff(now_ns)  # a set-point took its place meanwhile
-        return self._executor.state
+        return state if rising is None else self._executor.state
 
     def _withdraw_takeoff(self, now_ns: int) -> bool:
         """Make the vehicle forget a take-off that it has not begun to show; return whether there was one."""
@@ -511,7 +512,7 @@ class CommandHandler:
 
     def _tell(self, session: Session, intent: Intent) -> None:
         """Let feedback tell what became of an intent: soon where it ended."""
-        self._vehicle.tell(intent.outcome(session.app_id, session.name))
+        self._vehicle.tell(intent, session.app_id, session.name)
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
         """Publish what the proxy itself made the vehicle do."""

@@ -24,12 +24,13 @@ from skyloop.messages import (
     EncodedFrame,
     Encoding,
     EventKind,
+    Fate,
     Feedback,
     FlightState,
     FrameHeader,
     Intrinsics,
     LinkState,
-    Outcome,
+    Refusal,
     Severity,
     Value,
     VideoRequest,
@@ -39,6 +40,7 @@ from skyloop.messages.encoded import H264, MAX_ENCODED
 from skyloop.messages.feedback import MAX_LINK_TEXT
 from skyloop.messages.result import PROCESSOR_NAME
 from skyloop.proxy.core.events import EventDraft
+from skyloop.proxy.core.intents import NO_INTENT, Intent
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.feedback_variants import PREFIX, FeedbackVariants
 from skyloop.proxy.streams import Streams
@@ -110,7 +112,8 @@ class VehiclePublisher:
         self.streams = Streams(server, counters, clock, lambda why: self._fail("stream", why))
         self._on_link_up = on_link_up
         self._owner: dict[str, Any] = {}
-        self._outcome = Outcome()
+        self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
+        self._told: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # by the newest sample
         self._publish = server.publish
         self._publish_frame = server.publish_frame
         self._subscribers = server.subscribers
@@ -160,10 +163,16 @@ class VehiclePublisher:
         self._owner = owner
         self._published_ns = -KEEP_ALIVE_NS
 
-    def tell(self, outcome: Outcome) -> None:
-        """Show what became of an intent in feedback from now on; where it ended, at the next tick at the latest."""
-        before, self._outcome = self._outcome, outcome
-        if outcome.over and (outcome.fate, outcome.reason) != (before.fate, before.reason):
+    def tell(self, intent: Intent, app_id: int, name: str) -> None:
+        """Show what became of an intent in feedback from now on; where it ended, at the next tick at the latest.
+
+        Args:
+            intent: The newest of the application that commands; read with each sample.
+            app_id: The application's number.
+            name: The application's name.
+        """
+        self._newest = intent, app_id, name
+        if intent.over and (intent.fate, intent.reason) != self._told:
             self._published_ns = -KEEP_ALIVE_NS
 
     @property
@@ -189,6 +198,9 @@ class VehiclePublisher:
         self._seq += 1
         self.reported_state = raw.state
         state = self.state_of(raw.state)
+        intent, app_id, name = self._newest
+        outcome = intent.outcome(app_id, name)
+        self._told = outcome.fate, outcome.reason
         sample = _replace(
             raw,
             state=state,
@@ -197,7 +209,7 @@ class VehiclePublisher:
             vehicle_link=self.link_state,
             link_reason=self.link_reason,
             link_remedy=self.link_remedy,
-            outcome=self._outcome,
+            outcome=outcome,
             **self._owner,
         )
         self.feedback_now = sample

@@ -105,7 +105,7 @@ def serve(
     Writes to standard output a line that begins with ``ready`` when applications can connect and the vehicle is there;
     ``serving`` while it is not, and then, whenever that changes, what is waited for, why it failed last and what to do
     (not with ``parent_fd``). Ends on SIGINT or
-    SIGTERM, landing first for at most ``land_within_s`` [s] if the vehicle flies; a second signal ends at once. With
+    SIGTERM, landing first for at most ``land_within_s`` [s] if the vehicle flies; a second signal waits no longer. With
     ``parent_fd``, the reading end of a pipe: lands and ends when that reads end of file, which the death of the parent
     causes, and leaves SIGINT to the parent, as a terminal sends it to both. ``look`` is called some times a second:
     what it returns about the keys is logged, and published as an event.

@@ -230,6 +230,19 @@ def test_a_drone_that_was_away_too_briefly_to_be_missed_is_set_up_anew() -> None
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 2.0)
 
 
+def test_one_datagram_that_says_so_is_no_reboot_and_no_lost_link() -> None:
+    """Two in a row have to."""
+    rig = Rig()
+    rig.ready()
+    rig.run(0.5)
+    for sign in (State.BOOTSTRAP, State.COMMUNICATION_LOST):
+        rig.drone.sequence += 1
+        rig.session.on_navdata(encode(rig.drone.state | sign, rig.drone.sequence), rig.clock.now_ns)
+        rig.run(0.3)
+        assert rig.sink.link_state is LinkState.UP
+    assert LinkState.LOST not in [state for state, _ in rig.sink.links]
+
+
 def test_what_was_written_is_written_again_where_the_drone_forgot_it() -> None:
     rig = Rig()
     rig.ready()

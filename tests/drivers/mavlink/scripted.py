@@ -80,6 +80,7 @@ class Bench:
         self.sink = RecordingSink()
         self.said: list[Message] = []
         self.frames: list[bytes] = []
+        self.peers: set[Peer] = set()  # that something was sent to
         self._ears = Codec(1, 1)
         self.deliver()
 
@@ -94,7 +95,8 @@ class Bench:
             publish(self.sink)
 
     def tick(self) -> None:
-        for frame, _ in self.session.poll(self.clock()):
+        for frame, peer, _ in self.session.poll(self.clock()):
+            self.peers.add(peer)
             self.frames.append(frame)
             self.said += self._ears.decode(frame, whole=True)
         self.deliver()

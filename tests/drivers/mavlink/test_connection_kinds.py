@@ -14,6 +14,7 @@ import pytest
 
 from skyloop.drivers.mavlink.link import MavlinkConnection, SerialPort, open_connection
 from skyloop.drivers.mavlink.options import Address, ConnectionKind
+from skyloop.drivers.mavlink.protocol import Packet
 from skyloop.errors import MissingExtraError
 from skyloop.transport.testing import wait_until
 
@@ -53,14 +54,14 @@ def test_a_port_that_listens_answers_whom_it_heard() -> None:
         ours = open_connection(Address(ConnectionKind.UDP_IN, LOCAL, 0))
         try:
             assert ours.receive() == []
-            ours.send(b"to nobody yet", None)
+            ours.send(Packet(b"to nobody yet", None))
             with socket.socket(fileno=os.dup(ours.fileno())) as same:
                 port = same.getsockname()[1]
             vehicle.sendto(b"one", (LOCAL, port))
             assert select.select([ours], [], [], 5.0)[0]
             [(data, peer)] = ours.receive()
             assert (data, peer) == (b"one", vehicle.getsockname())
-            ours.send(b"two", peer)
+            ours.send(Packet(b"two", peer))
             vehicle.settimeout(5.0)
             assert vehicle.recv(100) == b"two", "what was sent to nobody never came"
             with pytest.raises(OSError, match="in use"):
@@ -75,7 +76,7 @@ def test_a_port_that_speaks_first_needs_no_peer() -> None:
         vehicle.settimeout(5.0)
         ours = open_connection(Address(ConnectionKind.UDP_OUT, LOCAL, vehicle.getsockname()[1]))
         try:
-            ours.send(b"hello", None)
+            ours.send(Packet(b"hello", None))
             data, peer = vehicle.recvfrom(100)
             assert data == b"hello"
             vehicle.sendto(b"who is it", peer)
@@ -87,7 +88,7 @@ def test_a_port_that_speaks_first_needs_no_peer() -> None:
 def test_tcp_brings_bytes_and_says_when_it_ends() -> None:
     with by_tcp() as (ours, vehicle):
         assert ours.receive() == [], "nothing yet"
-        ours.send(b"hello", None)
+        ours.send(Packet(b"hello", None))
         assert vehicle.recv(100) == b"hello"
         vehicle.sendall(b"heartbeat")
         assert came(ours) == b"heartbeat"
@@ -101,10 +102,10 @@ def test_tcp_ends_rather_than_send_half_a_frame() -> None:
     """What follows half a frame would be noise to the vehicle; a whole one that finds no room is merely lost."""
     with by_tcp() as (ours, _):
         with pytest.raises(ConnectionError, match="no longer reads"):
-            ours.send(bytes(64 << 20), None)
+            ours.send(Packet(bytes(64 << 20), None))
         # Freed room may take a moment to be known on both sides: here nobody reads, so none is freed.
         wait_until(lambda: not select.select([], [ours], [], 0.0)[1], "there is no room at all")
-        ours.send(b"lost without a word", None)
+        ours.send(Packet(b"lost without a word", None))
 
 
 def test_a_serial_line_carries_bytes_both_ways(line: tuple[int, str]) -> None:
@@ -116,7 +117,7 @@ def test_a_serial_line_carries_bytes_both_ways(line: tuple[int, str]) -> None:
         assert ours.receive() == []
         os.write(far, b"heartbeat")
         assert came(ours) == b"heartbeat"
-        ours.send(b"hello", None)
+        ours.send(Packet(b"hello", None))
         assert os.read(far, 100) == b"hello"
         with pytest.raises(OSError, match="exclusively lock"):
             open_connection(Address(ConnectionKind.SERIAL, device, 57600))

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import select
 import socket
 import threading
+import time
+import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,17 +19,20 @@ import pytest
 
 from skyloop.drivers.base import Driver, ExternalPose, ServedLink
 from skyloop.drivers.mavlink import MavlinkDriver
+from skyloop.drivers.mavlink.link import MavlinkLink
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import DriverError, UnsupportedError, UsageError
 from skyloop.host.links import LinkThread
-from skyloop.messages import FlightState, Land, LinkState, Takeoff, Velocity
+from skyloop.messages import EmergencyStop, FlightState, Land, LinkState, Takeoff, Velocity
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
 from skyloop.wire.mavlink.codec import Codec
 from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import Landed
+from tests.drivers.mavlink.scripted import ARDUPILOT, Vehicle
 
 PATIENCE_S = 15.0
 
@@ -75,6 +82,35 @@ def test_a_thread_that_serves_several_serves_it_too() -> None:
             driver.close()
             thread.close()
     assert not sink.problems
+
+
+def test_a_name_that_does_not_resolve_keeps_no_other_link_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread serves several vehicles; it comes back for the answer once there is one."""
+    released, found = threading.Event(), socket.getaddrinfo("127.0.0.1", None, type=socket.SOCK_STREAM)
+
+    def resolver(*_: object) -> object:
+        released.wait(PATIENCE_S)
+        return found
+
+    given: list[ServedLink] = []
+    driver = MavlinkDriver(parse_uri("mavlink://udpout:drone7.lab:9"))
+    driver.serve_link = given.append
+    driver.open(RecordingSink(watch=set()))
+    (link,) = given
+    assert isinstance(link, MavlinkLink)
+    monkeypatch.setattr("skyloop.drivers.name_lookup.socket.getaddrinfo", resolver)
+    monkeypatch.setattr("skyloop.drivers.name_lookup.WAIT_S", PATIENCE_S)
+    begun_s = time.monotonic()
+    for _ in range(3):
+        link.serve(readable=False)
+    assert time.monotonic() - begun_s < 0.5 * PATIENCE_S, "it never waits for the name"
+    released.set()
+    wait_until(lambda: link.serve(readable=False) is not None and link._connection is not None, "it is opened")
+    monkeypatch.undo()
+    link._stopping.set()
+    assert link.serve(readable=False) is None
+    link.end()
+    driver.close()
 
 
 def test_what_fails_on_a_thread_that_serves_several_is_an_event_and_told_to_the_thread() -> None:
@@ -142,6 +178,44 @@ def test_a_serial_port() -> None:
     os.close(master)
 
 
+def test_a_serial_port_that_is_no_longer_read_is_lost_and_stops_nobody() -> None:
+    """The vehicle goes on sending, and reads nothing: commands return, the link is lost, closing is done at once."""
+    pytest.importorskip("serial")
+    far, near = os.openpty()
+    tty.setraw(near)
+    vehicle, ending = Vehicle(ARDUPILOT), threading.Event()
+    vehicle.mode, vehicle.armed, vehicle.landed, vehicle.place = "GUIDED", True, Landed.IN_AIR, (0.0, 0.0, -2.0)
+
+    def send() -> None:
+        while not ending.wait(0.02):
+            vehicle.boot_ms += 20
+            frames = [vehicle.codec.encode(each) for each in (vehicle.heartbeat(), *vehicle.telemetry())]
+            os.write(far, b"".join(frames))
+
+    sending = threading.Thread(target=send)
+    sending.start()
+    try:
+        with opened(f"mavlink://serial:{os.ttyname(near)}:10000000?parameters=no") as (driver, sink):
+            up(sink)
+            assert sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.HOVERING, PATIENCE_S)
+            os.set_blocking(near, False)
+            while select.select([], [near], [], 0.05)[1]:
+                with suppress(BlockingIOError):
+                    while True:
+                        os.write(near, b"x")
+            driver.apply(Velocity(forward=0.3))
+            driver.apply(EmergencyStop())
+            assert sink.wait(lambda: any(state is LinkState.LOST for state, _ in sink.links), PATIENCE_S)
+            assert any("no longer reads" in reason for _, reason in sink.links)
+            driver.apply(EmergencyStop())
+            driver.close()
+    finally:
+        ending.set()
+        sending.join(5.0)
+        os.close(near)
+        os.close(far)
+
+
 def _into(descriptor: int) -> Callable[[bytes], object]:
     return lambda data: os.write(descriptor, data)
 
@@ -196,6 +270,21 @@ def test_two_vehicles_with_one_id_are_told_apart_by_their_addresses() -> None:
         up(sink)
         fly(driver, sink)
         assert host.simulation.truth(0).state is FlightState.LANDED
+
+
+def test_another_vehicle_in_the_place_of_the_first_is_flown_as_what_it_is() -> None:
+    """A PX4, then an ArduCopter with the same system id on the same port, whose numbers of modes mean other things."""
+    ports = Ports.free(Kind.PX4)
+    with opened(f"mavlink://udpin:127.0.0.1:{ports.remote}") as (driver, sink):
+        with firmware(kind=Kind.PX4, ports=ports):
+            up(sink)
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S)
+        with firmware(kind=Kind.ARDUCOPTER, ports=replace(Ports.free(Kind.ARDUCOPTER), remote=ports.remote)):
+            up(sink)
+            assert any("another vehicle answers" in event.text for event in sink.events)
+            assert "mavlink.fs_gcs_enable" in [each.name for each in driver.parameters()]
+            assert "mavlink.nav_dll_act" not in [each.name for each in driver.parameters()]
+            fly(driver, sink)
 
 
 def fly(driver: Driver, sink: RecordingSink) -> None:

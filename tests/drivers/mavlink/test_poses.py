@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from scipy.spatial.transform import Rotation
 
+from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import PoseMessage
+from skyloop.errors import DriverError
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.wire.mavlink.axes import angles_of, from_wire
 
@@ -52,3 +55,12 @@ def test_as_a_vision_estimate_of_unknown_accuracy() -> None:
     assert (message.usec, message.x, message.y, message.z) == (1_234_567, 2.0, 1.0, -3.0)
     assert (message.roll, message.pitch, message.yaw) == pytest.approx(ANGLES)
     assert math.isnan(message.covariance[0])
+
+
+def test_a_pose_from_the_future_is_refused_or_taken_for_one_of_now() -> None:
+    """A wrong clock; all poses with the right time would look old after it."""
+    for ahead_ns, taken in ((-NS_PER_S, -NS_PER_S), (0, 0), (NS_PER_S // 50, 0)):
+        pose = replace(POSE, captured_ns=5 * NS_PER_S + ahead_ns)
+        assert pose.bounded(5 * NS_PER_S).captured_ns == 5 * NS_PER_S + taken
+    with pytest.raises(DriverError, match=r"stamped 0\.1 s ahead"):
+        replace(POSE, captured_ns=5 * NS_PER_S + NS_PER_S // 10).bounded(5 * NS_PER_S)

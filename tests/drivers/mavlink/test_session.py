@@ -18,6 +18,7 @@ from skyloop.drivers.mavlink.setpoints import STEP_NS, Goal
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
 from skyloop.messages import (
+    AnyAction,
     EmergencyStop,
     FlightState,
     Hover,
@@ -29,8 +30,9 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.wire.mavlink.codec import Codec
+from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import COPTER_NUMBERS
 from skyloop.wire.mavlink.texts import chunks_of
 from tests.drivers.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
 from tests.recordings import recorded
@@ -508,3 +510,303 @@ def test_a_vehicle_at_rest_is_missed_in_time_and_its_mode_seen_at_once(autopilot
         bench.tick()
         bench.hear(message)
         assert bench.session.due_ns <= bench.clock()
+
+
+# What takes the place of a vehicle, and what only looks like it ------------------------------------------------------
+
+
+def parameter(name: str, value: float, index: int = 0, count: int = 1) -> Message:
+    return m.MAVLink_param_value_message(name.encode(), value, 9, count, index)
+
+
+def version_of(serial: int) -> Message:
+    none = [0] * 8
+    return m.MAVLink_autopilot_version_message(0, 0x01110000, 0, 0, 0, none, none, none, 0, 0, serial)
+
+
+def known(bench: Bench, serial: int = 0) -> Bench:
+    """A vehicle whose parameters were read, and that said who it is, if it has a serial number."""
+    bench.found()
+    bench.hear(parameter("MPC_THR_HOVER", 0.7))
+    if serial:
+        bench.hear(version_of(serial))
+    bench.go_on(0.2)
+    assert bench.link() is LinkState.UP
+    return bench
+
+
+def modes_set(bench: Bench) -> set[float]:
+    return {each.param2 for each in bench.heard_of("COMMAND_LONG") if each.command == m.MAV_CMD_DO_SET_MODE}
+
+
+WITH_PARAMETERS = "mavlink://udpin:127.0.0.1:14540"
+
+
+@pytest.mark.parametrize("silent_s", [10.0, 0.0])
+def test_another_autopilot_with_the_same_id_is_never_flown_by_the_first_ones_modes(silent_s: float) -> None:
+    """A PX4, then an ArduCopter on the same port, where PX4's numbers of modes are GUIDED and RTL."""
+    bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
+    bench.go_on(silent_s, silent=True)
+    bench.vehicle = Vehicle(ARDUPILOT)
+    bench.said.clear()
+    bench.flying("LOITER")
+    bench.go_on(1.0)
+    assert "ArduCopter" in bench.session.description
+    assert (bench.newest.native or {})["mavlink.mode"] == "LOITER"
+    assert not bench.session.parameters.values, "those of the other one are gone"
+    assert any("another vehicle" in text for text in bench.texts)
+    bench.apply(Hover())
+    bench.go_on(2.0)
+    assert modes_set(bench) == {COPTER_NUMBERS["GUIDED"]}
+    bench.apply(Land())
+    bench.go_on(2.0)
+    assert modes_set(bench) == {COPTER_NUMBERS["LAND"]}
+
+
+def test_what_can_not_be_flown_is_not_flown_in_the_place_of_another() -> None:
+    bench = known(Bench(Vehicle(ARDUPILOT), options(WITH_PARAMETERS)))
+    bench.go_on(3.0, silent=True)
+    bench.vehicle.kind = 1  # a plane
+    bench.found()
+    with pytest.raises(DriverError, match="no multirotor"):
+        bench.apply(Hover())
+
+
+def test_another_airframe_of_the_same_kind_is_read_anew() -> None:
+    """By its serial number; what was learnt of the first one is dropped."""
+    bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
+    bench.go_on(3.0, silent=True)
+    bench.vehicle = Vehicle(PX4)
+    bench.found()
+    assert bench.link() is LinkState.DEGRADED, "which one it is is not known yet"
+    bench.hear(version_of(8))
+    bench.go_on(0.1)
+    assert not bench.session.parameters.values
+    assert bench.heard_of("PARAM_REQUEST_LIST")
+    assert bench.link() is LinkState.DEGRADED
+    bench.hear(parameter("MPC_THR_HOVER", 0.3))
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP
+
+
+def test_the_same_vehicle_is_up_again_without_reading_its_parameters() -> None:
+    bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
+    bench.go_on(3.0, silent=True)
+    bench.found()
+    bench.hear(version_of(7))
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP
+    assert not bench.heard_of("PARAM_REQUEST_LIST")
+    assert bench.session.parameters.values
+
+
+@pytest.mark.parametrize("serial", [0, 7])
+def test_a_vehicle_that_does_not_say_which_it_is_is_read_anew(serial: int) -> None:
+    bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=serial)
+    bench.go_on(3.0, silent=True)
+    bench.hear(bench.vehicle.heartbeat())
+    bench.go_on(2.5)
+    assert bench.heard_of("PARAM_REQUEST_LIST")
+    assert bench.link() is LinkState.DEGRADED
+    bench.hear(parameter("MPC_THR_HOVER", 0.7))
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP
+
+
+def test_a_message_that_arrives_late_is_no_reboot() -> None:
+    """One attitude is 1.5 s late: nothing is lost, no set-point is missing, and it is not taken for the newest."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(1.0)
+    bench.said.clear()
+    for _ in range(3):
+        at_ms, before = bench.vehicle.boot_ms - 1500, bench.newest.position_m
+        late = m.MAVLink_attitude_message(at_ms, 1.5, 0.2, 0.0, 0.0, 0.0, 0.0)
+        bench.hear(late, m.MAVLink_local_position_ned_message(at_ms, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0), late)
+        assert bench.newest.roll_rad == pytest.approx(0.1)
+        assert bench.newest.position_m == before
+        bench.go_on(1.0)
+    assert bench.link() is LinkState.UP
+    assert all(state is not LinkState.LOST for state, _ in bench.sink.links)
+    sent = bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
+    assert len(sent) >= 70
+    assert all(each.vx == pytest.approx(0.5) for each in sent)
+
+
+def test_a_serial_number_that_one_version_of_the_protocol_lacks_is_no_other_vehicle() -> None:
+    """MAVLink 1 cuts the longer one off: the shorter one tells then, or nothing does."""
+    none = [0] * 8
+
+    def said(serial: int, longer: int) -> Message:
+        uid2 = [longer, *[0] * 17]
+        return m.MAVLink_autopilot_version_message(0, 0, 0, 0, 0, none, none, none, 0, 0, serial, uid2)
+
+    for before, after, reads in (((7, 9), (7, 0), 0), ((7, 9), (8, 9), 0), ((0, 9), (7, 0), 1), ((7, 9), (7, 8), 1)):
+        bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)))
+        bench.hear(said(*before))
+        bench.go_on(3.0, silent=True)
+        bench.found()
+        bench.hear(said(*after))
+        bench.go_on(0.5)
+        assert len(bench.heard_of("PARAM_REQUEST_LIST")) == reads, (before, after)
+
+
+def test_a_vehicle_that_no_longer_reads_is_not_up_before_it_has_answered() -> None:
+    """What was sent found no room: its heartbeats alone don't show that commands get through again."""
+    bench = Bench(Vehicle(PX4)).found()
+    bench.session.broken(ConnectionError("the vehicle no longer reads what is sent"), bench.clock())
+    bench.go_on(1.0)
+    assert bench.link() is LinkState.DEGRADED
+    assert (LinkState.LOST, "the connection failed: the vehicle no longer reads what is sent") in bench.sink.links
+    bench.answer(m.MAV_CMD_SET_MESSAGE_INTERVAL)
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP
+
+
+# Nothing comes, and what is sent may arrive --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", ["udpin:127.0.0.1:14540", "udpout:10.0.0.5:14550", "tcp:127.0.0.1:5760"])
+@pytest.mark.parametrize(("action", "mode"), [(Hover(), "BRAKE"), (Land(), "LAND")])
+def test_what_is_asked_of_a_vehicle_that_is_not_heard_is_sent(way: str, action: AnyAction, mode: str) -> None:
+    """It may still hear us: a dead receiver, a full downlink."""
+    bench = Bench(Vehicle(ARDUPILOT), options(f"mavlink://{way}?parameters=no")).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(3.0, silent=True)
+    assert bench.link() is LinkState.LOST
+    bench.said.clear()
+    bench.peers.clear()
+    bench.apply(action)
+    bench.go_on(10.0, silent=True)
+    asked = [each for each in bench.heard_of("COMMAND_LONG") if each.command == m.MAV_CMD_DO_SET_MODE]
+    assert 4 <= len(asked) <= 8, "for some seconds, and not for ever: others may take it over meanwhile"
+    assert {each.param2 for each in asked} == {COPTER_NUMBERS[mode]}
+    assert bench.peers == {PEER}
+
+
+def test_a_vehicle_that_is_not_heard_gets_no_heartbeats_that_keep_its_failsafe_from_acting() -> None:
+    """A failsafe's hover and landing aren't sent blindly, as a safety pilot may have it: its own failsafe is left."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(3.0, silent=True)
+    assert bench.link() is LinkState.LOST
+    bench.said.clear()
+    bench.apply(Hover(), alone=True)
+    bench.go_on(5.0, silent=True)
+    bench.apply(Land(), alone=True)
+    bench.go_on(5.0, silent=True)
+    assert not bench.said, "10 s without a word"
+    bench.go_on(20.0, silent=True)
+    assert 1 <= len(bench.heard_of("HEARTBEAT")) <= 2, "now and then one, for a vehicle that has lost our address"
+    bench.go_on(1.2)
+    assert bench.heard_of("HEARTBEAT")
+
+
+def test_a_vehicle_on_the_ground_that_is_not_heard_is_called_each_second() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    bench.go_on(3.0, silent=True)
+    bench.said.clear()
+    bench.go_on(5.0, silent=True)
+    assert len(bench.heard_of("HEARTBEAT")) >= 4
+
+
+# Several of one thing, and the same from somewhere else --------------------------------------------------------------
+
+
+def battery(number: int, percent: int, function: int = 0) -> Message:
+    return m.MAVLink_battery_status_message(number, function, 1, 0, [65535] * 10, -1, -1, -1, percent)
+
+
+def test_of_two_batteries_the_first_counts() -> None:
+    """The second may be for a gimbal, or nearly empty: its charge is not that of the flight."""
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.hear(bench.vehicle.heartbeat())
+    told = set()
+    for step in range(40):
+        bench.clock.advance(0.5)
+        bench.hear(bench.vehicle.heartbeat(), battery(1, 5))
+        if step % 20 < 4:
+            bench.hear(battery(0, 80))
+        told.add(bench.newest.battery)
+    assert told == {0.8, None}, "not known, rather than that of the other, while the first is silent"
+
+
+def test_the_charge_is_not_that_of_a_payload() -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.hear(bench.vehicle.heartbeat(), battery(0, 5, function=4), battery(1, 80), bench.vehicle.heartbeat())
+    assert bench.newest.battery == 0.8
+
+
+@pytest.mark.parametrize("facings", [(25, 0), (0, 25), (25, 25)])
+def test_of_two_range_finders_the_one_that_looks_down_counts(facings: tuple[int, int]) -> None:
+    """2.0 m below, and 5.0 m to a wall, or by a second one that looks down as well."""
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    below = facings.index(25)
+    told = set()
+    for _ in range(20):
+        for number, facing in enumerate(facings):
+            distance = 200 if number == below else 500
+            bench.hear(m.MAVLink_distance_sensor_message(0, 10, 3000, distance, 0, number, facing, 0))
+            bench.hear(m.MAVLink_extended_sys_state_message(0, 1), *bench.vehicle.telemetry())
+            told.add(bench.newest.altitude_m)
+        bench.go_on(0.04)
+    assert told - {0.0} == {2.0}
+
+
+def test_a_vehicle_that_goes_on_from_another_port_is_received_again_at_once() -> None:
+    """Its host, or an address translation, gave it a new one in flight."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(1.0)
+    moved = ("127.0.0.1", 33_333)
+    deaf_s = 0.0
+    while bench.session.identity is None or bench.session.identity.peer != moved:
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        bench.hear(*bench.vehicle.telemetry(), peer=moved)
+        bench.tick()
+        deaf_s += 0.02
+    assert deaf_s < 0.5
+    bench.peers.clear()
+    for _ in range(150):
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        bench.hear(bench.vehicle.heartbeat(), *bench.vehicle.telemetry(), peer=moved)
+        bench.tick()
+    assert bench.link() is LinkState.UP
+    assert all(state is not LinkState.LOST for state, _ in bench.sink.links)
+    assert bench.peers == {moved}
+
+
+@pytest.mark.parametrize("other", [("127.0.0.1", 33_333), ("10.0.0.7", 14_580)])
+def test_a_second_vehicle_with_the_same_id_never_steps_in(other: tuple[str, int]) -> None:
+    """Received beside the first one, or from another host: it is another vehicle, and not the first one's new port."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.hear(bench.vehicle.heartbeat(), peer=other)
+    bench.go_on(0.1)
+    for _ in range(100):
+        bench.clock.advance(0.02)
+        bench.hear(*bench.vehicle.telemetry(), peer=other)
+        bench.tick()
+        assert bench.session.identity is None or bench.session.identity.peer == PEER
+
+
+def test_a_request_that_was_lost_is_repeated_while_the_message_flows_too_slowly() -> None:
+    """PX4 sends positions once a second unasked: that is not the rate that was asked for."""
+    bench = Bench(Vehicle(PX4))
+    bench.hear(bench.vehicle.heartbeat())
+    asked: list[float] = []
+    for step in range(30 * 50):
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        if step % 10 == 0:
+            bench.hear(bench.vehicle.heartbeat())
+        for message in bench.vehicle.telemetry():
+            if message.get_type() != "LOCAL_POSITION_NED" or step % 50 == 0 or len(asked) > 2:
+                bench.hear(message)
+        bench.tick()
+        for each in bench.heard_of("COMMAND_LONG"):
+            if each.command == m.MAV_CMD_SET_MESSAGE_INTERVAL and each.param1 == m.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+                asked.append(step * 0.02)
+    assert len(asked) == 3, "until it flows as asked for"
+    assert asked[2] < 8.0

@@ -70,6 +70,9 @@ class Bench:
         self._parser.reset()
 
     def fly(self, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> None:
+        """Steer it; a climb from the ground is a take-off that somebody asked for."""
+        if climb > 0:
+            self.session.ask_takeoff(self.clock.now_ns)
         self.session.command(Attitude(roll, pitch, climb, yaw_rate), self.clock.now_ns)
 
     def tick(self) -> None:
@@ -80,7 +83,7 @@ class Bench:
         now_ns = self.clock.now_ns
         if self.poses and self._ticks % POSE_TICKS == 0:
             truth = self.simulation.truth(0)
-            self.session.on_pose(ExternalPose(truth.position_m, truth.quaternion, now_ns))
+            self.session.on_pose(ExternalPose(truth.position_m, truth.quaternion, now_ns), now_ns)
         if now_ns >= self.session.due_ns:
             self._exchange(self.session.poll(now_ns))
         for publish in self.session.drain():

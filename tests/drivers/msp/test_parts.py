@@ -16,7 +16,7 @@ from skyloop.drivers.msp.options import options_of
 from skyloop.drivers.msp.parameters import DriverParameters
 from skyloop.drivers.msp.protocol import MspSession
 from skyloop.drivers.msp.requests import PATIENCE_NS, Questions, Telemetry
-from skyloop.drivers.msp.setpoints import Report, SetpointController
+from skyloop.drivers.msp.setpoints import Phase, Report, SetpointController
 from skyloop.drivers.msp.telemetry import charge_left
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
@@ -282,6 +282,7 @@ def test_inav_is_read_and_armed() -> None:
     assert sink.newest is not None
     assert sink.newest.battery == 0.75
     assert sink.newest.yaw_rad == pytest.approx(math.pi / 4)
+    assert session.ask_takeoff(now_ns) == ""
     session.command(Attitude(climb=0.3), now_ns)
     run(0.2)
     assert (sticks[2], sticks[4] >= 1700) == (1000, True), "no throttle, and the arm switch is on"
@@ -351,6 +352,26 @@ def given_away() -> SetpointController:
     setpoints.on_pilot_throttle(0.42)
     setpoints.on_report(Report(armed=True, overridden=True), 1)
     return setpoints
+
+
+@pytest.mark.parametrize("climbs", [False, True])
+def test_one_that_is_disarmed_in_its_take_off_is_not_armed_again_by_the_take_off_that_goes_on(climbs: bool) -> None:
+    """It tipped over, or a switch killed it: 20 ms later the software take-off armed it again."""
+    setpoints = SetpointController()
+    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
+    setpoints.receiving = True
+    estimate = MotionEstimate()
+    estimate.on_altitude(msp.Altitude(0.0, 0.0), 0)
+    setpoints.on_motion(estimate.at(0))
+    setpoints.on_report(Report(armed=False), 0)
+    setpoints.apply(Attitude(climb=0.5), 1)
+    setpoints.on_report(Report(armed=True), 2)
+    if climbs:
+        setpoints.phase = Phase.FLYING
+    setpoints.on_report(Report(armed=False), 3)
+    with pytest.raises(DriverError, match="disarmed"):
+        setpoints.apply(Attitude(climb=0.5), 4)
+    assert setpoints.phase is Phase.STANDING
 
 
 # Without a vehicle ---------------------------------------------------------------------------------------------------

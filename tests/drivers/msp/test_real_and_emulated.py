@@ -18,7 +18,7 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.msp import BetaflightFirmware
 from skyloop.emulators.msp.board import bit
 from skyloop.errors import DriverError
-from skyloop.messages import Attitude, FlightState, LinkState
+from skyloop.messages import Attitude, FlightState, LinkState, Takeoff
 from skyloop.wire.msp.frames import Frame, Parser, encode
 from skyloop.wire.msp.messages import Function, Status, channels, pack_channels
 from skyloop.wire.msp.names import flag_names
@@ -133,6 +133,7 @@ def _arms_and_disarms(driver: MspDriver, sink: RecordingSink, vehicle: Vehicle) 
     vehicle.tilt(False)
     assert sink.wait(lambda: flags() == "", PATIENCE_S), flags()
 
+    driver.check(Takeoff())
     driver.apply(Attitude(climb=0.3))
     assert sink.wait(lambda: phase() == "spooling", PATIENCE_S), sink.events
     driver.apply(Attitude())

@@ -9,6 +9,7 @@ import sys
 import threading
 import tty
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 
@@ -17,7 +18,7 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.msp import BetaflightFirmware
 from skyloop.errors import MissingExtraError
-from skyloop.messages import Idle, LinkState, ResetEmergency
+from skyloop.messages import Attitude, EmergencyStop, Idle, LinkState, ResetEmergency
 from tests.drivers.msp.rig import world
 
 
@@ -39,6 +40,16 @@ class Wire(threading.Thread):
                     self._line.sendall(os.read(self._master, 4096))
                 else:
                     os.write(self._master, self._line.recv(4096))
+
+    def hang(self) -> None:
+        """Carry nothing any more, and leave no room for what is sent."""
+        self._ending.set()
+        self.join()
+        os.set_blocking(self._slave, False)
+        while select.select([], [self._slave], [], 0.05)[1]:
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(self._slave, b"x")
 
     def cut(self) -> None:
         self._ending.set()
@@ -71,6 +82,25 @@ def test_a_serial_port_is_read_and_lost(firmware: BetaflightFirmware) -> None:
         assert sink.wait(lambda: f"there is no {wire.path}" in sink.links[-1][1], 10.0), sink.links
     finally:
         driver.close()
+
+
+def test_a_serial_port_that_is_no_longer_read_stops_nobody(firmware: BetaflightFirmware) -> None:
+    """A flight controller that hangs: commands return, the link is lost, and closing takes no time."""
+    pytest.importorskip("serial")
+    wire = Wire(firmware.port)
+    wire.start()
+    driver, sink = MspDriver(parse_uri(f"msp://{wire.path}?baud=10000000")), RecordingSink()
+    driver.open(sink)
+    try:
+        assert sink.wait(lambda: sink.link_state is LinkState.UP, 20.0), sink.links
+        wire.hang()
+        for action in (Attitude(), EmergencyStop()):
+            driver.apply(action)
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, 10.0), sink.links
+        driver.apply(EmergencyStop())
+    finally:
+        driver.close()
+        wire.cut()
 
 
 def test_without_pyserial_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
 
+from skyloop.clock import NS_PER_S
+from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.msp.setpoints import Phase
 from skyloop.emulators.msp.board import bit
 from skyloop.emulators.msp.settings import BoardSettings
@@ -176,6 +179,21 @@ def test_without_a_measured_climb_nothing_takes_off() -> None:
         bench.fly(climb=0.5)
 
 
+def test_one_pose_that_is_stamped_ahead_changes_nothing() -> None:
+    """8 s, by a wrong clock, and nothing but poses measures the height: it would be blind, and cut its motors."""
+    bench = Bench(BoardSettings(barometer=False, gps=False))
+    bench.take_off()
+    now_ns, truth = bench.clock.now_ns, bench.simulation.truth(0)
+    with pytest.raises(DriverError, match=r"stamped 8 s ahead"):
+        bench.session.on_pose(ExternalPose((0.0, 0.0, 5.0), truth.quaternion, now_ns + 8 * NS_PER_S), now_ns)
+    bench.session.on_pose(ExternalPose(truth.position_m, truth.quaternion, now_ns + NS_PER_S // 30), now_ns)
+    for _ in range(10):
+        bench.run(1.0)
+        assert bench.session.motion.at(bench.clock.now_ns).precise
+        assert bench.height_m == pytest.approx(truth.position_m[2], abs=0.3)
+    assert not bench.texts("blind")
+
+
 def test_other_firmware_is_not_flown() -> None:
     bench = Bench()
     bench.cut = True
@@ -205,6 +223,34 @@ def test_silence_drops_it_after_the_firmwares_failsafe() -> None:
     assert bench.feedback.state is FlightState.LANDED
     bench.run(3.0)
     assert not bench.board.armed, "it is not armed again by itself"
+
+
+def test_what_is_found_on_the_ground_stays_there() -> None:
+    """The firmware stood still in flight and has disarmed; what hovered it goes on and asks for a climb."""
+    bench = Bench()
+    bench.take_off()
+    bench.cut = True
+    bench.until(lambda: not bench.board.armed, 1.6)
+    bench.cut = False
+    bench.until(lambda: bench.sink.link_state is LinkState.UP, 3.0)
+    for _ in range(300):
+        with suppress(DriverError):
+            bench.session.command(Attitude(climb=0.3), bench.clock.now_ns)
+        bench.tick()
+        assert bench.session.setpoints.phase is Phase.STANDING
+    with pytest.raises(DriverError, match="take off first"):
+        bench.session.command(Attitude(climb=0.3), bench.clock.now_ns)
+    bench.fly(climb=0.7)
+    bench.until(lambda: bench.height_m > 1.0, 20.0)
+
+
+def test_a_take_off_that_was_asked_for_long_ago_does_not_begin_now() -> None:
+    bench = Bench()
+    bench.ready()
+    assert bench.session.ask_takeoff(bench.clock.now_ns) == ""
+    bench.run(1.5)
+    with pytest.raises(DriverError, match="take off first"):
+        bench.session.command(Attitude(climb=0.3), bench.clock.now_ns)
 
 
 def test_a_short_cut_is_flown_through() -> None:

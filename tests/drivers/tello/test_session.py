@@ -483,3 +483,24 @@ def test_recorded_states_that_were_damaged_do_not_raise(data: st.DataObject) -> 
         rig.session.on_state(bytes(line), rig.now_ns)
         rig.step()
     assert not rig.sink.problems
+
+
+def test_a_state_that_arrives_late_is_left_out() -> None:
+    """One from before, with fewer seconds of running motors, would make the next look as if they ran again."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    late = rig.bench.logic.state_string()
+    assert late is not None
+    rig.do(Land())
+    rig.until(lambda: rig.state is FlightState.LANDED, 12.0)
+    before = rig.sink.feedback_count
+    rig.session.on_state(late, rig.now_ns)
+    for publish in rig.session.drain():
+        publish(rig.sink)
+    assert rig.sink.feedback_count == before
+    rig.run(1.0)
+    assert rig.state is FlightState.LANDED
+    assert rig.feedback.native is not None
+    assert rig.feedback.native["state.late"] == 1

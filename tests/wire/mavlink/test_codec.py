@@ -195,3 +195,83 @@ def test_a_signed_datagram_is_checked_as_a_stream_is() -> None:
     assert receiver.decode(Codec(1, 1).encode(attitude()), whole=True) == [], "not signed"
     assert keyless.decode(frame, whole=True) == []
     assert (keyless.signed, keyless.damaged) == (1, 0)
+
+
+@pytest.mark.parametrize("size", [1, 20, 64, 200])
+def test_a_stream_may_be_cut_across_datagrams(size: int) -> None:
+    """As a bridge from a serial line to the network does; another sender's datagrams come in between."""
+    sender, receiver, other = Codec(1, 1), Codec(255, 190), Codec(2, 1)
+    stream = b"".join(sender.encode(attitude(n), version=1 + n % 2) for n in range(220))
+    found: list[Message] = []
+    for at in range(0, len(stream), size):
+        found += receiver.decode(stream[at : at + size], whole=True, source="bridge")
+        assert len(receiver.decode(other.encode(attitude()), whole=True, source="other")) == 1
+    assert [each.time_boot_ms for each in found] == list(range(220))
+    assert receiver.damaged == 0
+
+
+def test_a_cut_stream_goes_on_after_a_lost_datagram() -> None:
+    sender, receiver = Codec(1, 1), Codec(255, 190)
+    stream = b"".join(sender.encode(attitude(n)) for n in range(200))
+    pieces = [stream[at : at + 100] for at in range(0, len(stream), 100)]
+    del pieces[::10]
+    found = [each for piece in pieces for each in receiver.decode(piece, whole=True)]
+    assert len(found) > 140, "each loss costs a few frames"
+
+
+def test_a_sender_of_pieces_can_not_fill_the_memory() -> None:
+    receiver = Codec(255, 190)
+    for sender in range(1000):
+        receiver.decode(b"\xfd\xff", whole=True, source=sender)
+    assert len(receiver._rests) <= 16
+
+
+class Wall:
+    """The system's clock, as the tests set it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, now_s: float = 1.8e9) -> None:
+        self.now_s = now_s
+        monkeypatch.setattr("skyloop.wire.mavlink.codec.time", self)
+
+    def time(self) -> float:
+        return self.now_s
+
+
+def test_the_time_of_signatures_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A vehicle that is switched on 80 s later takes what we send: one minute is the most it may be behind."""
+    wall = Wall(monkeypatch)
+    ours = Codec(255, 190, key=KEY)
+    ours.encode(attitude())
+    wall.now_s += 80
+    vehicle = Codec(1, 1, key=KEY)
+    assert len(vehicle.decode(ours.encode(attitude()))) == 1
+    assert len(ours.decode(vehicle.encode(attitude()))) == 1
+
+
+def test_a_clock_that_was_never_set_signs_and_follows_the_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1970, as on a computer without a clock of its own; the vehicle has the time from its satellites."""
+    wall = Wall(monkeypatch)
+    vehicle = Codec(1, 1, key=KEY)
+    first = vehicle.encode(attitude())
+    wall.now_s = 0.0
+    ours = Codec(255, 190, key=KEY)
+    assert vehicle.decode(ours.encode(attitude())) == [], "an old one"
+    assert len(ours.decode(first)) == 1
+    assert len(vehicle.decode(ours.encode(attitude()))) == 1
+
+
+def test_a_signature_is_never_repeated_where_the_clock_goes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall = Wall(monkeypatch)
+    ours, vehicle = Codec(255, 190, key=KEY), Codec(1, 1, key=KEY)
+    for _ in range(3):
+        assert len(vehicle.decode(ours.encode(attitude()))) == 1
+        wall.now_s -= 10.0
+
+
+def test_who_has_no_key_locks_nobody_out() -> None:
+    """A forged frame from the far future changes nothing."""
+    ours, vehicle = Codec(255, 190, key=KEY), Codec(1, 1, key=KEY)
+    forged = bytearray(vehicle.encode(attitude()))
+    forged[-12:-6] = b"\xff" * 6
+    assert ours.decode(bytes(forged)) == []
+    assert len(ours.decode(vehicle.encode(attitude()))) == 1

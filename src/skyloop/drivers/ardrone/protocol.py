@@ -107,7 +107,7 @@ class ArdroneSession(VehicleSession):
         self._health = Health()
         self._setup_ns: int | None = None
         self._setups_failed = 0
-        self._state = State(0)
+        self._state = self._earlier = State(0)  # of the newest datagram, and of the one before
         self._sent_ns = 0
         self._started_ns = 0
         self._published_ns = 0
@@ -186,13 +186,15 @@ class ArdroneSession(VehicleSession):
     def _detect_break(self, state: State, now_ns: int) -> None:
         """Detect that the drone restarted or lost us, even if it was silent for less time than we would detect.
 
-        What it forgot meanwhile is not known.
+        What it forgot meanwhile is not known. Two datagrams in a row have to say so.
         """
+        both, begins = state & self._state, ~self._earlier
+        self._earlier = self._state
         if not self.ready:
             return
-        if state & State.BOOTSTRAP:
+        if both & State.BOOTSTRAP:
             self._lose("the drone rebooted", now_ns)
-        elif state & ~self._state & State.COMMUNICATION_LOST:
+        elif both & begins & State.COMMUNICATION_LOST:
             self._lose("the drone reports that it lost its link to us", now_ns)
 
     def _publish(self, navdata: Navdata, demo: Demo, now_ns: int) -> None:

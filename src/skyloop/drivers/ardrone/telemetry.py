@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.live_clock import LiveClock
-from skyloop.drivers.vehicle_session import VehicleEvent
+from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
 from skyloop.errors import DecodeError
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle
@@ -24,7 +24,6 @@ from skyloop.wire.ardrone.options import LAYOUTS, Demo, PhysMeasures, RawMeasure
 # Datagrams as they come ----------------------------------------------------------------------------------------------
 
 RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: after it a lower sequence is a new count, and not a late datagram
-RESTART_RUN: Final = 5  #: so many lower ones in a row, in order among themselves, are a new count as well
 _MICROSECOND_BITS: Final = 21
 _TIME_WRAP_S: Final = 1 << 11
 
@@ -40,8 +39,7 @@ class Reception:
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late", "missed", "restarts", "unknown"), 0))
         self._sequence = 0
         self._accepted_ns = 0
-        self._late_sequence = 0
-        self._late_run = 0
+        self._watch = RestartWatch()
 
     def receive(self, datagram: bytes, now_ns: int) -> Navdata | None:
         """Return the content of a datagram, or None if it is damaged or late. Never raises."""
@@ -66,22 +64,18 @@ class Reception:
         return {f"navdata.{name}": count for name, count in self.counts.items()}
 
     def _is_new(self, sequence: int, now_ns: int) -> bool:
-        if sequence > self._sequence:
-            if self._sequence:
-                self.counts["missed"] += sequence - self._sequence - 1
-        elif self._begins_anew(sequence, now_ns):
-            self.counts["restarts"] += 1
-        else:
+        if sequence == self._sequence:
             return False
-        self._sequence, self._accepted_ns, self._late_run = sequence, now_ns, 0
+        if now_ns - self._accepted_ns >= RESTART_SILENCE_NS:
+            self._watch.forget()
+        if self._watch.update(sequence, now_ns) is Arrival.LATE:
+            return False
+        if sequence < self._sequence:
+            self.counts["restarts"] += 1
+        elif self._sequence:
+            self.counts["missed"] += sequence - self._sequence - 1
+        self._sequence, self._accepted_ns = sequence, now_ns
         return True
-
-    def _begins_anew(self, sequence: int, now_ns: int) -> bool:
-        if now_ns - self._accepted_ns >= RESTART_SILENCE_NS and sequence != self._sequence:
-            return True
-        self._late_run = self._late_run + 1 if sequence > self._late_sequence else 1
-        self._late_sequence = sequence
-        return self._late_run >= RESTART_RUN
 
 
 class DroneClock:

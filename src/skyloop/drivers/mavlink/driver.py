@@ -115,7 +115,7 @@ class MavlinkDriver(Driver):
         link = self._opened()
         if not link.session.is_receiving:
             raise DriverError("no data from the vehicle: an external pose can't be sent until the link is up")
-        link.send(pose_message(pose, self.options.pose))
+        link.send(pose_message(pose.bounded(monotonic_ns()), self.options.pose))
 
     def checkup(self) -> list[Diagnostic]:
         """Return which of the autopilot's own safety nets are off, and what to set."""

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import ServedLink
-from skyloop.drivers.byte_stream import SerialStream, TcpStream
+from skyloop.drivers.byte_stream import ByteStream, SerialStream, TcpStream
 from skyloop.drivers.mavlink.options import Address, ConnectionKind, Peer
-from skyloop.drivers.mavlink.protocol import MavlinkSession
-from skyloop.drivers.vehicle_link import VehicleLink
+from skyloop.drivers.mavlink.protocol import MavlinkSession, Packet
+from skyloop.drivers.vehicle_link import ConnectionLink
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.messages import AnyAction
 from skyloop.wire.mavlink.codec import Message
@@ -27,6 +26,7 @@ class MavlinkConnection(Protocol):
     """An open socket or port."""
 
     whole: bool  #: each piece is a datagram
+    dropped: int  #: packets that were not sent
 
     def fileno(self) -> int: ...
 
@@ -37,12 +37,8 @@ class MavlinkConnection(Protocol):
             OSError: Nothing more will come.
         """
 
-    def send(self, data: bytes, peer: Peer) -> None:
-        """Send, or drop it where there is no room.
-
-        Args:
-            data: One packet.
-            peer: The receiver of a datagram; None: the one in the address.
+    def send(self, packet: Packet) -> None:
+        """Send a packet, or drop it where there is no room.
 
         Raises:
             OSError: It can't be sent.
@@ -61,6 +57,7 @@ class UdpListener:
     whole = True
 
     def __init__(self, address: Address) -> None:
+        self.dropped = 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
@@ -85,12 +82,15 @@ class UdpListener:
                 continue
         return came
 
-    def send(self, data: bytes, peer: Peer) -> None:
+    def send(self, packet: Packet) -> None:
         """Send a datagram; drop it if there is no peer yet, or no room."""
-        if peer is None:
-            return  # no vehicle was received yet
-        with suppress(BlockingIOError):
-            self._socket.sendto(data, peer)
+        if packet.peer is None:
+            self.dropped += 1  # no vehicle was received yet
+            return
+        try:
+            self._socket.sendto(packet.data, packet.peer)
+        except BlockingIOError:
+            self.dropped += 1
 
     def close(self) -> None:
         """Close the port."""
@@ -109,41 +109,46 @@ class UdpSender(UdpListener):
         self._to: tuple[str, int] = str(found[0][4][0]), address.number
         super().__init__(Address(ConnectionKind.UDP_IN, "", 0))
 
-    def send(self, data: bytes, peer: Peer) -> None:
+    def send(self, packet: Packet) -> None:
         """Send a datagram to the peer, or to the address until something was received."""
-        super().send(data, peer or self._to)
+        super().send(packet._replace(peer=packet.peer or self._to))
 
 
-class TcpClient(TcpStream):
+class _Stream(ByteStream):
+    """A connection that carries bytes in order, of one vehicle."""
+
+    whole = False
+
+    def receive(self) -> list[tuple[bytes, Peer]]:
+        """Return what came.
+
+        Raises:
+            OSError: The connection ended, or the port was unplugged.
+        """
+        data = self.read()
+        return [(data, None)] if data else []
+
+    def send(self, packet: Packet) -> None:
+        """Send a packet, or drop it; see :meth:`ByteStream.write`.
+
+        Raises:
+            OSError: The vehicle no longer reads what is sent.
+        """
+        self.write(packet.data, packet.rank)
+
+
+class TcpClient(_Stream, TcpStream):
     """A client of the autopilot's TCP server, which serves one client at a time: connected is not yet served.
 
     Raises:
         OSError: It can't be reached within :data:`skyloop.drivers.byte_stream.CONNECT_S`.
     """
 
-    whole = False
-
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number)
 
-    def receive(self) -> list[tuple[bytes, Peer]]:
-        """Return what came.
 
-        Raises:
-            OSError: The connection ended.
-        """
-        return _piece(self.read())
-
-    def send(self, data: bytes, peer: Peer) -> None:  # noqa: ARG002
-        """Send a packet, or drop it where there is no room.
-
-        Raises:
-            OSError: It was sent in part: what follows half a frame would be noise.
-        """
-        self.write(data)
-
-
-class SerialPort(SerialStream):
+class SerialPort(_Stream, SerialStream):
     """A serial port, through pyserial, opened for this process alone.
 
     Raises:
@@ -151,26 +156,8 @@ class SerialPort(SerialStream):
         MissingExtraError: pyserial is not installed.
     """
 
-    whole = False
-
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number, "mavlink://serial:", "mavlink")
-
-    def receive(self) -> list[tuple[bytes, Peer]]:
-        """Return what came.
-
-        Raises:
-            OSError: It was unplugged.
-        """
-        return _piece(self.read())
-
-    def send(self, data: bytes, peer: Peer) -> None:  # noqa: ARG002
-        """Send a packet."""
-        self.write(data)
-
-
-def _piece(data: bytes) -> list[tuple[bytes, Peer]]:
-    return [(data, None)] if data else []
 
 
 _KINDS: Final[dict[ConnectionKind, type[UdpListener | TcpClient | SerialPort]]] = {
@@ -194,13 +181,11 @@ def open_connection(address: Address) -> MavlinkConnection:
     return _KINDS[address.kind](address)
 
 
-RETRY_NS: Final = nanoseconds(1.0)  #: between attempts to connect
-SILENT_NS: Final = nanoseconds(8.0)  #: a connected stream on which nothing comes for so long is reopened
 WRITE_S: Final = 0.9  #: a parameter is written and confirmed within this, or it failed
 _CLOSE_S: Final = 3.0
 
 
-class MavlinkLink(VehicleLink[MavlinkSession]):
+class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
     """Keeps the connection and serves the session, on a thread of its own.
 
     Args:
@@ -209,6 +194,8 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
         clock: Monotonic, ns.
         serve: Takes the link to a thread that serves several, if it is one over UDP: to open another may take a while.
     """
+
+    RETRY_NS = nanoseconds(1.0)
 
     def __init__(
         self,
@@ -228,8 +215,7 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
             close_s=_CLOSE_S,
             serve=serve if udp else None,
         )
-        self._connection: MavlinkConnection | None = None
-        self._broken = False  # nothing can be sent any more
+        self._silent_ns = None if udp else nanoseconds(8.0)
 
     # From the proxy's threads ------------------------------------------------------------------------------------
 
@@ -263,15 +249,8 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
 
     # On the link's thread ----------------------------------------------------------------------------------------
 
-    def _receive(self) -> None:
-        connection = self._connection
-        if connection is None:
-            return
-        try:
-            came = connection.receive()
-        except OSError as error:
-            self._on_failure(error)
-            return
+    def _read(self, connection: MavlinkConnection) -> None:
+        came = connection.receive()
         now_ns = self._clock()
         with self.lock:
             for data, peer in came:
@@ -281,34 +260,22 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
         """Send what is due. With the lock held, on any thread."""
         packets = self.session.poll(now_ns)
         connection = self._connection
-        if connection is None:
+        if connection is None or self._broken:
             return
         try:
-            for data, peer in packets:
-                connection.send(data, peer)
+            for packet in sorted(packets, key=lambda each: each.rank):
+                connection.send(packet)
         except OSError as error:
-            self.session.failed(error)
-            self._broken = not connection.whole
+            if connection.whole:
+                self.session.failed(error)
+            else:
+                self._on_broken(error, now_ns)
+        self.session.dropped = connection.dropped
 
     # The connection ----------------------------------------------------------------------------------------------
 
-    def _renewal_ns(self) -> int | None:
-        """Return when to reopen the connection: a stream when it breaks, or when nothing comes on it."""
-        connection = self._connection
-        if connection is None:
-            return RETRY_NS
-        if self._broken:
-            return 0
-        return None if self.session.is_receiving or connection.whole else SILENT_NS
-
-    def _open_sockets(self) -> None:
-        with self.lock:
-            self._close_sockets()
-        made = open_connection(self._address())
-        with self.lock:
-            self._connection = made
-            self.session.connected()
-        self._watch(made, self._receive)
+    def _connect(self) -> MavlinkConnection:
+        return open_connection(self._address())
 
     def _address(self) -> Address:
         """Return the address with a numeric host.
@@ -320,14 +287,3 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
         if address.kind not in (ConnectionKind.TCP, ConnectionKind.UDP_OUT):
             return address
         return replace(address, place=self._lookup.address(address.place))
-
-    def _on_failure(self, error: OSError) -> None:
-        with self.lock:
-            self.session.failed(error)
-            self._close_sockets()
-
-    def _close_sockets(self) -> None:
-        self._broken = False
-        if self._connection is not None:
-            self._forget(self._connection)
-            self._connection = None

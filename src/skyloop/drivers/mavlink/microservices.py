@@ -13,7 +13,7 @@ from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.mavlink.options import Peer, PoseMessage
 from skyloop.drivers.mavlink.telemetry import Telemetry
-from skyloop.drivers.vehicle_session import VehicleEvent
+from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
 from skyloop.messages import EventKind, Severity
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.wire.mavlink.axes import angles_of, swap, to_wire, yaw_between
@@ -22,6 +22,7 @@ from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import Autopilot
 
 AUTOPILOT_COMPONENT: Final = 1
+MOVED_NS: Final = nanoseconds(0.3)  #: a vehicle that is silent for so long may go on from another port
 MOST_OTHERS: Final = 16  #: other vehicles that are reported; a hostile sender can make up any number
 _NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
 _GROUND_STATION: Final = m.MAV_TYPE_GCS
@@ -51,19 +52,40 @@ class VehicleSelector:
         self.chosen: VehicleIdentity | None = None
         self._wanted_peer = peer
         self._reported: set[VehicleIdentity] = set()
+        self._elsewhere: set[VehicleIdentity] = set()  # received since the chosen one was: it may have moved there
+        self._others: set[VehicleIdentity] = set()  # received beside it: others, with its id
+        self._received_ns = 0  # when the chosen one was
 
-    def on_message(self, message: Message, peer: Peer) -> list[VehicleEvent]:
-        """Handle any message; return events about other vehicles."""
-        if message.get_type() != "HEARTBEAT" or not _is_vehicle(message):
-            return []
+    def on_message(self, message: Message, peer: Peer, now_ns: int) -> list[VehicleEvent]:
+        """Handle any message; return events about other vehicles, and about a chosen one that moved to another port."""
         found = VehicleIdentity(message.get_srcSystem(), message.get_srcComponent(), peer)
         if self.chosen == found:
+            self._received_ns = now_ns
+            self._others |= self._elsewhere
+            self._elsewhere.clear()
+            return []
+        if self._may_have_moved(found):
+            self._elsewhere.add(found)
+            if now_ns - self._received_ns >= MOVED_NS:
+                self.chosen, self._received_ns = found, now_ns
+                self._elsewhere.clear()
+                text = f"the vehicle sends from UDP port {found.peer[1] if found.peer else 0} now"
+                return [VehicleEvent(EventKind.VEHICLE_MESSAGE, text, data={"reason": "moved"})]
+        if message.get_type() != "HEARTBEAT" or not _is_vehicle(message):
             return []
         suits = self.system in (None, found.system) and self._wanted_peer in (None, peer)
         if self.chosen is None and suits:
-            self.chosen, self.system = found, found.system
+            self.chosen, self.system, self._received_ns = found, found.system, now_ns
             return []
         return self._report_other(found)
+
+    def _may_have_moved(self, found: VehicleIdentity) -> bool:
+        """Return whether this may be the chosen vehicle, with another port: its host may have given it a new one."""
+        chosen = self.chosen
+        if chosen is None or chosen.peer is None or found.peer is None or self._wanted_peer is not None:
+            return False
+        same = (found.system, found.component, found.peer[0]) == (chosen.system, chosen.component, chosen.peer[0])
+        return same and found not in self._others and len(self._others | self._elsewhere) < MOST_OTHERS
 
     def is_chosen(self, message: Message, peer: Peer) -> bool:
         """Return whether the vehicle that is flown sent it."""
@@ -78,6 +100,8 @@ class VehicleSelector:
     def forget(self) -> None:
         """Forget the chosen vehicle: it may come back from another peer, as the same system."""
         self.chosen = None
+        self._others.clear()
+        self._elsewhere.clear()
 
     def _report_other(self, found: VehicleIdentity) -> list[VehicleEvent]:
         if found in self._reported or len(self._reported) >= MOST_OTHERS:
@@ -192,7 +216,8 @@ class CommandSender:
 
 
 AT_ONCE: Final = 4  #: requests in a tick: a slow link needs room for others
-RETRY_S: Final = 3.0  #: a message that was accepted and does not flow is asked for again
+RETRY_S: Final = 3.0  #: a message that does not flow as often as it was asked for is asked for again
+ENOUGH: Final = 0.5  #: share of the rate that counts as flowing
 PATIENT_RETRY_S: Final = 20.0  #: the same after :data:`TRIES`, as the vehicle may not have it
 TRIES: Final = 4
 
@@ -209,26 +234,27 @@ class MessageIntervals:
 
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)
-        self._asked: dict[str, tuple[int, int]] = {}  # when last, and how often
+        self._asked: dict[str, tuple[int, int, int]] = {}  # since when it is counted, from what, and how often asked
         self._look_ns = 0
 
     def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
-        """Ask for messages that do not flow, at most :data:`AT_ONCE` of them."""
+        """Ask for messages that flow too slowly or not at all, at most :data:`AT_ONCE` of them."""
         if now_ns < self._look_ns:
             return
         left = AT_ONCE
         for name, rate_hz in self._rates.items():
             if not left:
                 return
-            asked_ns, times = self._asked.get(name, (None, 0))
-            if asked_ns is not None:
-                wait_s = RETRY_S if times < TRIES else PATIENT_RETRY_S
-                age_s = telemetry.age_s(name, now_ns)
-                if age_s is not None and age_s < max(RETRY_S, 3.0 / rate_hz):
+            since_ns, before, times = self._asked.get(name, (None, 0, 0))
+            count = telemetry.counts[name]
+            if since_ns is not None:
+                since_s = seconds(now_ns - since_ns)
+                if since_s < max(RETRY_S if times < TRIES else PATIENT_RETRY_S, 3.0 / rate_hz):
                     continue
-                if now_ns - asked_ns < nanoseconds(wait_s):
+                if count - before >= ENOUGH * rate_hz * since_s:
+                    self._asked[name] = now_ns, count, times
                     continue
-            self._asked[name] = now_ns, times + 1
+            self._asked[name] = now_ns, count, times + 1
             number = getattr(m, f"MAVLINK_MSG_ID_{name}")
             commands.request(VehicleCommand(m.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / rate_hz)), now_ns, 0.0)
             left -= 1
@@ -240,8 +266,7 @@ HURRY_NS: Final = nanoseconds(0.1)  #: between the first few
 FIRST: Final = 5
 KEEP_NS: Final = nanoseconds(10.0)
 PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that would be older than this when it arrives is of another clock
-REBOOT_MS: Final = 1000  #: stamps that go back by more mean that the vehicle was restarted
-_HALF: Final = 1 << 31
+BEHIND_MS: Final = 1000  #: stamps that are behind by more may mean that the vehicle was started anew
 _WRAP: Final = 1 << 32  #: of stamps in ms: 49 days
 
 
@@ -250,13 +275,12 @@ class VehicleClock:
 
     def __init__(self) -> None:
         self.round_trip_s: float | None = None  #: of the best answer lately
-        self.restarted = False  #: its clock was set back; read and cleared by the owner
         self._samples: deque[tuple[int, int, int]] = deque()  # when, round trip, their clock minus ours
         self._offset_ns: int | None = None  # their clock minus ours, of the best sample
         self._asked_ns = 0
         self._asked = 0
         self._live = LiveClock()
-        self._stamp_ms: int | None = None
+        self._watches: dict[str, RestartWatch] = {}  # by the message's name
         self._captured_ns = 0
 
     def poll(self, now_ns: int) -> list[Message]:
@@ -279,6 +303,10 @@ class VehicleClock:
             self.round_trip_s = seconds(best_ns)
         return []
 
+    def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> Arrival:
+        """Judge a message by its stamp: new, overtaken by others of its kind, or of a vehicle that was started anew."""
+        return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
+
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
         """Return when a state was captured: neither after ``now_ns`` nor before the last one.
 
@@ -286,11 +314,6 @@ class VehicleClock:
             boot_ms: The state's stamp, in milliseconds since the vehicle's start, 32 bits.
             now_ns: When it arrived.
         """
-        before, self._stamp_ms = self._stamp_ms, boot_ms
-        if before is not None:
-            step = (boot_ms - before + _HALF) % _WRAP - _HALF
-            if step < -REBOOT_MS and boot_ms < before:
-                self.restarted = True
         live_ns = self._live.captured_ns(boot_ms / 1000.0, now_ns)
         if self._offset_ns is not None:
             synced_ns = boot_ms * 1_000_000 - self._offset_ns

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple
 
 from skyloop.clock import nanoseconds
+from skyloop.drivers.byte_stream import Rank
 from skyloop.drivers.link_reasons import LinkTrouble, serial_trouble, trouble_of
 from skyloop.drivers.mavlink.autopilots import AutopilotProfile, profile_of
 from skyloop.drivers.mavlink.microservices import (
@@ -22,7 +23,7 @@ from skyloop.drivers.mavlink.parameters import ParameterExchange
 from skyloop.drivers.mavlink.setpoints import SetpointController
 from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
 from skyloop.drivers.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
-from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession
+from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, VehicleEvent, VehicleSession
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Severity, Value
 from skyloop.wire.mavlink.codec import Codec, Message
@@ -32,17 +33,45 @@ from skyloop.wire.mavlink.parameter_values import BYTEWISE
 TICK_NS: Final = nanoseconds(0.02)
 REST_NS: Final = nanoseconds(0.1)  #: the same while nothing is under way: for silence, heartbeats and requests
 HEARTBEAT_NS: Final = nanoseconds(1.0)
+UNHEARD_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: the autopilots' own failsafes act after 5 or 10 s without one
 DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
 LOST_NS: Final = nanoseconds(2.5)
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle without any data by then is reported as lost
 PARAMETERS_NS: Final = nanoseconds(25.0)  #: the list may take so long, then the link is up without it
+IDENTITY_NS: Final = nanoseconds(2.0)  #: a vehicle that is found again says by then that it is the same
 QUIET_ATTITUDE_S: Final = 0.5  #: without it, other messages make feedback
 VERSION_PACE_S: Final = 1.0
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
+_STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps show their order
 _MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that say it
 
-Packet: TypeAlias = tuple[bytes, Peer]
+#: Commands that the vehicle's safety rests on: sent before all else, whatever is under way.
+_URGENT: Final = frozenset(
+    {m.MAV_CMD_COMPONENT_ARM_DISARM, m.MAV_CMD_DO_SET_MODE, m.MAV_CMD_NAV_TAKEOFF, m.MAV_CMD_NAV_LAND}
+)
+_SETPOINTS: Final = frozenset({"SET_POSITION_TARGET_LOCAL_NED", "SET_ATTITUDE_TARGET", "HEARTBEAT"})
+_POSES: Final = frozenset({"ODOMETRY", "VISION_POSITION_ESTIMATE"})
+
+
+class Packet(NamedTuple):
+    """One frame to be sent."""
+
+    data: bytes
+    peer: Peer  #: the receiver of a datagram; None: the one in the address
+    rank: Rank = Rank.SETPOINT
+
+
+def rank_of(message: Message) -> Rank:
+    """Return how important a message to the vehicle is on a slow line."""
+    kind = message.get_type()
+    if kind == "COMMAND_LONG" and message.command in _URGENT:
+        return Rank.COMMAND
+    if kind in _SETPOINTS:
+        return Rank.SETPOINT
+    return Rank.POSE if kind in _POSES else Rank.QUERY
+
+
 _ASK_VERSION: Final = VehicleCommand(m.MAV_CMD_REQUEST_MESSAGE, (float(m.MAVLINK_MSG_ID_AUTOPILOT_VERSION),))
 
 
@@ -71,6 +100,7 @@ class MavlinkSession(VehicleSession):
         self.setpoints: SetpointController | None = None  #: None until then, and for what can't be flown
         self.version: Message | None = None  #: its AUTOPILOT_VERSION
         self.limits = options.limits  #: the driver's own
+        self.dropped = 0  #: packets that the connection did not send, for want of room
         self._axes = WorldAxes(options.world_origin)
         self._extra = extra
         self._selector = VehicleSelector(options.system, options.peer)
@@ -79,8 +109,13 @@ class MavlinkSession(VehicleSession):
         self._out: list[Message] = []
         self._found_ns = 0
         self._heartbeat_ns = -HEARTBEAT_NS
+        self._peer = options.peer  # the chosen vehicle's, kept while it is lost
+        self._unheard = False  # lost while it was armed: our heartbeats would keep its own failsafe from acting
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
+        self._kind: tuple[int, int] | None = None  # autopilot and type, by its heartbeat
+        self._known_as: Message | None = None  # the version told before the link was lost, until it is told again
+        self._heard_by_it = True  # False: nothing shows yet that it reads what is sent
         self._said: tuple[int | None, bool, int] | None = None  # mode, whether it is armed, MAV_STATE, when last looked
         self._unsupported_reason = "no data from it"
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
@@ -158,7 +193,7 @@ class MavlinkSession(VehicleSession):
             now_ns: When it came.
             whole: Whether ``data`` is a datagram; if not, it is a piece of a stream.
         """
-        for message in self.codec.decode(data, whole=whole):
+        for message in self.codec.decode(data, whole=whole, source=peer):
             self._on_message(message, peer, now_ns)
         if self.codec.signed > self._signed:
             first, self._signed = not self._signed, self.codec.signed
@@ -172,11 +207,13 @@ class MavlinkSession(VehicleSession):
         self._unreachable = ""
 
     def _on_message(self, message: Message, peer: Peer, now_ns: int) -> None:
-        for event in self._selector.on_message(message, peer):
+        kind = message.get_type()
+        if kind == "HEARTBEAT" and self._is_another(message, peer):
+            self._lose(f"another autopilot answers as system {message.get_srcSystem()}", now_ns)
+        for event in self._selector.on_message(message, peer, now_ns):
             self._publish_event(event)
         if not self._selector.is_chosen(message, peer):
             return
-        kind = message.get_type()
         if self._received_ns is None:
             if kind != "HEARTBEAT":
                 return
@@ -185,21 +222,31 @@ class MavlinkSession(VehicleSession):
         self._old = message.get_msgbuf()[0] == m.PROTOCOL_MARKER_V1
         if self.autopilot is not None and not self._axes.received(message, self.autopilot.EARTH_RADIUS_M):
             return
+        if kind in _STAMPED:
+            arrival = self.clock.on_stamp(kind, message.time_boot_ms, now_ns)
+            if arrival is Arrival.RESTARTED:
+                self.version = None  # it may be another one, and its parameters may be others
+                self.telemetry = Telemetry()
+                self._lose("the vehicle rebooted", now_ns)
+            if arrival is not Arrival.NEW:
+                return
         if kind not in _ANSWERS:
             self.telemetry.on_message(message, now_ns)
         self._dispatch(kind, message, now_ns)
 
+    def _is_another(self, heartbeat: Message, peer: Peer) -> bool:
+        """Return whether the chosen vehicle's place was taken by one with another autopilot."""
+        if self._received_ns is None or self._kind is None or not self._selector.is_chosen(heartbeat, peer):
+            return False
+        return bool(heartbeat.autopilot != self._kind[0])
+
     def _dispatch(self, kind: str, message: Message, now_ns: int) -> None:
         if kind == "ATTITUDE":
-            captured_ns = self.clock.captured_ns(message.time_boot_ms, now_ns)
-            if self.clock.restarted:
-                self.parameters.complete = False
-                self._lose("the vehicle rebooted", now_ns)
-                return
-            self._publish(captured_ns, now_ns)
+            self._publish(self.clock.captured_ns(message.time_boot_ms, now_ns), now_ns)
         elif kind == "COMMAND_ACK":
             if message.target_system in (0, self.options.own_system):
                 self.commands.on_ack(message, now_ns)
+                self._heard_by_it = True
                 self.due_ns = 0
         elif kind == "PARAM_VALUE":
             self.parameters.on_value(message, now_ns)
@@ -214,8 +261,7 @@ class MavlinkSession(VehicleSession):
                 if self.setpoints is not None and event.data["reason"] == "prearm":
                     self.setpoints.on_prearm_reason(event.text)
         elif kind == "AUTOPILOT_VERSION":
-            self.version = message
-            self.parameters.bytewise = bool(message.capabilities & BYTEWISE)
+            self._on_version(message, now_ns)
         elif kind in ("HEARTBEAT", "LOCAL_POSITION_NED", "EXTENDED_SYS_STATE"):
             age_s = self.telemetry.age_s("ATTITUDE", now_ns)
             if age_s is None or age_s > QUIET_ATTITUDE_S:
@@ -230,6 +276,7 @@ class MavlinkSession(VehicleSession):
         vehicle = self.vehicle_state(now_ns)
         native: dict[str, Value] = dict(self._extra())
         native["link.frames"], native["link.damaged"] = self.codec.frames, self.codec.damaged
+        native["link.dropped"] = self.dropped
         if vehicle is not None:
             native["mavlink.mode"], native["mavlink.armed"] = vehicle.mode, vehicle.armed
             if vehicle.ready is not None:
@@ -248,8 +295,9 @@ class MavlinkSession(VehicleSession):
     def poll(self, now_ns: int) -> list[Packet]:
         """Return the packets to send now."""
         self._check_silence(now_ns)
-        identity = self.identity
-        peer = identity.peer if identity is not None else self.options.peer
+        if self.identity is not None:
+            self._peer = self.identity.peer
+        peer = self._peer
         packets = self._heartbeats(peer, now_ns)
         out, self._out = self._out, []
         if self._received_ns is not None:
@@ -257,9 +305,13 @@ class MavlinkSession(VehicleSession):
             vehicle = self.vehicle_state(now_ns)
             out += self._fly(vehicle, now_ns)
             self._check_health(vehicle, now_ns)
-        elif self.setpoints is not None and self.setpoints.step_stop(None, now_ns):
-            out += self.commands.pop_messages()
-        packets += [(self._encoded(message), peer) for message in out if self._axes.sent(message)]
+        elif self.setpoints is not None:
+            stops = self.setpoints.step_stop(None, now_ns)
+            if stops or self.setpoints.step_blind(now_ns):
+                out += self.commands.pop_messages()
+        packets += [
+            Packet(self._encoded(message), peer, rank_of(message)) for message in out if self._axes.sent(message)
+        ]
         self.due_ns = self._next_ns(now_ns)
         return packets
 
@@ -287,11 +339,11 @@ class MavlinkSession(VehicleSession):
 
         A vehicle that speaks MAVLink 1 gets both versions: some autopilots change over once they receive the new one.
         """
-        if now_ns - self._heartbeat_ns < HEARTBEAT_NS:
+        if now_ns - self._heartbeat_ns < (UNHEARD_HEARTBEAT_NS if self._unheard else HEARTBEAT_NS):
             return []
         self._heartbeat_ns = now_ns
         versions = (1, 2) if self._old and self.options.key is None else (2,)
-        return [(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
+        return [Packet(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
 
     def _encoded(self, message: Message) -> bytes:
         return self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)
@@ -300,7 +352,11 @@ class MavlinkSession(VehicleSession):
         for event in self._health.update(self.telemetry, vehicle, now_ns):
             self._publish_event(event)
         exchange = self.parameters
+        if self._known_as is not None and now_ns - self._found_ns > IDENTITY_NS:
+            self._read_again(now_ns)  # it does not say which one it is
         if self.link_state is not LinkState.DEGRADED or self._silent(now_ns):
+            return
+        if self._known_as is not None or not self._heard_by_it:
             return
         waited = now_ns - self._found_ns > PARAMETERS_NS
         if not self.options.parameters or exchange.complete or exchange.given_up or waited:
@@ -331,6 +387,7 @@ class MavlinkSession(VehicleSession):
 
     def _lose(self, reason: str, now_ns: int) -> None:
         self._received_ns = self._said = None
+        self._unheard = self.telemetry.armed()
         self._selector.forget()
         self._axes.forget()
         self.parameters.fail_writes(reason)
@@ -343,11 +400,13 @@ class MavlinkSession(VehicleSession):
         self._set_link_state(LinkState.LOST, reason)
 
     def _find(self, heartbeat: Message, now_ns: int) -> None:
-        self._found_ns, self._unreachable = now_ns, ""
+        self._found_ns, self._unreachable, self._unheard = now_ns, "", False
         target = heartbeat.get_srcSystem(), heartbeat.get_srcComponent()
         self.commands.target = self.parameters.target = target
-        if self.autopilot is None:
+        kind = heartbeat.autopilot, heartbeat.type
+        if kind != self._kind:
             self._identify(heartbeat)
+        self._known_as, self.version = self.version, None
         if self.autopilot is not None:
             rates = self.autopilot.message_rates(self.options.rate_hz)
             if self._axes.begin is not None:
@@ -355,18 +414,29 @@ class MavlinkSession(VehicleSession):
             self._intervals = MessageIntervals(rates)
         if self.options.origin is not None:
             self._out.append(_origin(target[0], self.options.origin))
-        if self.options.parameters and not self.parameters.complete:
-            self.parameters.request_all(now_ns)
-        text = "its parameters are being read" if self.options.parameters else ""
+        if self._known_as is None:
+            self._read_again(now_ns)
+        text = "its parameters are being read" if self.parameters.busy else ""
+        if not self._heard_by_it:
+            text = "it has not answered yet, since what was sent did not get through"
         self._set_link_state(LinkState.DEGRADED, text)
 
     def _identify(self, heartbeat: Message) -> None:
-        found = profile_of(heartbeat.autopilot)
+        """Begin with a vehicle of which nothing is known: whatever was known of another one is dropped."""
+        if self._kind is not None:
+            text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: it is set up anew"
+            data: dict[str, Value] = {"reason": "another", "system": heartbeat.get_srcSystem()}
+            self._publish_event(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data))
+        self._kind = heartbeat.autopilot, heartbeat.type
+        self.telemetry, self.parameters, self._health = Telemetry(), ParameterExchange(), HealthMonitor()
+        self.parameters.target = self.commands.target
+        self.version = self._known_as = self.setpoints = None
+        self._axes.forget()
+        self.autopilot = found = profile_of(heartbeat.autopilot)
         self._unsupported_reason = unsupported_reason(heartbeat)
         if self._unsupported_reason:
             text = f"the vehicle answers but can't be flown: {self._unsupported_reason}"
             self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "autopilot"}))
-        self.autopilot = found
         if found is None:
             return
         self.parameters.bytewise = found.BYTEWISE
@@ -379,11 +449,42 @@ class MavlinkSession(VehicleSession):
                 VehicleEvent(EventKind.VEHICLE_MESSAGE, limits_text(self.limits), data={"reason": "limits"})
             )
 
+    def _on_version(self, version: Message, now_ns: int) -> None:
+        """Handle which vehicle it says it is. A found one is the same as before only where it can say so."""
+        before, self._known_as, self.version = self._known_as, None, version
+        same = True if before is None else _is_same(before, version)
+        heartbeat = self.telemetry.newest("HEARTBEAT", now_ns)
+        if same is False and heartbeat is not None:
+            self._identify(heartbeat)
+            self.telemetry.on_message(heartbeat, now_ns)
+            self.version = version
+        if not same:
+            self._read_again(now_ns)
+        self.parameters.bytewise = bool(version.capabilities & BYTEWISE)
+
+    def _read_again(self, now_ns: int) -> None:
+        """Read the parameters of a vehicle that may be another one than before."""
+        self._known_as = None
+        if self.options.parameters:
+            self.parameters.request_all(now_ns)
+
+    def broken(self, error: OSError, now_ns: int) -> None:
+        """See :meth:`VehicleSession.broken`. The link is not up again before the vehicle has answered something."""
+        super().broken(error, now_ns)
+        self._heard_by_it = False
+
     def limit(self, limits: Mapping[str, float]) -> None:
         """Set the driver's own limits."""
         self.limits = limits
         if self.setpoints is not None:
             self.setpoints.takeoff_m = takeoff_height(limits)
+
+
+def _is_same(one: Message, other: Message) -> bool | None:
+    """Return whether two ``AUTOPILOT_VERSION`` are of one vehicle; None: they have no serial number in common."""
+    if any(one.uid2) and any(other.uid2):  # MAVLink 1 has no room for it
+        return list(one.uid2) == list(other.uid2)
+    return bool(one.uid == other.uid) if one.uid and other.uid else None
 
 
 def observed_state(vehicle: VehicleState | None) -> FlightState:

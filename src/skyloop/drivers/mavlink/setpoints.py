@@ -55,6 +55,7 @@ DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
 STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
+BLIND_NS: Final = nanoseconds(3.0)  #: what is asked for while nothing is received is sent for so long
 HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
 
 
@@ -101,6 +102,7 @@ class SetpointController:
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
         self._stepped_ns = 0  # when what is wanted now had its last step; 0: it has not had one
         self._arms_until_ns: int | None = None  # a take-off that a landing broke off may arm it until then
+        self._blind_until_ns = 0
         self._events: list[VehicleEvent] = []
 
     # What is decided ---------------------------------------------------------------------------------------------
@@ -154,6 +156,8 @@ class SetpointController:
         else:
             assert not isinstance(action, ReturnToStart)  # the proxy makes places of it
             action = self._steer(action, vehicle, now_ns)
+        if vehicle is None and new and not alone and isinstance(action, Hover | Land):
+            self._blind_until_ns = now_ns + BLIND_NS
         if self.goal is not Goal.NOTHING and not isinstance(action, Idle):
             self.ownership.take(action, vehicle, alone=alone, new=new)
         return action
@@ -332,6 +336,20 @@ class SetpointController:
             shown = not vehicle.armed
         if self.stop.step(shown, now_ns):
             self._commands.request(CUT, now_ns, 0.0)
+        return True
+
+    def step_blind(self, now_ns: int) -> bool:
+        """Send what an application newly asked for while nothing is received: the vehicle may hear it all the same.
+
+        What a failsafe asks for is not sent so: who flies the vehicle by now can't be seen.
+
+        Returns:
+            Whether a command is under way.
+        """
+        modes = {Goal.HOLD: self._autopilot.HOLD, Goal.LAND: self._autopilot.LAND}
+        if self.stop.active or now_ns >= self._blind_until_ns or self.goal not in modes:
+            return False
+        self._ask_for(modes[self.goal], now_ns)
         return True
 
     def due_ns(self, now_ns: int) -> int | None:

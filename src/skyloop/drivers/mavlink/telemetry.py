@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -65,15 +65,19 @@ class Telemetry:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._newest: dict[str, tuple[Message, int]] = {}
+        self._newest: dict[str, tuple[Message, int]] = {}  # of the instance with the lowest number that flows
+        self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # of kinds that tell several of a thing apart
         self._ground_down: float | None = None  # "down" of the ground, from the origin [m]
         self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; the same on the earth
 
     def on_message(self, message: Message, now_ns: int) -> None:
         """Keep a message of the vehicle that is flown."""
         kind = message.get_type()
-        self._newest[kind] = message, now_ns
         self.counts[kind] += 1
+        self._newest[kind] = message, now_ns
+        if message.instance_field is not None:
+            self._instances.setdefault(kind, {})[getattr(message, message.instance_field)] = message, now_ns
+            self._newest[kind] = next(self._by_number(kind, now_ns, FLOWING_S))
         if kind == "GLOBAL_POSITION_INT":
             local = self.newest("LOCAL_POSITION_NED", now_ns, 0.5)
             if local is not None and math.isfinite(local.z):
@@ -92,6 +96,21 @@ class Telemetry:
         if found is None or now_ns - found[1] > max_age_s * NS_PER_S:
             return None
         return found[0]
+
+    def instances(self, kind: str, now_ns: int, max_age_s: float = math.inf) -> Iterator[Message]:
+        """Yield the newest message of each instance, such as each of several batteries, the lowest number first.
+
+        Args:
+            kind: The message's name.
+            now_ns: The present time.
+            max_age_s: Older ones are left out [s].
+        """
+        return (message for message, _ in self._by_number(kind, now_ns, max_age_s))
+
+    def _by_number(self, kind: str, now_ns: int, max_age_s: float) -> Iterator[tuple[Message, int]]:
+        for _, found in sorted(self._instances.get(kind, {}).items()):
+            if now_ns - found[1] <= max_age_s * NS_PER_S:
+                yield found
 
     def age_s(self, kind: str, now_ns: int) -> float | None:
         """Return the age of the newest message of a kind [s]; None if none came."""
@@ -185,9 +204,9 @@ class Telemetry:
             position: As :meth:`position` returns it.
             now_ns: The present time.
         """
-        sensor = self.newest("DISTANCE_SENSOR", now_ns, FLOWING_S)
-        if sensor is not None and sensor.orientation == _DOWN and _in_range(sensor):
-            return float(sensor.current_distance) / 100.0
+        for sensor in self.instances("DISTANCE_SENSOR", now_ns, FLOWING_S):
+            if sensor.orientation == _DOWN and _in_range(sensor):
+                return float(sensor.current_distance) / 100.0
         if position is not None:
             return (self._ground_down or 0.0) - position[2]
         message = self.newest("GLOBAL_POSITION_INT", now_ns, FLOWING_S)
@@ -261,6 +280,7 @@ def finite(x: float, y: float, z: float) -> Vector | None:
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 _UNKNOWN_16: Final = 0xFFFF
+_OTHERS: Final = (3, 4)  #: MAV_BATTERY_FUNCTION: of avionics and of a payload
 
 
 def feedback_of(
@@ -329,8 +349,13 @@ def _force(telemetry: Telemetry, now_ns: int) -> Vector | None:
 
 
 def _charge(telemetry: Telemetry, now_ns: int) -> float | None:
-    for kind in ("SYS_STATUS", "BATTERY_STATUS"):
-        message = telemetry.newest(kind, now_ns, SLOW_S)
+    status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
+    # Of several the one with the lowest number, and no other while that one is silent: their charges differ.
+    batteries = telemetry.instances("BATTERY_STATUS", now_ns)
+    first = next((each for each in batteries if each.battery_function not in _OTHERS), None)
+    if first not in telemetry.instances("BATTERY_STATUS", now_ns, SLOW_S):
+        first = None
+    for message in (status, first):
         if message is not None and 0 <= message.battery_remaining <= 100:
             return float(message.battery_remaining) / 100.0
     return None

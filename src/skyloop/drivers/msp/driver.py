@@ -68,9 +68,9 @@ class MspDriver(Driver):
         return self._opened().command(action)
 
     def check(self, action: AnyAction) -> None:
-        """Refuse a take-off for what keeps the flight controller from being armed."""
+        """Refuse a take-off for what keeps the flight controller from being armed, else let the next climb begin it."""
         if isinstance(action, Takeoff):
-            why = self._opened().why_not()
+            why = self._opened().ask_takeoff()
             if why:
                 raise DriverError(why)
 

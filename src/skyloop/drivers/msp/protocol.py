@@ -94,14 +94,18 @@ class MspSession(VehicleSession):
         self.due_ns = min(self.due_ns, now_ns if isinstance(action, EmergencyStop) else self._sticks_due_ns)
         return applied
 
-    def why_not(self, now_ns: int) -> str:
-        """Return why a take-off is sure to be refused; empty if it is not."""
+    def ask_takeoff(self, now_ns: int) -> str:
+        """Let the next climb start it; return why a take-off is sure to be refused, empty if it is not."""
         self.setpoints.on_motion(self.motion.at(now_ns))
-        return self.setpoints.why_not(now_ns)
+        return self.setpoints.ask_takeoff(now_ns)
 
-    def on_pose(self, pose: ExternalPose) -> None:
-        """Take in a pose from outside."""
-        self.motion.on_pose(pose)
+    def on_pose(self, pose: ExternalPose, now_ns: int) -> None:
+        """Take in a pose from outside.
+
+        Raises:
+            DriverError: It is stamped ahead; see :meth:`ExternalPose.bounded`.
+        """
+        self.motion.on_pose(pose.bounded(now_ns))
 
     def close(self) -> None:
         """End the session."""

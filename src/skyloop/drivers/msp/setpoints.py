@@ -31,6 +31,7 @@ IDLE: Final = 0.05  #: where it is not
 ARM_NS: Final = nanoseconds(6.0)  #: an arming that has not shown by then failed; Betaflight's BOOTGRACE is 5 s
 NAMED_NS: Final = nanoseconds(0.4)  #: so long must a hindrance last while it arms
 REFUSED_NS: Final = nanoseconds(1.0)  #: after a refusal the arm switch stays off for so long
+ASKED_NS: Final = nanoseconds(1.0)  #: a take-off that was asked for begins within this, or it has to be asked for again
 ABORT_NS: Final = nanoseconds(1.0)  #: so long a take-off may be interrupted before it ends
 #: What passes by itself, soon after the connection or a landing: an arming waits for it with the arm switch off.
 PASSING: Final = frozenset(
@@ -130,6 +131,7 @@ class SetpointController:
         self._still_ns: int | None = None
         self._blind_ns: int | None = None
         self._sink = 1.0
+        self._asked_ns: int | None = None  # when a take-off was asked for that has not begun
         self._events: list[VehicleEvent] = []
 
     def set_up(self, setup: Setup, hindrance: str) -> None:
@@ -196,7 +198,7 @@ class SetpointController:
             yaw_rate=_within(action.yaw_rate, min(limits.yaw_rate, self._turn(1.0))),
         )
         if self.phase is Phase.STANDING and self._wanted.climb > 0:
-            self._start(now_ns)
+            self._start(now_ns)  # only after a take-off was asked for: what stands climbs by no other set-point
         return self._wanted
 
     def why_not(self, now_ns: int) -> str:
@@ -221,8 +223,16 @@ class SetpointController:
         names = [name for name in self.report.hindrances if name not in PASSING]
         return "" if self.report.armed or not names else f"the flight controller refuses to arm: {explained(names)}"
 
+    def ask_takeoff(self, now_ns: int) -> str:
+        """Let the next climb start it, unless that is sure to fail; return why it would."""
+        why = self.why_not(now_ns)
+        self._asked_ns = None if why or self.phase is not Phase.STANDING else now_ns
+        return why
+
     def _start(self, now_ns: int) -> None:
         why = self.why_not(now_ns)
+        if not why and (self._asked_ns is None or now_ns - self._asked_ns > ASKED_NS):
+            why = "it stands on the ground: take off first"
         if why:
             self._wanted = LEVEL
             raise DriverError(why)
@@ -232,7 +242,7 @@ class SetpointController:
     def _enter(self, phase: Phase, now_ns: int) -> None:
         self.phase, self._since_ns = phase, now_ns
         self._abort_ns = self._still_ns = self._blind_ns = None
-        self._sink = 1.0
+        self._sink, self._asked_ns = 1.0, None
         if phase is Phase.SPOOLING:
             self.throttle = IDLE if self.hover is None else SPOOL_FROM * self.hover
         elif phase is not Phase.FLYING:
@@ -254,6 +264,7 @@ class SetpointController:
                 where = "in flight" if flew else "before it had taken off"
                 why = f": {explained(report.hindrances)}" if report.hindrances else ""
                 text = f"the flight controller disarmed {where}{why}"
+                self._refused = text, now_ns  # whoever did it: a take-off that goes on must not arm it again
                 self._events.append(message(text, "disarmed", Severity.WARNING, flags=", ".join(report.hindrances)))
         elif self._override and before.overridden and not report.overridden:
             self._enter(Phase.STANDING, now_ns)

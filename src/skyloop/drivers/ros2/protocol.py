@@ -36,6 +36,7 @@ PERIOD_S: Final = 0.05  #: a velocity is repeated so often, as robots stop when 
 AIRBORNE_M: Final = 0.1  #: a robot that flies is off the ground above this height of its odometry
 SERVICES_S: Final = 5.0  #: as long as the robot's services may take to be found
 ANSWER_S: Final = 30.0  #: as long as a service may take
+BLIND_NS: Final = nanoseconds(0.2)  #: a velocity is repeated for so long while odometry is missing
 _FEEDBACK_NS: Final = nanoseconds(PERIOD_S)
 
 
@@ -90,10 +91,13 @@ class RobotSession:
         self._intrinsics: Intrinsics | None = None
         self._captured_ns = 0  # of the newest feedback
         self._received_ns: int | None = None
+        self._odometry_ns: int | None = None
+        self._measures_height = False  # its odometry was seen above the ground: a planar one never is
         self._fed_ns = 0
         self._opened_ns = clock()
         self._link: LinkState | None = None
         self._velocity: Velocity | None = None  # in force
+        self._commanded_ns = 0  # when it was commanded
         self._pending: _Pending | None = None
         self._up: bool | None = False if options.ground else None  # by the robot's services, or the drive's begin
         self._complained: set[str] = set()
@@ -102,9 +106,11 @@ class RobotSession:
 
     def on_odometry(self, message: Any) -> None:
         """Publish a feedback."""
+        self._odometry_ns = self._clock()
         now_ns = self._received()
         with self._lock:
             self._fields = state_of(message, ground=self._options.ground)
+            self._measures_height |= self._fields.get("altitude_m", 0.0) > AIRBORNE_M
         stamp_ns = nanoseconds_of(message.header.stamp)
         self._publish(self._clocks["odom"].captured_ns(stamp_ns, now_ns, self._system_clock()), now_ns)
 
@@ -155,7 +161,7 @@ class RobotSession:
         """
         with self._lock:
             if isinstance(action, Velocity):
-                self._velocity = action
+                self._velocity, self._commanded_ns = action, self._clock()
             elif isinstance(action, Takeoff):
                 self._begin(FlightState.TAKING_OFF, self._options.takeoff, new=new)
             elif isinstance(action, Land):
@@ -171,7 +177,12 @@ class RobotSession:
     def tick(self) -> None:
         """Repeat the velocity in force, and watch the link: to be called every :data:`PERIOD_S`."""
         now_ns = self._clock()
+        blind = self._is_blind(now_ns)
         with self._lock:
+            if blind:
+                self._fields = {}
+                if self._velocity is not None and now_ns - self._commanded_ns > BLIND_NS:
+                    self._velocity = Velocity()  # nothing shows where it goes
             if self._velocity is not None:
                 self._robot.send(self._velocity)
             if self._pending is not None and now_ns - self._pending.since_ns > nanoseconds(ANSWER_S):
@@ -179,8 +190,11 @@ class RobotSession:
         since_ns = self._opened_ns if self._received_ns is None else self._received_ns
         silent_s = seconds(now_ns - since_ns)
         if silent_s > self._options.timeout_s:
-            self._lose(silent_s)
-        elif not self._fields and self._received_ns is not None and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
+            self._lose(LinkState.LOST, silent_s, self._options.odom, self._options.image)
+            return
+        if blind and self._odometry_ns is not None:
+            self._lose(LinkState.DEGRADED, seconds(now_ns - self._odometry_ns), self._options.odom)
+        if not self._fields and self._received_ns is not None and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
             self._publish(self._received_ns, now_ns)  # no odometry tells how the robot is: its images show that it is
 
     def close(self) -> None:
@@ -197,7 +211,8 @@ class RobotSession:
         if self._pending is not None:
             return self._pending.state
         altitude_m = self._fields.get("altitude_m")
-        up = self._up if self._options.ground or altitude_m is None else altitude_m > AIRBORNE_M
+        told = self._up is not None and not self._measures_height  # by its services, where the odometry may be planar
+        up = self._up if self._options.ground or altitude_m is None or told else altitude_m > AIRBORNE_M
         if up is None:
             return FlightState.UNKNOWN
         if not up:
@@ -215,7 +230,7 @@ class RobotSession:
         there = (self._state is FlightState.LANDED) is not up and self._state is not FlightState.UNKNOWN
         if (under_way or there) and not new:
             return
-        if not up and self._state is FlightState.LANDED:
+        if not up and self._state is FlightState.LANDED and (self._measures_height or self._up is False):
             return  # it stands on the ground
         pending = _Pending(state, self._clock())
 
@@ -235,9 +250,13 @@ class RobotSession:
     def _received(self) -> int:
         """Note that something came, and return the time."""
         self._received_ns = now_ns = self._clock()
-        if self._link is not LinkState.UP:
+        if self._link is not LinkState.UP and not self._is_blind(now_ns):
             self._find(now_ns)
         return now_ns
+
+    def _is_blind(self, now_ns: int) -> bool:
+        """Return whether the odometry has ended, whatever else still comes."""
+        return self._odometry_ns is not None and seconds(now_ns - self._odometry_ns) > self._options.timeout_s
 
     def _find(self, now_ns: int) -> None:
         """Report that the robot is there, once its services are found too, or that they are not."""
@@ -250,16 +269,15 @@ class RobotSession:
             remedy = "start the node that does, or correct its name in the address"
             self._sink.link(LinkState.DEGRADED, f"nobody offers the service {missing}", remedy)
 
-    def _lose(self, silent_s: float) -> None:
-        if self._link is LinkState.LOST:
+    def _lose(self, state: LinkState, silent_s: float, *topics: str) -> None:
+        if self._link is state:
             return
-        self._link = LinkState.LOST
+        self._link = state
         options = self._options
-        topics = " and ".join(topic for topic in (options.odom, options.image) if topic)
         domain = "ROS_DOMAIN_ID" if options.domain is None else f"domain={options.domain}"
         self._sink.link(
-            LinkState.LOST,
-            f"nothing came on {topics} for {silent_s:.1f} s",
+            state,
+            f"nothing came on {' and '.join(filter(None, topics))} for {silent_s:.1f} s",
             f"start the robot's nodes, and compare the topics' names and {domain} with theirs",
         )
 

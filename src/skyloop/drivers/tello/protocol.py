@@ -11,7 +11,7 @@ from skyloop.clock import nanoseconds
 from skyloop.drivers.tello.options import TelloOptions
 from skyloop.drivers.tello.setpoints import SetpointController
 from skyloop.drivers.tello.telemetry import Health, feedback_of, native_of
-from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
+from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, RestartWatch, VehicleEvent, VehicleSession, message
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
 from skyloop.messages.checkup import Diagnostic
@@ -169,7 +169,8 @@ class TelloSession(VehicleSession):
         self.options = options
         self.setpoints = SetpointController()
         self.conversation = Conversation()
-        self.counts = Counter(dict.fromkeys(("received", "damaged"), 0))
+        self.counts = Counter(dict.fromkeys(("received", "damaged", "late"), 0))
+        self._watch = RestartWatch()  # of the seconds that the motors ran for
         self.sdk: Sdk | None = None  #: None until the drone answered ``sdk?``; SDK 1.3 answers with an error
         self.serial = ""
         self.ready = False  #: whether state comes and commands are answered
@@ -243,6 +244,9 @@ class TelloSession(VehicleSession):
             state = parse(datagram)
         except DecodeError:
             self.counts["damaged"] += 1
+            return
+        if state.motor_s is not None and self._watch.update(state.motor_s, now_ns) is Arrival.LATE:
+            self.counts["late"] += 1
             return
         self.counts["received"] += 1
         begins, self._received_ns = self._received_ns is None, now_ns
@@ -368,6 +372,7 @@ class TelloSession(VehicleSession):
 
     def _lose(self, reason: str, now_ns: int) -> None:
         self._received_ns = None
+        self._watch.forget()
         self.ready = self._asking_version = False
         self.conversation.abandon()
         self.setpoints.lost(now_ns)

@@ -142,13 +142,11 @@ class Autopilot:
         if self.mode is Mode.OFF:
             return None
         known = feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
-        mode = self.mode
-        if self.flight.has_ended(reported, now_ns, known):
+        wanted = self._wanted(now_ns, known, reported)
+        if self.flight.has_ended(reported, now_ns, known):  # what is sent last stays in force
+            wanted = wanted if self.mode is Mode.LAND else Velocity()
             self.mode = Mode.OFF
-            if mode is not Mode.LAND:
-                return None  # else the descent stays in force, which keeps the vehicle on the ground
-        wanted = self._wanted(mode, now_ns, known, reported)
-        if known is not None and self.mode not in (Mode.LAND, Mode.OFF):
+        elif known is not None and self.mode is not Mode.LAND:
             wanted = self.guard(wanted, known, now_ns)
         dt = PERIOD_S if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
         self._stepped_ns = now_ns
@@ -157,12 +155,12 @@ class Autopilot:
         roll, pitch = self._tilt(wanted, known, dt)
         return Attitude(roll, pitch, wanted.up, wanted.yaw_rate)
 
-    def _wanted(self, mode: Mode, now_ns: int, known: Feedback | None, reported: FlightState) -> Velocity:
-        if mode is Mode.TAKEOFF:
+    def _wanted(self, now_ns: int, known: Feedback | None, reported: FlightState) -> Velocity:
+        if self.mode is Mode.TAKEOFF:
             return self._rise(now_ns, known, self.flight.lifted(reported))
-        if mode is Mode.LAND:
+        if self.mode is Mode.LAND:
             return Velocity(up=-self.settings.descent)
-        if mode is Mode.HOVER:
+        if self.mode is Mode.HOVER:
             return self._hold(known)
         if isinstance(self._target, Position):
             return self._go(self._target, known)

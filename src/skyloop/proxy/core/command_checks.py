@@ -82,7 +82,6 @@ class Decision(NamedTuple):
     action: AnyAction | None = None  #: what the vehicle must do; None: nothing new. Of a refused one: instead of it
     refusal: Refusal | None = None
     why: str = ""  #: of the refusal, for a person
-    new: bool = False  #: the application newly asked for it; else the library repeats it
     takes_off: bool = False
     clamps: tuple[Clamp, ...] = ()  #: the limits that shortened it
     enforced: bool | None = None  #: whether the safety box and zones could be; None: there are none, or no set-point
@@ -94,7 +93,7 @@ class CommandChecks:
     Args:
         authority: who holds the lease; :meth:`receive` notes when its holder's last command came.
         ladder: the failsafe ladder.
-        flight: whose flight it is.
+        flight: whose it is.
         supported: the actions that the vehicle or the software autopilot can do.
         why_not: why others are not supported, for people; may be empty.
     """
@@ -166,35 +165,33 @@ class CommandChecks:
             policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
         problem = self._problem(action, policy, state, link, new=new, automatic=automatic)
         if problem is not None:
-            return Decision(None, *problem, new)
+            return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
         if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND:
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
-            return Decision(None, Refusal.WRONG_STATE, explain_state(action, state), new)
+            return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
         if policy is StatePolicy.HOLD:
             if type(action) is Position and (why := self.airspace.objection(action, feedback, now_ns)):
-                return Decision(None, Refusal.OUT_OF_RANGE, why, new)  # which would be too late after the take-off
-            return Decision(new=new)
+                return Decision(None, Refusal.OUT_OF_RANGE, why)  # which would be too late after the take-off
+            return Decision()
         if type(action) is ReturnToStart and policy is not StatePolicy.HOVER:
             if self.back is None:
                 self.begin_return(action)
             back = self.step_return(feedback, now_ns)
             if back.action is None:
-                return Decision(_HOVER_ACTION, back.refusal, back.why, new)
-            return Decision(back.action, new=new, clamps=back.clamps, enforced=back.enforced)
+                return Decision(_HOVER_ACTION, back.refusal, back.why)
+            return Decision(back.action, clamps=back.clamps, enforced=back.enforced)
         action = _HOVER_ACTION if policy is StatePolicy.HOVER else action
         if self._is_judged(action, state):
             verdict = self.airspace.judge(action, feedback, now_ns, new=not intent.begun)
             if verdict.action is None:  # what was flown before is not wanted any more either
                 instead = _HOVER_ACTION if is_set_point and Hover in self._supported else None
-                return Decision(
-                    instead, verdict.refusal, verdict.why, new
-                )  # without a refusal: until it is known again
+                return Decision(instead, verdict.refusal, verdict.why)  # without a refusal: until it is known again
         else:
             verdict = Verdict(action)
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
-        return Decision(verdict.action, None, "", new, takes_off, verdict.clamps, verdict.enforced)
+        return Decision(verdict.action, None, "", takes_off, verdict.clamps, verdict.enforced)
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
         """Whether it matters where the vehicle is: a hover only in its place, a take-off only on the ground."""

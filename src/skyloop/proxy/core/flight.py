@@ -85,6 +85,7 @@ class Flight:
         self._state = FlightState.LANDED  # of a vehicle without a notion, or of what is steered
         self._begun_ns = 0  # when what is steered began
         self._was_up = False  # the vehicle reported to be in the air since it is steered
+        self._landed_ns: int | None = None  # since when it reports to stand meanwhile
         self._seen = False  # an altitude was
         self._lowest, self._lowest_ns = math.inf, 0
         self._blind_ns: int | None = None  # since when a landing goes by nothing
@@ -238,7 +239,7 @@ class Flight:
     def steer(self, state: FlightState, now_ns: int) -> None:
         """Note that the software autopilot begins with what is this state."""
         if not self._steered:
-            self._was_up = False
+            self._was_up, self._landed_ns = False, None
         self._steered, self._state, self._begun_ns = True, state, now_ns
         self._start_descent(now_ns)
 
@@ -280,12 +281,14 @@ class Flight:
             self._start_descent(now_ns)
             return False
         if reported is FlightState.LANDED:
-            ended = self._was_up or not self._has_no_notion
-            if not ended:  # it may be about to rise: what it reported before it was told proves nothing
-                patience_ns = {FlightState.LANDING: STANDING_NS, FlightState.TAKING_OFF: CLAIM_NS}.get(self._state)
-                ended = patience_ns is not None and now_ns - self._begun_ns >= patience_ns
-            ended = ended and (landing or self._has_no_notion)
+            self._landed_ns = now_ns if self._landed_ns is None else self._landed_ns
+            # It may be about to rise: what it reported before it was told to do this proves nothing.
+            since_ns = self._begun_ns if self._state in _MANOEUVRES else self._landed_ns
+            patience_ns = CLAIM_NS if self._state is FlightState.TAKING_OFF else STANDING_NS
+            ended = now_ns - since_ns >= (0 if self._was_up else patience_ns)
+            ended = ended if self._has_no_notion else landing
         else:
+            self._landed_ns = None
             self._was_up = self._was_up or reported.airborne
             ended = landing and not reported.airborne and self._is_down(feedback.altitude_m, now_ns)
         if ended:

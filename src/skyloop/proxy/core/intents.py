@@ -34,8 +34,7 @@ SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
 _SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: nobody needs to be told that repeats of it do nothing
 _LANDINGS: Final = (Land, ReturnToStart)
-#: Tried again by repeats where the driver fails or the link is lost: nothing is safer.
-INSISTENT: Final = (Hover, Land, ResetEmergency)
+_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: what may be different with the next repeat
 
 
 @dataclass(slots=True)
@@ -60,10 +59,20 @@ class Intent:
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
         """End it, unless it is over already. ``text`` and ``reason``: what its repeats are answered with."""
         if self.fate is Fate.UNDER_WAY:
-            self.fate = fate
             if fate not in _SILENT:
                 self.reason = reason or Refusal.NOT_FRESH
                 self.text = text or f"{ENDINGS[fate]}: send a new command"
+            self.fate = fate  # last, as other threads read it
+
+    def refuse(self, reason: Refusal, why: str) -> None:
+        """End it because it was refused.
+
+        A hover and a landing go on where only the driver failed or the link is lost, as nothing is safer; a reset does
+        in any case, as the emergency may not be known yet.
+        """
+        kind = type(self.action)
+        if not (kind is ResetEmergency or (kind in (Hover, Land) and reason in _PASSING)):
+            self.end(Fate.REFUSED, why, reason)
 
     def observe(self, state: FlightState, now_ns: int) -> None:
         """End or complete it by what the vehicle does."""
@@ -83,7 +92,7 @@ class Intent:
             if before is not state and kind not in _LANDINGS:
                 self.end(Fate.LANDED)
         elif state is FlightState.EMERGENCY:
-            if before is not state:
+            if before is not state and kind is not ResetEmergency:
                 self.end(Fate.EMERGENCY)
         elif kind is Takeoff and state in _UP and (self.begun or before.airborne):
             self.end(Fate.COMPLETED)
@@ -92,8 +101,14 @@ class Intent:
 
     def outcome(self, app_id: int, name: str) -> Outcome:
         """What feedback tells of it; ``name``: of the application."""
-        text = f"{name}: {self.action.name} refused: {self.text}"[:MAX_OUTCOME_TEXT] if self.text else ""
-        return Outcome(app_id, max(0, self.number), self.fate, self.reason, text)
+        fate = self.fate  # first, as another thread may end it now
+        if fate is Fate.UNDER_WAY or not self.text:
+            return Outcome(app_id, max(0, self.number), fate)
+        text = f"{name}: {self.action.name} refused: {self.text}"[:MAX_OUTCOME_TEXT]
+        return Outcome(app_id, self.number, fate, self.reason, text)
+
+
+NO_INTENT: Final = Intent(-1, Idle(), 0, FlightState.UNKNOWN, Fate.COMPLETED)
 
 
 class Intents:
@@ -103,7 +118,7 @@ class Intents:
 
     def __init__(self) -> None:
         self.seq = -1  #: of the newest command received
-        self.newest = Intent(-1, Idle(), 0, FlightState.UNKNOWN, Fate.COMPLETED)
+        self.newest = NO_INTENT
         self._received = 0  # the highest number, refused commands included
         self._floor = -1  # intents up to this one are from before something that ended them,
         self._ended = Fate.AUTHORITY  # which was this

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import lru_cache
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -26,8 +28,12 @@ _AROUND_V1: Final = 8  #: bytes of a frame's header and checksum
 _AROUND_V2: Final = 12
 _SIGNATURE: Final = 13
 _LEAST: Final = _AROUND_V1
+_MARKERS: Final = (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2)
+_MOST_SOURCES: Final = 16  #: whose cut frames are kept; anybody can send datagrams
 _SIGNED: Final = 1  #: of the flags that a receiver must understand
 _SIGNING_EPOCH_S: Final = 1_420_070_400  #: 2015-01-01, from which signatures count time in steps of 10 µs
+_STEPS_PER_S: Final = 100_000
+_OLD: Final = 60 * _STEPS_PER_S  #: a sender that is heard for the first time may be behind by so much
 _UNSIGNED: Final = dialect.MAVLINK_MSG_ID_RADIO_STATUS  #: which radios send, who have no key
 _HEADER_V1: Final = struct.Struct("<xBBBBB")  #: length, number in sequence, system, component, kind
 _HEADER_V2: Final = struct.Struct("<xBBBBBBHB")  #: length, two kinds of flags, the same; the kind has three bytes
@@ -89,15 +95,55 @@ def _decode_plain(data: bytes) -> Message | None:
     return message
 
 
-def _is_one_frame(data: bytes) -> bool:
-    """Whether the bytes are one frame by their first ones, and nothing else; its checksum may still be wrong."""
-    if len(data) < _LEAST:
-        return False
+def _length_of(data: bytes) -> int | None:
+    """Return how long the frame is that begins here; None: none begins, or too little of it is there to tell."""
+    if len(data) < _LEAST or data[0] not in _MARKERS:
+        return None
     if data[0] == dialect.PROTOCOL_MARKER_V1:
-        return len(data) == data[1] + _AROUND_V1
-    signature = _SIGNATURE if data[2] == _SIGNED else 0
-    known = data[0] == dialect.PROTOCOL_MARKER_V2 and data[2] in (0, _SIGNED)
-    return known and len(data) == data[1] + _AROUND_V2 + signature
+        return data[1] + _AROUND_V1
+    return data[1] + _AROUND_V2 + (_SIGNATURE if data[2] == _SIGNED else 0) if data[2] in (0, _SIGNED) else None
+
+
+def _begins_with_a_frame(data: bytes) -> bool:
+    """Whether a whole frame of a known kind with the right checksum stands first."""
+    length = _length_of(data)
+    if length is None or len(data) < length:
+        return False
+    old = data[0] == dialect.PROTOCOL_MARKER_V1
+    number = data[5] if old else int.from_bytes(data[7:10], "little")
+    end = data[1] + (_HEADER_V1 if old else _HEADER_V2).size
+    kind = dialect.mavlink_map.get(number)
+    if kind is None:
+        return False
+    checksum: int = dialect.x25crc(data[1:end] + bytes([kind.crc_extra])).crc
+    return checksum == data[end] | data[end + 1] << 8
+
+
+class _Signatures:
+    """Time and senders of one link's signatures, as MAVLink 2 has them: time never stands still nor goes back."""
+
+    def __init__(self, key: bytes) -> None:
+        self._key = key
+        self._newest = 0  # of all that was sent and taken
+        self._streams: dict[tuple[int, int, int], int] = {}  # link, system and component: the newest that was taken
+
+    def now(self) -> int:
+        """Return the time for the next signature: this host's, or that of a sender who is ahead, and never the last."""
+        self._newest = max(self._newest + 1, int((time.time() - _SIGNING_EPOCH_S) * _STEPS_PER_S))
+        return self._newest
+
+    def check(self, frame: bytearray, system: int, component: int) -> bool:
+        """Return whether a signed frame is to be taken; one without the key changes nothing, whatever it claims."""
+        signature = hashlib.sha256(self._key + frame[:-6]).digest()[:6]
+        if not hmac.compare_digest(signature, bytes(frame[-6:])):
+            return False
+        stream = frame[-_SIGNATURE], system, component
+        stamp = int.from_bytes(frame[-12:-6], "little")
+        if stamp <= self._streams.get(stream, self.now() - _OLD - 1):
+            return False
+        self._streams[stream] = stamp
+        self._newest = max(self._newest, stamp)
+        return True
 
 
 class Codec:
@@ -114,35 +160,59 @@ class Codec:
         self.unknown = 0  #: frames of kinds that nothing is known of
         self.signed = 0  #: frames that came with a signature while no key is known: not taken
         self._key = key
+        self._signatures = None if key is None else _Signatures(key)
+        self._rests: dict[Hashable, bytes] = {}  # by sender of datagrams, what is left of a frame that was cut
         self._sender = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
         self._receiver = self._fresh()
         if key is not None:
-            signing = self._sender.signing
-            signing.secret_key, signing.sign_outgoing = key, True
-            signing.timestamp = self._receiver.signing.timestamp
+            self._sender.signing.secret_key, self._sender.signing.sign_outgoing = key, True
 
     def encode(self, message: Message, *, version: int = 2) -> bytes:
         """A frame, numbered. Raises ``struct.error`` for a field that does not fit."""
         old = version == 1 and self._key is None
+        if self._signatures is not None:
+            self._sender.signing.timestamp = self._signatures.now()
         frame: bytes = message.pack(self._sender, force_mavlink1=old)
         self._sender.seq = (self._sender.seq + 1) % 256
         return frame
 
-    def decode(self, data: bytes, *, whole: bool = False) -> list[Message]:
+    def decode(self, data: bytes, *, whole: bool = False, source: Hashable = None) -> list[Message]:
         """The messages that these bytes complete. Never raises for what it is fed.
 
-        ``whole``: a datagram; nothing of it belongs to what comes next.
+        ``whole``: a datagram, of ``source``. A frame may go on in that one's next datagram, as behind a bridge that
+        cuts a serial line's bytes anywhere.
         """
-        if whole:
-            self._receiver.buf, self._receiver.buf_index = bytearray(), 0
+        if not whole:
+            return self._parsed(data)
+        rest = self._rests.pop(source, b"")
+        if _length_of(data) == len(data):  # what nearly all datagrams are: no search for where a frame begins and ends
+            self.damaged += bool(rest)
+            return self._decoded(data)
+        if rest and _begins_with_a_frame(data):
+            rest = b""  # what followed it was lost
+            self.damaged += 1
+        self._receiver.buf, self._receiver.buf_index = bytearray(), 0
+        found = self._parsed(rest + data)
+        left = bytes(self._receiver.buf[self._receiver.buf_index :])
+        if left:
+            self._rests[source] = left
+        if len(self._rests) > _MOST_SOURCES:
+            self._rests.pop(next(iter(self._rests)))
+        return found
+
+    def _decoded(self, frame: bytes) -> list[Message]:
+        plain = _decode_plain(frame) if self._key is None else None
+        if plain is not None:
+            self.frames += 1
+            return [plain]
+        return self._taken(lambda: [self._receiver.decode(bytearray(frame))])
+
+    def _parsed(self, data: bytes) -> list[Message]:
+        return self._taken(lambda: self._receiver.parse_buffer(data) or [])
+
+    def _taken(self, parse: Callable[[], list[Message]]) -> list[Message]:
         try:
-            # What nearly all datagrams are needs no search for where a frame begins and ends.
-            single = whole and _is_one_frame(data)
-            plain = _decode_plain(data) if single and self._key is None else None
-            if plain is not None:
-                self.frames += 1
-                return [plain]
-            found = [self._receiver.decode(bytearray(data))] if single else self._receiver.parse_buffer(data) or []
+            found = parse()
         except dialect.MAVError:
             self.damaged += 1
             return []
@@ -169,8 +239,8 @@ class Codec:
     def _fresh(self) -> Any:
         receiver = dialect.MAVLink(None)
         receiver.robust_parsing = True
-        if self._key is not None:
+        if self._signatures is not None:
             receiver.signing.secret_key = self._key
-            receiver.signing.timestamp = int((time.time() - _SIGNING_EPOCH_S) * 100_000)
+            receiver.check_signature = self._signatures.check
             receiver.signing.allow_unsigned_callback = lambda _, number: number == _UNSIGNED
         return receiver
