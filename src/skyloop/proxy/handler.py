@@ -356,12 +356,9 @@ class CommandHandler:
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
         intent.action = action  # a set-point may have decayed to hover
-        vehicle_now = vehicle.feedback_now
-        automatic = command.automatic
+        known, automatic = vehicle.feedback_now, command.automatic
         new = new and not automatic  # what the library does by itself is nobody's decision
-        decision = checks.decide(
-            action, intent, state, vehicle.link_state, vehicle_now, now_ns, new=new, automatic=automatic
-        )
+        decision = checks.decide(action, intent, state, vehicle.link_state, known, now_ns, new=new, automatic=automatic)
         if decision.refusal is not None:
             if decision.action is not None:
                 self._stop_instead(decision.action, now_ns)
