@@ -684,6 +684,20 @@ def test_what_is_asked_of_a_vehicle_that_is_not_heard_is_sent(way: str, action: 
     assert bench.peers == {PEER}
 
 
+@pytest.mark.parametrize("way", ["udpin:127.0.0.1:14540", "udpout:10.0.0.5:14550", "tcp:127.0.0.1:5760"])
+def test_an_emergency_stop_is_sent_to_a_vehicle_that_is_not_heard(way: str) -> None:
+    bench = Bench(Vehicle(ARDUPILOT), options(f"mavlink://{way}?parameters=no")).flying("GUIDED")
+    bench.go_on(3.0, silent=True)
+    assert bench.link() is LinkState.LOST
+    bench.said.clear()
+    bench.peers.clear()
+    bench.apply(EmergencyStop())
+    assert [each.param2 for each in bench.heard_of("COMMAND_LONG")] == [21196.0], "at once"
+    bench.go_on(2.0, silent=True)
+    assert len(bench.heard_of("COMMAND_LONG")) >= 5
+    assert bench.peers == {PEER}
+
+
 def test_a_vehicle_that_is_not_heard_gets_no_heartbeats_that_keep_its_failsafe_from_acting() -> None:
     """A failsafe's hover and landing aren't sent blindly, as a safety pilot may have it: its own failsafe is left."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
