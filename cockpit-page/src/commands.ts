@@ -119,7 +119,7 @@ export class CommandSender {
   }
 
   /** Sticks: what does not go now is forgotten. */
-  steer(command: { do: string }): boolean {
+  steer<Message extends { do: string }>(command: Message): boolean {
     const stamp = this.isLive ? this.clock.at(this.now_ms()) : null;
     return stamp !== null && this.socket.send({ ...command, ...stamp });
   }

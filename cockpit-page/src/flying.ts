@@ -1,20 +1,31 @@
 // Keys, gamepad and thumbs fly the selected drone; nothing else of the page does.
 
-import { GamepadReader, plugged } from "./gamepad.js";
+import { chosen, GamepadReader, plugged } from "./gamepad.js";
 import { type Deed, Keys, stopKeys } from "./keys.js";
 import { isModalOpen } from "./modal.js";
 import type { Sticks } from "./model.js";
 import { padMaps } from "./paddialog.js";
 import { type Pilot, STEER_MS } from "./pilot.js";
 import { settings } from "./settings.js";
-import { CENTRED, isCentred, Latch, merge, PACES, type Pace, ramp, scale } from "./sticks.js";
+import { CENTRED, type Hands, PACES, type Pace, scale } from "./sticks.js";
+import type { Thumbs } from "./thumbs.js";
+
+/** A page that stood still for so long, as in the browser's cache or a computer that slept, does not know what hands did meanwhile. */
+const STOOD_STILL_MS = 1000;
+
+/** One drone that this page may fly, and what hands do to it. */
+export interface Flown {
+  pilot: Pilot;
+  hands: Hands;
+  thumbs: Pick<Thumbs, "sticks" | "touches" | "release">;
+}
 
 /** Which drone the keys fly, and what else they do. */
 export interface Cabin {
   /** Of all drones that are open here. */
-  pilots(): Pilot[];
-  /** Of the one that keys and gamepad are for. */
-  selected(): Pilot | null;
+  flown(): Flown[];
+  /** The one that hands fly. */
+  selected(): Flown | null;
   /** A deed by key or gamepad, for the selected drone. */
   act(deed: Deed): void;
   /** The emergency stop is held by keys or gamepad: of the drone that is seen, or of all; null: released. */
@@ -40,16 +51,11 @@ const TAKES_KEYS = "input, select, textarea, [contenteditable]";
 
 export class Flying {
   pace: Pace = PACES[1] as Pace;
-  /** What thumbs on the screen do. */
-  thumbs: Sticks = { ...CENTRED };
   /** The gamepad commands nothing, as its buttons are being assigned. */
   padSilent = false;
   private readonly keys = new Keys();
   private readonly pad = new GamepadReader(padMaps);
-  private readonly thumbLatch = new Latch();
-  private ramped: Sticks = { ...CENTRED };
-  private flown: Pilot | null = null;
-  private held = false;
+  private read_ms = performance.now();
   private stopping: "keys" | "pad" | null = null;
 
   constructor(private readonly cabin: Cabin) {
@@ -68,9 +74,11 @@ export class Flying {
   rest(): void {
     this.keys.clear();
     this.pad.reset();
-    this.thumbs = { ...CENTRED };
-    this.ramped = { ...CENTRED };
-    for (const pilot of this.cabin.pilots()) pilot.rest();
+    for (const { pilot, hands, thumbs } of this.cabin.flown()) {
+      hands.rest();
+      thumbs.release();
+      pilot.rest();
+    }
   }
 
   private down(event: KeyboardEvent): void {
@@ -83,12 +91,12 @@ export class Flying {
     }
     if (isModalOpen()) return;
     const modified = event.ctrlKey || event.altKey || event.metaKey;
-    const press = { code: event.code, repeat: event.repeat, modified, typing: this.typing() || (ownKeys()?.has(event.code) ?? false) };
+    const press = { code: event.code, repeat: event.repeat, modified, typing: event.isComposing || this.typing() || (ownKeys()?.has(event.code) ?? false) };
     const meant = this.keys.down(press);
     if (meant === null) return;
     if (meant === "stick") {
       // Arrows scroll the page while there is nothing to fly.
-      if (this.cabin.selected()?.mine) event.preventDefault();
+      if (this.cabin.selected()?.pilot.mine) event.preventDefault();
       return;
     }
     event.preventDefault();
@@ -111,31 +119,25 @@ export class Flying {
   }
 
   private round(): void {
+    const now_ms = performance.now();
+    if (now_ms - this.read_ms > STOOD_STILL_MS) this.rest();
+    this.read_ms = now_ms;
     const selected = this.cabin.selected();
-    const reading = this.pad.read(plugged()[0] ?? null, settings.get("mode"));
+    const reading = this.pad.read(chosen(plugged(), this.pad.pad, selected?.pilot.mine ?? false), settings.get("mode"));
+    if (reading.lost) this.rest();
     const focused = document.hasFocus() && !document.hidden;
     const modal = isModalOpen();
-    // What is held while a dialog is open counts only after it was let go.
-    if (modal) for (const held of [this.pad, this.thumbLatch]) held.reset();
-    if (modal) this.keys.clear();
-    // A drone without data is not flown; it is flown again only after keys and sticks were released.
-    const mine = (selected?.mine ?? false) && (selected?.isLive ?? false);
-    if (this.held && !mine) this.keys.clear();
-    // Sticks that are pushed when control begins, or another drone is selected, must come back to the centre first.
-    if (selected !== this.flown || mine !== this.held) this.pad.reset();
-    if (reading.lost) this.rest();
-    this.flown = selected;
-    this.held = mine;
     if (focused && !modal) for (const deed of reading.deeds) this.cabin.act(deed);
     if (focused && reading.stops && !this.padSilent && this.stopping === null) this.stop("pad", "one");
     if ((!reading.stops || this.padSilent) && this.stopping === "pad") this.stop("pad", null);
-    const held = this.keys.sticks();
-    this.ramped = ramp(this.ramped, held, STEER_MS / 1000);
-    const thumbs = this.thumbLatch.pass(this.thumbs);
-    const sticks = focused && !modal ? merge(this.ramped, reading.sticks, thumbs) : { ...CENTRED };
-    for (const pilot of this.cabin.pilots()) {
-      pilot.steer(pilot === selected && !isCentred(sticks) ? scale(sticks, this.pace) : CENTRED);
+    let shown: Sticks = { ...CENTRED };
+    for (const flown of this.cabin.flown()) {
+      const { pilot, hands, thumbs } = flown;
+      const counts = flown === selected && focused && !modal && pilot.isFlyable;
+      const sticks = hands.read(this.keys.sticks(), reading.sticks, thumbs.sticks, counts, STEER_MS / 1000);
+      pilot.steer(scale(sticks, this.pace), this.keys.touches + reading.touches + thumbs.touches);
+      if (flown === selected) shown = sticks;
     }
-    this.cabin.inputs({ gamepad: reading.name, typing: this.typing(), focused, sticks });
+    this.cabin.inputs({ gamepad: reading.name, typing: this.typing(), focused, sticks: shown });
   }
 }

@@ -9,6 +9,7 @@ import { type Axis, CENTRED, Latch } from "./sticks.js";
 /** As much of a Gamepad as is read. */
 export interface Pad {
   id: string;
+  index?: number | undefined;
   mapping: string;
   connected: boolean;
   axes: readonly number[];
@@ -22,8 +23,10 @@ export interface PadReading {
   name: string | null;
   /** The buttons of the emergency stop are pressed, which is to be held. */
   stops: boolean;
-  /** It was there a moment ago. */
+  /** The one that was there a moment ago is gone, or another one is in its place. */
   lost: boolean;
+  /** Counts what hands have moved. */
+  touches: number;
 }
 
 /** The gamepads that are there: the one that flies first. */
@@ -38,33 +41,42 @@ export function sources(pad: Pad, map: PadMap, mode: Values["mode"]): Readonly<R
   return map.sources ?? (pad.mapping === "standard" ? sourcesOf(mode) : none);
 }
 
+const isSame = (one: Pad | null, other: Pad | null): boolean => one?.id === other?.id && one?.index === other?.index;
+
+/** The one that flies: in flight no other one takes its place while it is there. */
+export const chosen = (pads: readonly Pad[], before: Pad | null, inFlight: boolean): Pad | null => (inFlight && pads.find((pad) => isSame(pad, before))) || (pads[0] ?? null);
+
 export const pressedOf = (pad: Pad): number[] => pad.buttons.flatMap(({ pressed }, button) => (pressed ? [button] : []));
 
 export class GamepadReader {
+  /** As it was read last. */
+  pad: Pad | null = null;
   private readonly latch = new Latch();
-  private before: PadDeed[] = [];
-  private there = false;
+  private before: PadDeed[] | null = null;
+  private touches = 0;
 
   constructor(private readonly maps: Pick<PadMaps, "get">) {}
 
-  /** Ask for centred sticks before they count, as when control begins. */
+  /** Ask for centred sticks and released buttons before they count, as when control begins. */
   reset(): void {
     this.latch.reset();
+    this.before = null;
   }
 
   read(pad: Pad | null, mode: Values["mode"]): PadReading {
     const map = pad && (this.maps.get(pad.id) ?? (pad.mapping === "standard" ? STANDARD_MAP : null));
-    const lost = pad === null && this.there;
-    this.there = pad !== null;
-    if (pad === null || map === null) {
-      this.before = [];
-      this.latch.reset();
-      return { sticks: { ...CENTRED }, deeds: [], name: null, stops: false, lost };
-    }
+    const { pad: last } = this;
+    const lost = last !== null && !isSame(pad, last);
+    if (pad?.axes.some((value, axis) => value !== last?.axes[axis])) this.touches += 1;
+    this.pad = pad && { id: pad.id, index: pad.index, mapping: pad.mapping, connected: true, axes: [...pad.axes], buttons: [] };
+    if (lost || pad === null || map === null) this.reset();
+    if (pad === null || map === null) return { sticks: { ...CENTRED }, deeds: [], name: null, stops: false, lost, touches: this.touches };
     const pressed = PAD_DEEDS.filter((deed) => map.buttons[deed].length > 0 && map.buttons[deed].every((button) => pad.buttons[button]?.pressed));
-    const deeds = pressed.filter((deed): deed is Exclude<PadDeed, "stop"> => deed !== "stop" && !this.before.includes(deed));
+    // Browsers show a gamepad when it is first pressed: that press says no more than "here I am". The emergency stop is held for long.
+    const { before } = this;
+    const deeds = pressed.filter((deed): deed is Exclude<PadDeed, "stop"> => deed !== "stop" && before !== null && !before.includes(deed));
     this.before = pressed;
-    const sticks = sticksOf(pad.axes, sources(pad, map, mode), map.curves);
-    return { sticks: this.latch.pass(sticks), deeds, name: pad.id, stops: pressed.includes("stop"), lost: false };
+    const sticks = this.latch.pass(sticksOf(pad.axes, sources(pad, map, mode), map.curves));
+    return { sticks, deeds, name: pad.id, stops: pressed.includes("stop"), lost, touches: this.touches };
   }
 }

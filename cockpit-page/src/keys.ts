@@ -17,6 +17,9 @@ const STICKS: Readonly<Record<string, [Axis, 1 | -1]>> = {
   ArrowRight: ["yaw_rate", -1],
 };
 
+/** Browsers on macOS do not tell which keys are released while Cmd is down. */
+const COMMAND = /^(Meta|OS)(Left|Right)$/;
+
 const DEEDS: Readonly<Record<string, Deed>> = {
   KeyT: "takeoff",
   KeyH: "hover",
@@ -66,12 +69,16 @@ export function stopKeys(event: { code: string; ctrlKey: boolean; shiftKey: bool
 
 /** Keys that are held, and what single presses mean. */
 export class Keys {
+  /** Counts what fingers have pressed. */
+  touches = 0;
   private readonly held = new Set<string>();
 
   /** What a press means: a deed, "stick" for one that flies, or null. */
   down(press: Press): Deed | "stick" | null {
+    if (COMMAND.test(press.code)) this.clear();
     if (press.modified || press.typing) return null;
     if (press.code in STICKS) {
+      this.touches += 1;
       if (!press.repeat) this.held.add(press.code); // once cleared, a key counts when it is pressed again
       return "stick";
     }
@@ -79,6 +86,7 @@ export class Keys {
   }
 
   up(code: string): void {
+    if (COMMAND.test(code)) this.clear();
     this.held.delete(code);
   }
 

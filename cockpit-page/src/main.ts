@@ -17,7 +17,7 @@ import { AlarmSound } from "./alarmsound.js";
 import { post } from "./api.js";
 import { ServerClock } from "./clock.js";
 import { h, setAttribute, setHidden, setText } from "./dom.js";
-import { Flying, type InputView } from "./flying.js";
+import { type Flown, Flying, type InputView } from "./flying.js";
 import { FleetList } from "./fleet.js";
 import { FlightMode } from "./flightmode.js";
 import { Help } from "./help.js";
@@ -25,7 +25,7 @@ import { Countdown } from "./hold.js";
 import type { Deed } from "./keys.js";
 import { named, t } from "./language/index.js";
 import { session } from "./login.js";
-import type { DroneRow, Session, Sticks } from "./model.js";
+import type { DroneRow, Session } from "./model.js";
 import { OverviewView } from "./overview.js";
 import { Pane } from "./pane.js";
 import { keepInReach } from "./reach.js";
@@ -39,6 +39,8 @@ import type { Own } from "./tile.js";
 const DRAW_MS = 45;
 /** The list of drones comes twice a second; when it is older than this it is grey [ms]. */
 const OLD_LIST_MS = 2000;
+
+const isFlown = (pane: Pane): pane is Pane & Flown => pane.pilot !== null;
 
 class Page {
   private rows: DroneRow[] = [];
@@ -91,8 +93,8 @@ class Page {
     this.deckhouse = h("div", { class: "deckhouse" }, this.fleet.element, this.overview.element, this.main, this.overview.side, recordings.element);
     root.replaceChildren(bar, h("div", { class: "over page-over" }, h("div", { class: "stack" }, this.lost, this.safety?.message ?? "")), this.deckhouse, this.help.modal.element, this.help.mapping.modal.element, settings.modal.element, this.countdown.element);
     this.flying = new Flying({
-      pilots: () => [...this.panes.values()].flatMap((pane) => pane.pilot ?? []),
-      selected: () => this.selected?.pilot ?? null,
+      flown: () => [...this.panes.values()].filter(isFlown),
+      selected: () => (this.selected && isFlown(this.selected) ? this.selected : null),
       act: (deed) => this.act(deed),
       hold: (which) => this.safety?.hold(which),
       inputs: (view) => this.inputs(view),
@@ -228,7 +230,6 @@ class Page {
         rows: () => this.rows,
         select: (one) => this.select(one),
         close: (one) => this.close(one),
-        push: (one, sticks) => this.push(one, sticks),
         help: () => this.help.open(),
         fly: (one) => this.flight.toggle(one),
         known: (one) => this.panes.size === 1 && this.flight.offer(one),
@@ -291,10 +292,6 @@ class Page {
 
   private aim(): void {
     this.safety?.aim(this.selected?.target ?? null);
-  }
-
-  private push(name: string, sticks: Sticks): void {
-    if (name === this.chosen) this.flying.thumbs = sticks;
   }
 
   private act(deed: Deed): void {

@@ -188,7 +188,8 @@ export type Command =
   | { do: "take"; priority: number; ask: boolean }
   | { do: "answer"; id: number; grant: boolean; reason: string }
   | { do: "release" | "takeoff" | "hover" | "land" | "return" | "stop" | "reset" }
-  | ({ do: "fly" } & Sticks)
+  | { do: "hover"; automatic: true }
+  | ({ do: "fly"; touches: number } & Sticks)
   | { do: "goto"; x: number; y: number; z: number; yaw?: number }
   | { do: "route"; id: string }
   | { do: "route_pause" | "route_resume" | "route_skip" | "route_stop" }

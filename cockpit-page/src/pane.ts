@@ -20,7 +20,7 @@ import { Instruments } from "./instruments.js";
 import { named, t } from "./language/index.js";
 import type { Deed } from "./keys.js";
 import { MapPanel } from "./mappanel.js";
-import type { Alarm, DroneRow, State, Sticks, Vehicle } from "./model.js";
+import type { Alarm, DroneRow, State, Vehicle } from "./model.js";
 import { Parameters } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
@@ -30,6 +30,7 @@ import { before, type Playback, playbackOf, type Timeline } from "./replaytime.j
 import { isRecording, type Target } from "./safety.js";
 import type { SceneView } from "./scene.js";
 import { LastingSocket } from "./socket.js";
+import { Hands } from "./sticks.js";
 import { Strip } from "./strip.js";
 import { Thumbs } from "./thumbs.js";
 import { Stage } from "./video.js";
@@ -41,7 +42,6 @@ export interface PaneHost {
   rows(): readonly DroneRow[];
   select(name: string): void;
   close(name: string): void;
-  push(name: string, sticks: Sticks): void;
   help(): void;
   /** Into its flight mode, or out of it. */
   fly(pane: Pane): void;
@@ -91,7 +91,8 @@ export class Pane {
   private readonly stage: Stage;
   private readonly instruments = new Instruments();
   private readonly strip: Strip;
-  private readonly thumbs: Thumbs;
+  readonly thumbs = new Thumbs();
+  readonly hands = new Hands();
   private readonly map: MapPanel;
   private readonly writes: Writes;
   private readonly space = h("div", { class: "filling" });
@@ -123,7 +124,6 @@ export class Pane {
       deadly: () => (this.target === null ? null : { what: t.safety.motorsOff(name), act: () => this.target?.stop() }),
       understood: () => this.pilot?.understood(),
     });
-    this.thumbs = new Thumbs((sticks) => host.push(name, sticks));
     this.writes = new Writes((parameter, value) => this.pilot?.write(parameter, value));
     this.map = new MapPanel(name, {
       scene: () => this.world(),
@@ -185,6 +185,7 @@ export class Pane {
   }
 
   selected(selected: boolean): void {
+    if (!selected) this.thumbs.release();
     setAttribute(this.element, "data-selected", String(selected));
   }
 
@@ -260,7 +261,7 @@ export class Pane {
       follow: (message) => (message ? this.stage.followed(message) : this.stage.forgetTarget()),
       done: (command, name, value) => {
         if (command === "set" && name !== undefined && value !== undefined && !this.writes.done(name)) for (const list of [this.parameters, this.controls.parameters]) list.done(name, value);
-        if (command === "stop") this.notify(t.pane.stopSent, "bad");
+        if (command === "stop") this.notify(t.pane.stopShown, "bad");
         if (command === "goto") this.notify(t.pane.reached, "ok");
       },
     };

@@ -42,6 +42,7 @@ export class Pilot {
   /** How this page lost the control that it had; it stays until the person takes control or puts it away. */
   ended = "";
   private steering = false;
+  private stopping = false; // the emergency stop is not shown by the vehicle yet
   private readonly commands: CommandSender;
   private received_ms = 0; // when the authority was received
   private questioned_ms = 0; // and the questions
@@ -90,6 +91,11 @@ export class Pilot {
     return this.connected && this.authority.mine;
   }
 
+  /** Sticks count: it is this page's, nothing that is known of it is old, and its motors are not being stopped. */
+  get isFlyable(): boolean {
+    return this.mine && this.isLive && !this.stopping;
+  }
+
   /** Waits in line, or was pre-empted and waits to have it back. */
   get waits(): boolean {
     return this.connected && (this.authority.state === "queued" || this.authority.state === "preempted");
@@ -126,6 +132,7 @@ export class Pilot {
     this.end();
     const sent = this.send({ do: deed });
     this.going = sent && deed === "return";
+    this.stopping ||= sent && deed === "stop";
   }
 
   goTo(x: number, y: number, z: number): void {
@@ -173,11 +180,11 @@ export class Pilot {
     this.listener.changed();
   }
 
-  /** Called every STEER_MS with the sticks as they are, as velocities. */
-  steer(sticks: Sticks): void {
+  /** Called every STEER_MS with the sticks as they are, as velocities. `touches`: how often hands were seen to move anything. */
+  steer(sticks: Sticks, touches = 0): void {
     if (this.mine && !isCentred(sticks)) {
       this.going = this.following = false;
-      this.steering = this.commands.steer({ do: "fly", ...sticks } satisfies Command);
+      this.steering = this.commands.steer({ do: "fly", ...sticks, touches } satisfies Command);
     } else if (this.steering) {
       this.rest();
     }
@@ -188,7 +195,7 @@ export class Pilot {
   rest(): void {
     const moving = this.steering || this.going || this.following;
     this.end();
-    if (moving && this.mine) this.commands.steer({ do: "hover" } satisfies Command);
+    if (moving && this.mine) this.commands.steer({ do: "hover", automatic: true } satisfies Command);
   }
 
   close(): void {
@@ -206,6 +213,7 @@ export class Pilot {
   private linked(open: boolean): void {
     if (!open && this.mine) this.ended = t.pilot.broke;
     this.connected = open;
+    this.stopping = false;
     this.end();
     this.authority = NOBODY;
     this.questions = [];
@@ -214,6 +222,7 @@ export class Pilot {
   }
 
   private refused(command: string, why: string): void {
+    if (command === "stop") this.stopping = false;
     if (["goto", "fly", "route", "return", "follow_mode"].includes(command)) this.end();
     this.listener.refused(command, why);
   }
@@ -238,6 +247,7 @@ export class Pilot {
       this.following = message.state === "flying" || message.state === "waiting";
       this.listener.follow?.(message);
     } else if (message.type === "done") {
+      if (message.do === "stop") this.stopping = false;
       if (message.do === "goto" || message.do === "return") this.going = false;
       this.listener.done(message.do, message.name, message.value);
     }

@@ -74,7 +74,7 @@ export function scale(sticks: Sticks, pace: Pace): Sticks {
   };
 }
 
-/** A stick that was already pushed when control began counts for nothing until it has been released. */
+/** What is pushed while it does not count, for another drone, before control, or on a page that is not seen, counts only after it was centred. */
 export class Latch {
   private open = false;
 
@@ -83,8 +83,26 @@ export class Latch {
     this.open = false;
   }
 
-  pass(sticks: Sticks): Sticks {
-    this.open ||= isCentred(sticks);
-    return this.open ? sticks : { ...CENTRED };
+  pass(sticks: Sticks, counts = true): Sticks {
+    this.open = isCentred(sticks) || (this.open && counts);
+    return counts && this.open ? sticks : { ...CENTRED };
+  }
+}
+
+/** What a person's hands do to one drone. Each drone has its own, which are read each round, whether it is flown or not. */
+export class Hands {
+  private readonly latches = { keys: new Latch(), pad: new Latch(), thumbs: new Latch() };
+  private ramped: Sticks = { ...CENTRED };
+
+  /** Ask for the centre of everything again. */
+  rest(): void {
+    for (const latch of Object.values(this.latches)) latch.reset();
+  }
+
+  /** `counts`: this drone is the selected one, under control, and the page is seen. */
+  read(keys: Sticks, pad: Sticks, thumbs: Sticks, counts: boolean, seconds: number): Sticks {
+    const { latches } = this;
+    this.ramped = ramp(this.ramped, latches.keys.pass(keys, counts), seconds);
+    return merge(this.ramped, latches.pad.pass(pad, counts), latches.thumbs.pass(thumbs, counts));
   }
 }

@@ -6,35 +6,58 @@ import type { Sticks } from "./model.js";
 import { settings } from "./settings.js";
 import { CENTRED, deadBand, STICK_MODES } from "./sticks.js";
 
-type Push = (x: number, y: number) => void;
+const CENTRE: readonly [number, number] = [0, 0];
 
-/** One stick: pushes from −1 to 1, right and up positive; back to the centre when it is released. */
-function stick(push: Push): { pad: HTMLElement; call: (label: string) => void } {
+interface Stick {
+  pad: HTMLElement;
+  call(label: string): void;
+  /** From −1 to 1, right and up positive: where the finger is that holds it, else its centre. */
+  read(): readonly [number, number];
+  /** What holds it has to let go first. */
+  release(): void;
+}
+
+function stick(touched: () => void): Stick {
   const knob = h("i", { class: "knob" });
   const name = h("span", {});
   const pad = h("div", { class: "thumb", role: "img" }, knob, name);
+  let [finger, at]: [number | null, readonly [number, number]] = [null, CENTRE];
+  // The browser is asked each time: an event that says that it was let go may be lost, as with what is not shown any more.
+  const isHeld = (): boolean => finger !== null && pad.hasPointerCapture(finger);
   const put = (x: number, y: number): void => {
+    at = [x, y];
     knob.style.setProperty("translate", `calc(${x} * var(--travel)) calc(${-y} * var(--travel))`);
-    push(x, y);
   };
   const follow = (event: PointerEvent): void => {
-    if (!pad.hasPointerCapture(event.pointerId)) return;
+    if (event.pointerId !== finger || !isHeld()) return;
+    touched();
     const box = pad.getBoundingClientRect();
     const [x, y] = [((event.clientX - box.left) / box.width) * 2 - 1, 1 - ((event.clientY - box.top) / box.height) * 2];
     const size = Math.max(1, Math.hypot(x, y));
     put(x / size, y / size);
   };
+  const release = (): void => {
+    if (finger !== null && pad.hasPointerCapture(finger)) pad.releasePointerCapture(finger);
+    finger = null;
+    put(...CENTRE);
+  };
   pad.addEventListener("pointerdown", (event) => {
+    if (isHeld()) return; // a second finger moves nothing
     pad.setPointerCapture(event.pointerId);
+    finger = event.pointerId;
     follow(event);
   });
   pad.addEventListener("pointermove", follow);
-  for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) pad.addEventListener(end, () => put(0, 0));
-  const call = (label: string): void => {
-    setText(name, label);
-    setAttribute(pad, "aria-label", label);
+  for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) pad.addEventListener(end, (event) => event.pointerId === finger && release());
+  return {
+    pad,
+    call: (label) => {
+      setText(name, label);
+      setAttribute(pad, "aria-label", label);
+    },
+    read: () => (isHeld() ? at : CENTRE),
+    release,
   };
-  return { pad, call };
 }
 
 /** What both sticks do now, by the mode that the person chose. Pure. */
@@ -45,27 +68,31 @@ export function thumbed(mode: keyof typeof STICK_MODES, place: "left" | "right",
 
 export class Thumbs {
   readonly element: HTMLElement;
-  private sticks: Sticks = { ...CENTRED };
+  /** Counts what fingers have moved. */
+  touches = 0;
+  private readonly sides = (["left", "right"] as const).map((place) => ({ place, stick: stick(() => (this.touches += 1)) }));
 
-  constructor(push: (sticks: Sticks) => void) {
-    const sides = (["left", "right"] as const).map((place) => ({
-      place,
-      ...stick((x, y) => {
-        this.sticks = { ...this.sticks, ...thumbed(settings.get("mode"), place, x, y) };
-        push(this.sticks);
-      }),
-    }));
+  constructor() {
     const label = (): void => {
-      this.sticks = { ...CENTRED }; // what a thumb held has another meaning now
-      push(this.sticks);
-      for (const { place, call } of sides) {
+      this.release(); // what a thumb held has another meaning now
+      for (const { place, stick } of this.sides) {
         const { x, y } = STICK_MODES[settings.get("mode")][place];
-        call(t.thumbs.label(t.thumbs.axes[y], t.thumbs.axes[x]));
+        stick.call(t.thumbs.label(t.thumbs.axes[y], t.thumbs.axes[x]));
       }
     };
-    this.element = h("div", { class: "thumbs" }, ...sides.map(({ pad }) => pad));
+    this.element = h("div", { class: "thumbs" }, ...this.sides.map(({ stick }) => stick.pad));
     label();
     this.forget = settings.on("mode", label);
+  }
+
+  /** As fingers hold them now. */
+  get sticks(): Sticks {
+    return Object.assign({ ...CENTRED }, ...this.sides.map(({ place, stick }) => thumbed(settings.get("mode"), place, ...stick.read()))) as Sticks;
+  }
+
+  /** What is held counts no more until it is let go. */
+  release(): void {
+    for (const { stick } of this.sides) stick.release();
   }
 
   /** To be called when it is not shown any more. */

@@ -2,7 +2,8 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { GamepadReader, type Pad } from "../src/gamepad.js";
+import { chosen, GamepadReader, type Pad } from "../src/gamepad.js";
+import { isCentred } from "../src/sticks.js";
 import { AXES, Chord, movedAxis, PAD_DEEDS, PadMaps, parsed, shaped, sourcesOf, STANDARD_MAP, withButtons, withSource } from "../src/padmap.js";
 
 const pad = (axes: number[], pressed: number[] = [], mapping = "standard"): Pad => ({ id: "pad", mapping, connected: true, axes, buttons: Array.from({ length: 17 }, (_, one) => ({ pressed: pressed.includes(one) })) });
@@ -62,4 +63,43 @@ test("a gamepad of an unknown layout flies nothing until its sticks are assigned
   maps.get = () => ({ ...STANDARD_MAP, sources: { forward: { axis: 1, sign: 1 }, left: null, up: null, yaw_rate: null } });
   reader.read(pad([0, 0], [], ""), "2");
   assert.deepEqual(reader.read(pad([1, 1], [], ""), "2").sticks, { forward: 1, left: 0, up: 0, yaw_rate: 0 });
+});
+
+test("the press that wakes a gamepad commands nothing, the next one does; what is held over a rest is not new", () => {
+  const reader = new GamepadReader({ get: () => null });
+  reader.read(null, "2");
+  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [9]), "2").deeds, [], "browsers show a gamepad when it is first pressed");
+  assert.deepEqual(reader.read(pad([0, 0, 0, 0]), "2").deeds, []);
+  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [9]), "2").deeds, ["takeoff"]);
+  reader.reset();
+  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [9]), "2").deeds, []);
+  assert.ok(new GamepadReader({ get: () => null }).read(pad([0, 0, 0, 0], [4, 5]), "2").stops, "the emergency stop, which is held, works at once");
+});
+
+test("a gamepad that is unplugged is lost also where another one lies there, and that one has to be centred first", () => {
+  const one: Pad = { ...pad([0, 0, 0, -1]), index: 0 };
+  const other: Pad = { ...pad([0, 1, 0, 0]), index: 1 };
+  const reader = new GamepadReader({ get: () => null });
+  reader.read({ ...one, axes: [0, 0, 0, 0] }, "2");
+  assert.equal(reader.read(chosen([one, other], reader.pad, true), "2").sticks.forward, 1);
+  const swapped = reader.read(chosen([other], reader.pad, true), "2");
+  assert.deepEqual([swapped.lost, isCentred(swapped.sticks)], [true, true]);
+  assert.ok(isCentred(reader.read(other, "2").sticks), "still as it lies there");
+  reader.read({ ...other, axes: [0, 0, 0, 0] }, "2");
+  assert.equal(reader.read(other, "2").sticks.up, -1);
+});
+
+test("in flight no other gamepad takes the place of the one that flies", () => {
+  const [radio, plugged]: [Pad, Pad] = [{ ...pad([0], [], ""), id: "radio", index: 1 }, { ...pad([0]), index: 0 }];
+  assert.equal(chosen([plugged, radio], radio, true), radio);
+  assert.equal(chosen([plugged, radio], radio, false), plugged);
+  assert.equal(chosen([plugged], radio, true), plugged);
+  assert.equal(chosen([], radio, true), null);
+});
+
+test("what hands move is counted, also where it changes nothing: a stick at its end trembles across", () => {
+  const reader = new GamepadReader({ get: () => null });
+  const counts = [[0, -1], [0.01, -1], [0.01, -1]].map((axes) => reader.read(pad([0, 0, ...axes]), "2").touches);
+  assert.ok((counts[1] as number) > (counts[0] as number));
+  assert.equal(counts[2], counts[1]);
 });

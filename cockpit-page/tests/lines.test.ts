@@ -217,6 +217,35 @@ test("a page that loses the focus hovers what it has under way, and nothing else
   assert.deepEqual(doings(sent).slice(4), ["goto"], "there already");
 });
 
+test("a hover that nobody pressed says so, and sticks say how often hands were seen", () => {
+  const { pilot, sent, receive, live } = flown();
+  live();
+  receive(held(true));
+  pilot.steer(FORWARD, 7);
+  pilot.steer(CENTRED, 7);
+  pilot.act("hover");
+  const [fly, rest, pressed] = sent.filter((message) => message["do"] !== "ping");
+  assert.deepEqual([fly?.["touches"], rest?.["automatic"], pressed?.["automatic"]], [7, true, undefined]);
+});
+
+test("until the vehicle shows an emergency stop, or it is given up, sticks that are held command nothing", () => {
+  for (const end of [{ type: "done", do: "stop" }, { type: "refused", do: "stop", n: 0, why: "not shown" }]) {
+    const { pilot, sent, receive, live } = flown();
+    live();
+    receive(held(true));
+    pilot.steer(FORWARD);
+    pilot.act("stop");
+    assert.ok(!pilot.isFlyable);
+    pilot.steer(CENTRED);
+    pilot.rest();
+    receive({ type: "sent", do: "stop", n: sent.findLast((message) => message["do"] === "stop")?.["n"] });
+    assert.ok(!pilot.isFlyable, "passed on, and not shown yet");
+    assert.deepEqual(doings(sent), ["fly", "stop"], "no hover either");
+    receive(end);
+    assert.ok(pilot.isFlyable);
+  }
+});
+
 test("while it holds control it tells that it is there and what it hears, and measures how long that takes", () => {
   const { pilot, sent, receive, live, at } = flown();
   live();

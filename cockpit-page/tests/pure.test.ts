@@ -14,7 +14,7 @@ import { grouped } from "../src/plots.js";
 import { explained, pending, wins } from "../src/question.js";
 import { lacking } from "../src/recordings.js";
 import { isRecording, outcome } from "../src/safety.js";
-import { CENTRED, DEAD_BAND, deadBand, isCentred, Latch, merge, PACES, type Pace, ramp, RAMP_S, scale } from "../src/sticks.js";
+import { CENTRED, DEAD_BAND, deadBand, Hands, isCentred, Latch, merge, PACES, type Pace, ramp, RAMP_S, scale } from "../src/sticks.js";
 import { lineText } from "../src/strip.js";
 import { parse, rangeText } from "../src/values.js";
 import { othersOf } from "../src/world.js";
@@ -58,6 +58,43 @@ test("a stick that is pushed already must come back first", () => {
 });
 
 const press = (code: string, more: Partial<Press> = {}): Press => ({ code, repeat: false, modified: false, typing: false, ...more });
+
+test("hands fly the drone that is selected, and another one only after they were centred", () => {
+  const [alpha, beta] = [new Hands(), new Hands()];
+  const forward = push({ forward: 1 });
+  for (const source of ["keys", "pad", "thumbs"] as const) {
+    const read = (hands: Hands, sticks: Sticks, counts: boolean): Sticks => {
+      const of = (name: typeof source): Sticks => (name === source ? sticks : CENTRED);
+      return hands.read(of("keys"), of("pad"), of("thumbs"), counts, 1);
+    };
+    for (const hands of [alpha, beta]) read(hands, CENTRED, hands === alpha);
+    assert.deepEqual(read(alpha, forward, true), forward);
+    assert.ok(isCentred(read(beta, forward, false)));
+    assert.ok(isCentred(read(alpha, forward, false)), "beta is selected now");
+    assert.ok(isCentred(read(beta, forward, true)), `${source}: pushed for alpha`);
+    assert.ok(isCentred(read(alpha, forward, true)), "and back: it was never let go");
+    for (const hands of [alpha, beta]) read(hands, CENTRED, hands === beta);
+    assert.deepEqual(read(beta, forward, true), forward, "pushed anew");
+    beta.rest();
+    assert.ok(isCentred(read(beta, forward, true)), "after a rest it is centred first");
+    for (const hands of [alpha, beta]) read(hands, CENTRED, false);
+    assert.ok(isCentred(read(alpha, forward, false)), "no control");
+    assert.ok(isCentred(read(alpha, forward, true)), "control, with the stick pushed already");
+  }
+});
+
+test("macOS does not tell of keys that are released while Cmd is down: it lets go of all", () => {
+  const keys = new Keys();
+  keys.down(press("KeyW"));
+  keys.down(press("MetaLeft", { modified: true }));
+  assert.ok(isCentred(keys.sticks()));
+  keys.up("MetaLeft");
+  keys.down(press("KeyW", { repeat: true }));
+  assert.ok(isCentred(keys.sticks()), "its repeats are no new press");
+  keys.down(press("KeyW"));
+  keys.up("MetaRight");
+  assert.ok(isCentred(keys.sticks()), "pressed before the page had the focus");
+});
 
 test("keys: sticks by place, deeds once, nothing while somebody types", () => {
   const keys = new Keys();

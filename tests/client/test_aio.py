@@ -404,3 +404,23 @@ def test_a_cancelled_flight_of_a_swarm_is_not_carried_out(proxy: ScriptedProxy) 
         await drone.close()
 
     run(fly())
+
+
+def test_an_interrupted_flight_of_a_swarm_is_not_carried_out(
+    proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C, while each drone is waited for on a thread of its own."""
+    drone = skyloop.client.connect("me")
+
+    def interrupt(_thread: threading.Thread, _timeout_s: float | None = None) -> None:
+        proxy.until_commanded(Takeoff())
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "join", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            in_parallel({"left": lambda: drone.takeoff(timeout_s=WAIT_S)})
+    after = len(proxy.commands)
+    proxy.until(lambda: proxy.actions()[after:].count(Idle()) >= 3)
+    assert Takeoff() not in proxy.actions()[-2:]
+    drone.close()

@@ -38,6 +38,8 @@ from skyloop.messages import (
     Applied,
     CameraInfo,
     Capabilities,
+    Command,
+    EmergencyStop,
     EncodedFrame,
     Encoding,
     Event,
@@ -45,13 +47,17 @@ from skyloop.messages import (
     Feedback,
     FlightState,
     FrameHeader,
+    Hover,
     Intrinsics,
+    Land,
     LinkState,
     LogEntry,
     Role,
+    Takeoff,
     Value,
     Velocity,
     VideoRequest,
+    decode,
 )
 from skyloop.proxy.proxy import Proxy
 from skyloop.recording.status import RecorderState, Status
@@ -239,6 +245,9 @@ class Flyer(Driver):
         self.state = FlightState.LANDED
         self.applied: list[AnyAction] = []
         self.deaf = False  #: does nothing of what it is told
+        self.others = ""  #: the mode that somebody else chose, until it is steered from here again
+        self.taken: list[AnyAction] = []  #: what took it back
+        self.battery = 0.9
         self.place = [0.0, 0.0, 0.0]
         self.yaw = 0.0
         self._velocity = Velocity()
@@ -270,10 +279,16 @@ class Flyer(Driver):
         self.applied.append(action)
         if self.deaf:
             return action
+        if self.others and isinstance(action, Hover | Land | Takeoff):
+            self.taken.append(action)
+            self.others = ""
         self.state = NEXT.get(type(action), self.state)
         if ACTION_NAMES[type(action)] != "idle":
             self._velocity = action if isinstance(action, Velocity) else Velocity()
         return action
+
+    def left_to(self) -> str:
+        return self.others
 
     def _run(self, sink: Sink) -> None:
         while not self._ended.wait(self.PERIOD_S):
@@ -286,7 +301,7 @@ class Flyer(Driver):
                 Feedback(
                     captured_ns=now_ns,
                     state=self.state,
-                    battery=0.9,
+                    battery=self.battery,
                     yaw_rad=self.yaw,
                     velocity_m_s=(v.forward, v.left, v.up),
                     position_m=(self.place[0], self.place[1], self.place[2]) if self._knows_position else None,
@@ -303,13 +318,24 @@ class Node:
     def __init__(self, name: str = "alpha", **options: Any) -> None:
         self.name = name
         self.flyer = Flyer(**options)
+        self.stops_lost = 0  #: so many packets of an emergency stop are lost on their way
         self._server = MemoryServer(name)
         self._proxy = Proxy(self.flyer, self._server, name=name)
         self._proxy.start()
         self.up = True
 
     def dial(self, handler: ClientHandler) -> TransportClient:
-        return self._server.dial(handler)
+        client = self._server.dial(handler)
+        send = client.send
+        client.send = lambda packet: self._loses(packet) or send(packet)  # type: ignore[method-assign]
+        return client
+
+    def _loses(self, packet: bytes) -> bool:
+        message = decode(packet) if self.stops_lost else None
+        if not isinstance(message, Command) or not isinstance(message.action, EmergencyStop):
+            return False
+        self.stops_lost -= 1
+        return True
 
     def connect(self, app: str, priority: int = 16, **options: Any) -> Drone:
         return open_drone(self.dial, app=app, **options, authority=Authority(priority=priority))

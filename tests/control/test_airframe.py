@@ -23,6 +23,7 @@ from skyloop.control.landing_law import LandingLaw, LandingPhase
 from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Attitude, Feedback, FlightState, Velocity
 from skyloop.sim.camera import FRONT_CAMERA
+from skyloop.vision import BlobSighting
 
 GRAVITY = 9.80665
 STILL: dict[str, Any] = {
@@ -148,6 +149,20 @@ def test_what_is_not_finite_counts_as_missing(name: str, wrong: float) -> None:
     assert all(getattr(airframe.feedback, other) == STILL[other] for other in STILL if other != name)
 
 
+def test_samples_after_one_that_was_stamped_ahead_are_not_ignored() -> None:
+    airframe = Airframe(Part.VELOCITY)
+    airframe.add(state(1.0, velocity_m_s=(1.0, 0.0, 0.0)))
+    airframe.add(state(1.1, velocity_m_s=(1.0, 0.0, 0.0)))
+    airframe.add(state(9.0))
+    assert airframe.missing(nanoseconds(1.2)) == "the vehicle's velocity is not known"
+    airframe.add(state(1.2))
+    assert airframe.missing(nanoseconds(1.2)) == ""
+    motion = airframe.at(nanoseconds(1.2))
+    assert motion is not None
+    assert motion.position[0] == pytest.approx(0.1, abs=0.3), "near where it was"
+    assert airframe.interruptions >= 1
+
+
 # Laws --------------------------------------------------------------------------------------------------------------
 
 AHEAD = np.array([2.0, 0.3, 0.1])
@@ -255,6 +270,25 @@ def test_what_was_seen_before_a_gap_is_not_flown_to_after_it() -> None:
     assert (follow.mode, gate.phase, landing.phase) == (Mode.SEARCHING, GatePhase.SEARCHING, LandingPhase.SEARCHING)
 
 
+@pytest.mark.parametrize("number", [0, 1, 4])
+def test_after_a_while_without_set_points_they_begin_from_rest(number: int) -> None:
+    """Frames had stopped, and the vehicle hovered: what it was asked for before is not what it does."""
+    law, fastest = laws()[number], 0.0
+    for k in range(80):
+        at_s = 1.0 + 0.05 * k
+        sample = state(at_s)
+        law.feedback(sample)
+        see(law, sample, AHEAD + np.array([1.0, 0.0, 0.0]))
+        if k < 40 or k > 60:
+            setpoint = step(law, at_s)
+            assert isinstance(setpoint, Velocity)
+            if k < 40:
+                fastest = max(fastest, setpoint.forward)
+            elif k == 61:
+                assert (setpoint.forward, setpoint.left) == (0.0, 0.0)
+    assert fastest > 0.3
+
+
 ANY = st.one_of(st.floats(-3.0, 3.0), st.sampled_from([math.nan, math.inf, -math.inf]))
 SAMPLES = st.fixed_dictionaries(
     {
@@ -284,6 +318,16 @@ def test_nan_anywhere_yields_no_set_point_that_is_not_finite_or_grows(
             assert max(map(abs, (setpoint.forward, setpoint.left, setpoint.up, setpoint.yaw_rate))) < 9.0
         else:
             assert max(map(abs, (setpoint.roll, setpoint.pitch, setpoint.climb))) < 1.0
+
+
+def test_an_obstacle_whose_edge_the_lens_can_not_tell_counts_as_close() -> None:
+    """It ended the flight by an error about a fuzzy variable."""
+    law = AvoidLaw(9.0)
+    law.feedback(state(1.0))
+    law.see([BlobSighting((0.0, 0.0, 9.0, 9.0), math.nan, 0.1)], nanoseconds(1.0))
+    law.step(nanoseconds(1.0))
+    assert law.phase is AvoidPhase.AVOIDING
+    assert law.step(nanoseconds(1.2)).left < 0.0, "away from it"
 
 
 def test_of_the_phases_that_a_law_ends_in_none_is_reached_while_it_is_blind() -> None:

@@ -6,6 +6,7 @@ import importlib.util
 import math
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -29,7 +30,7 @@ from skyloop.control.gate_law import GatePhase, GateSettings
 from skyloop.control.landing_law import LandingPhase
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.errors import AuthorityError, UnknownNameError, UsageError
-from skyloop.messages import Annotation, AnyAction, FlightState, Land, LinkState, Severity, Velocity
+from skyloop.messages import Annotation, FlightState, Land, LinkState, Severity, Velocity
 from skyloop.sim.geometry import geometry_of
 from skyloop.sim.world_file import load_world
 from skyloop.stepping.rehearsal import Radio, rehearse
@@ -56,17 +57,17 @@ def test_a_landing_that_others_took_over_does_not_go_on_where_they_give_it_back(
         drone.takeoff()
         pilot = LandOnMarker(drone)
         pilot._landing_law.phase = LandingPhase.DOWN
-
-        def refused(action: AnyAction) -> bool:
-            raise AuthorityError(f"{action.name} refused: taken over")
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(drone, "command", refused)
+        drone.release_authority()
+        with suppress(AuthorityError):
             pilot.run(seconds=0.5)
         assert pilot.phase is LandingPhase.SEARCHING
+        drone.request_authority()
         pilot.run(seconds=1.0)
         assert not pilot.landed
         assert drone.feedback().state is FlightState.FLYING
+        drone.land()
+        assert pilot.run(seconds=5.0).reason == "stopped", "others have landed it"
+        assert not pilot.landed
 
 
 @pytest.mark.slow

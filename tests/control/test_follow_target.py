@@ -315,6 +315,7 @@ class Recorder:
     def __init__(self) -> None:
         self.capabilities = Capabilities("sim", frozenset({"velocity"}), (FRONT_CAMERA.info(),))
         self.config = {"limits.speed": 2.0, "limits.tilt": 0.3, "autopilot.kind": "sim"}
+        self.authority = SimpleNamespace(state="held")
         self.velocities: list[dict[str, float]] = []
         self.attitudes: list[Attitude] = []
         self.hovers = 0

@@ -150,6 +150,30 @@ def test_two_that_are_too_close_part_and_others_are_left_alone() -> None:
     assert np.allclose(same_place, [(0.5, 0, 0), (-0.5, 0, 0)])
 
 
+def test_who_meets_one_that_does_not_give_way_gives_way_alone() -> None:
+    """It gave way by half, and flew through its leader."""
+    positions = [(0.5, 0.0, 1.0), (0.0, 0.0, 1.0)]
+    changed = kept_apart([(-1.0, 0.3, 0.0), (0.4, 0.0, 0.0)], positions, 1.0, fixed=1)
+    assert np.allclose(changed, [(0.9, 0.3, 0.0), (0.4, 0.0, 0.0)])
+    near = kept_apart([(-1.0, 0.3, 0.0), (0.0, 0.0, 0.0)], [(1.2, 0.0, 1.0), (0.0, 0.0, 1.0)], 1.0, fixed=1)
+    assert np.allclose(near, [(-0.2, 0.3, 0.0), (0.0, 0.0, 0.0)]), "it slows down before"
+    assert np.allclose(kept_apart([(1.0, 0.0, 0.0)] * 2, positions, 1.0, fixed=2), [(1.0, 0.0, 0.0)] * 2)
+
+
+@settings(deadline=None)
+@given(points(2, 5), st.integers(1, 4), st.floats(0.1, 3.0))
+def test_nobody_comes_nearer_to_the_last_that_does_not_give_way(positions: Places, fixed: int, apart: float) -> None:
+    fixed = min(fixed, len(positions))
+    changed = kept_apart(-positions, positions, apart, fixed=fixed)
+    assert np.array_equal(changed[len(positions) - fixed :], -positions[len(positions) - fixed :])
+    for one in range(len(positions) - fixed):
+        between = positions[one] - positions[-1]
+        distance = float(np.linalg.norm(between))
+        if distance > 1e-6:
+            growing = float((changed[one] - changed[-1]) @ between) / distance
+            assert growing >= apart - distance - 1e-6
+
+
 @settings(deadline=None)
 @given(points(2, 2), st.floats(0.1, 20.0))
 def test_steering_apart_never_makes_two_approach_that_are_too_close(positions: Places, apart: float) -> None:

@@ -192,6 +192,86 @@ def test_a_leader_that_fails_lets_the_followers_hover() -> None:
             Formation(drones).follow("a", {"b": (-1.0, 0.0, 0.0)}, 30.0)
 
 
+@contextmanager
+def watched(movers: dict[str, Mover]) -> Iterator[list[float]]:
+    """How near the first two of them really come to each other."""
+    nearest, over = [math.inf], threading.Event()
+    first, second = list(movers.values())[:2]
+
+    def watch() -> None:
+        while not over.wait(PERIOD_S / 2):
+            nearest[0] = min(nearest[0], float(np.linalg.norm(first.at - second.at)))
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield nearest
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_a_follower_whose_leader_turns_about_does_not_fly_through_it() -> None:
+    """It gave way by half only, which its leader did not know of: 0.18 m."""
+    movers = {"a": Mover((0.0, 0.0, 1.0)), "b": Mover((-1.0, 0.02, 1.0))}
+    with flying(movers) as drones, watched(movers) as nearest:
+        threading.Timer(0.3, lambda: setattr(movers["a"], "yaw", math.pi)).start()
+        report = Formation(drones, settings=BRISK).follow("a", {"b": (-1.0, 0.0, 0.0)}, 2.0)
+    assert nearest[0] > 0.6
+    assert report.closest_m == pytest.approx(nearest[0], abs=0.1)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_nobody_flies_through_one_that_was_set_aside(closed: bool) -> None:
+    """One came within 0.005 m of it, which was reported as 0.998."""
+    movers = {"a": Mover((1.0, 0.0, 1.0)), "b": Mover((0.0, 0.1, 1.0))}
+    with flying(movers, on_error="continue") as drones, watched(movers) as nearest:
+
+        def set_aside() -> None:
+            if closed:
+                drones["a"].close()
+            else:
+                drones.fail("a test", {"a": NoAnswerError("it is tired")})
+
+        timer = threading.Timer(0.5, set_aside)
+        timer.start()
+        report = Formation(drones, settings=BRISK).fly_to(
+            [(4.0, 0.0, 1.0), (3.0, 0.0, 1.0)], speed_m_s=2.0, timeout_s=5.0
+        )
+        assert "a" not in drones.active
+    assert nearest[0] > 0.6
+    if not closed:
+        assert report.closest_m == pytest.approx(nearest[0], abs=0.1)
+
+
+def test_a_drone_whose_position_is_lost_is_set_aside_and_the_others_fly_on() -> None:
+    """It ended the whole formation with an error about an array, whatever on_error said."""
+    movers = row()
+    with flying(movers, on_error="continue") as drones:
+        timer = threading.Timer(0.5, lambda: setattr(movers["b"], "tells", False))
+        timer.start()
+        report = Formation(drones, settings=BRISK).fly_to([(x, 3.0, 1.0) for x in (0.0, 1.0, 2.0)], speed_m_s=2.0)
+        assert list(drones.active) == ["a", "c"]
+        assert str(drones.errors["b"]) == "the vehicle's position is not known"
+        assert max(report.errors_m[name] for name in ("a", "c")) < 0.5
+        assert drones["b"].wait("hovering", 5.0).state is FlightState.HOVERING
+    movers = row()
+    with flying(movers) as drones:
+        timer = threading.Timer(0.3, lambda: setattr(movers["b"], "tells", False))
+        timer.start()
+        with pytest.raises(SwarmError, match=r"b: .*position is not known"):
+            Formation(drones).hold(10.0)
+
+
+def test_a_position_that_is_missing_for_a_moment_is_carried_on() -> None:
+    movers = row()
+    with flying(movers) as drones:
+        formation = Formation(drones)
+        for at_s, tells in ((0.3, False), (0.55, True)):
+            threading.Timer(at_s, lambda tells=tells: setattr(movers["b"], "tells", tells)).start()
+        assert max(formation.hold(1.0).errors_m.values()) < 0.1
+
+
 def test_the_place_beside_a_leader() -> None:
     leader = Feedback(captured_ns=0, position_m=(1.0, 2.0, 3.0), yaw_rad=math.pi / 2)
     assert np.allclose(station(leader, (1.0, 0.5, 0.2)), (0.5, 3.0, 3.2))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from skyloop.client.frame import Frame
 from skyloop.control import OnnxPolicy, PolicyNetwork, PolicyPhase
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Attitude, Feedback, Severity, Velocity
@@ -161,6 +162,15 @@ def test_it_hovers_while_it_does_not_know_what_the_policy_needs(drone: Recorder,
     assert len(drone.velocities) == 1
     pilot.on_frame(frame(1_200_000_000, [], known=False))
     assert drone.told[-1] == ("policy: the drone does not know all that the policy needs: hovering", Severity.WARNING)
+
+
+def test_it_hovers_where_the_state_is_from_long_before_the_picture(
+    drone: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pilot = fly(drone, write(tmp_path / "policy.onnx"))
+    monkeypatch.setattr(Frame, "feedback", state(1_400_000_000))
+    pilot.on_frame(frame(2_000_000_000, []))
+    assert (drone.velocities, drone.hovers, pilot.phase) == ([], 1, PolicyPhase.NO_STATE)
 
 
 def test_it_hovers_where_the_action_is_not_finite(drone: Recorder, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import itertools
 import math
 from pathlib import Path as File
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from msgspec.structs import replace
 from skyloop.client import Drone
 from skyloop.control import Circle, DeadReckoning, Fix, FixedYaw, FollowPath, Polyline, Waypoint, Waypoints
 from skyloop.errors import AuthorityError, UsageError
-from skyloop.messages import AnyAction, Feedback
+from skyloop.messages import Failsafe, Feedback
 from skyloop.stepping.rehearsal import Radio, rehearse
 
 CALM = "sim://?world=empty&cameras=none&wind=0"
@@ -163,18 +164,29 @@ def test_while_others_fly_it_a_path_waits_and_integrates_nothing() -> None:
         assert flight._law is not None
         taken = flight._law.time_s
 
-        def refused(action: AnyAction) -> bool:
-            raise AuthorityError(f"{action.name} refused: taken over")
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(drone, "command", refused)
-            patch.setattr(drone._core, "command", refused)
-            feedback = drone.feedback()
-            for k in range(1, 400):
-                later = replace(feedback, captured_ns=feedback.captured_ns + k * 25_000_000, position_m=(0.0, 0.4, 1.0))
-                with pytest.raises(AuthorityError):
-                    flight.on_feedback(later)
+        drone.release_authority()
+        feedback = drone.feedback()
+        for k in range(1, 400):
+            later = replace(feedback, captured_ns=feedback.captured_ns + k * 25_000_000, position_m=(0.0, 0.4, 1.0))
+            with pytest.raises(AuthorityError):
+                flight.on_feedback(later)
         assert flight._law.time_s == taken
+        assert not flight._law._loop.integral.any()
+
+
+@pytest.mark.parametrize("taken", [{"others": "the pilot's switch"}, {"failsafe": Failsafe.HOVER}])
+def test_a_path_waits_while_its_set_points_have_no_effect(taken: dict[str, Any]) -> None:
+    """Without a word to the program: a safety pilot's mode switch leaves it the authority."""
+    with rehearse(CALM) as drone:
+        drone.takeoff()
+        flight = FollowPath(drone, Polyline([(0, 0, 1), (5, 0, 1)]))
+        flight.run(seconds=3.0)
+        assert flight._law is not None
+        begun, feedback = flight._law.time_s, drone.feedback()
+        for k in range(1, 200):
+            at_ns = feedback.captured_ns + k * 25_000_000
+            flight.on_feedback(replace(feedback, captured_ns=at_ns, position_m=(0.0, 0.4, 1.0), **taken))
+        assert flight._law.time_s == begun
         assert not flight._law._loop.integral.any()
 
 

@@ -400,7 +400,7 @@ export const en = {
     watch: "you may watch, not fly",
     close: (name: string) => `Close ${name}`,
     drone: (name: string) => `Drone ${name}`,
-    stopSent: "emergency stop sent",
+    stopShown: "the motors are stopped",
     reached: "the waypoint is reached",
     replayEnded: "This replay has ended. Recordings can replay it again.",
     gone: (name: string) => `${name} is not there; it is shown when it comes back`,
@@ -438,7 +438,7 @@ export const en = {
     failed: { land_all: (drones: string) => `NOT landed: ${drones}`, stop_all: (drones: string) => `NOT stopped: ${drones}` },
     pending: (drones: string) => `pending: ${drones}`,
     sent: (drones: string) => `sent: ${drones}`,
-    done: { land_all: (drones: string) => `landed: ${drones}`, stop_all: (drones: string) => `done: ${drones}` },
+    done: { land_all: (drones: string) => `landed: ${drones}`, stop_all: (drones: string) => `stopped: ${drones}` },
   },
   parameters: {
     filter: "Filter",

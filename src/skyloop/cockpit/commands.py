@@ -18,6 +18,9 @@ Word = Annotated[str, msgspec.Meta(max_length=64)]
 LATE_S: Final = 0.5  #: a command that may be older is refused: the person no longer expects it to happen
 #: An emergency stop may be this late: as long as the page shows it as pending.
 STOP_LATE_S: Final = 2.0
+#: Sticks that are pushed and that no hand has moved for so long are in nobody's hand. Bluetooth itself notices that a
+#: gamepad is gone after up to 20 s only.
+UNTOUCHED_S: Final = 10.0
 AHEAD_S: Final = 0.05  #: what clocks may differ by beyond what the page stated; as for commands of programs
 SETTLED_NS: Final = 50_000_000  #: feedback captured so soon after a command may still be from before it [ns]
 
@@ -58,7 +61,10 @@ class Answer(Command, frozen=True, tag="answer"):
 class TakeOff(Command, frozen=True, tag="takeoff"): ...
 
 
-class HoverHere(Command, frozen=True, tag="hover"): ...
+class HoverHere(Command, frozen=True, tag="hover"):
+    """Hover, as the person decided; or by itself, as nothing is held any more, which takes the vehicle from nobody."""
+
+    automatic: bool = False
 
 
 class LandHere(Command, frozen=True, tag="land"): ...
@@ -79,6 +85,8 @@ class Fly(Command, frozen=True, tag="fly"):
     left: float = 0.0
     up: float = 0.0
     yaw_rate: float = 0.0
+    #: Grows with each sign of a hand: fingers that move, keys that repeat, raw axes. None: it does not say.
+    touches: int | None = None
 
 
 class GoTo(Command, frozen=True, tag="goto"):
@@ -220,6 +228,30 @@ def decode_fleet_command(text: str | bytes) -> AnyFleetCommand:
 def late_s(command: Command) -> float:
     """Return how old a command may be [s]."""
     return STOP_LATE_S if isinstance(command, Stop | StopAll) else LATE_S
+
+
+class HandWatch:
+    """Whether sticks that are pushed are in anybody's hand. Pure.
+
+    Hands are never still: a finger moves by pixels, a held key repeats, an axis that is at its end trembles across it.
+    A gamepad whose radio link broke is still, and so would be a page that lost track of what is held.
+    """
+
+    def __init__(self) -> None:
+        """Begin with sticks that nobody has pushed."""
+        self._last: Fly | None = None
+        self._moved_s = self._seen_s = 0.0
+
+    def holds(self, sticks: Fly, now_s: float) -> bool:
+        """Return whether a hand was seen on them within :data:`UNTOUCHED_S`; called with each command of the sticks."""
+        last, self._last = self._last, sticks
+        same = last is not None and all(
+            getattr(last, name) == getattr(sticks, name) for name in ("forward", "left", "up", "yaw_rate", "touches")
+        )
+        if not same or sticks.touches is None or now_s - self._seen_s > LATE_S:
+            self._moved_s = now_s
+        self._seen_s = now_s
+        return now_s - self._moved_s <= UNTOUCHED_S
 
 
 def untimely(command: Command, now_s: float) -> str:

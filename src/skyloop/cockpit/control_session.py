@@ -15,6 +15,7 @@ import asyncio
 import itertools
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,6 +27,7 @@ from skyloop.cockpit.authority_report import AuthorityReport
 from skyloop.cockpit.broadcast import call_soon
 from skyloop.cockpit.commands import (
     SETTLED_NS,
+    UNTOUCHED_S,
     Alive,
     Answer,
     AnyCommand,
@@ -34,6 +36,7 @@ from skyloop.cockpit.commands import (
     FlyRoute,
     FollowTarget,
     GoTo,
+    HandWatch,
     HoverHere,
     LandHere,
     PauseRoute,
@@ -124,8 +127,11 @@ class ControlSession:
         self._takeover = TakeoverDialog(self._send)
         self._last_command = ""  # what the page commanded last
         self._commands = 0  # how many there were
+        self._decisions = 0  # grows with whatever flies, or ends a flight: what waits for answers compares it
+        self._hands = HandWatch()
         self._refused_command = 0  # the one whose refusal was sent
         self._awaited: tuple[str, frozenset[FlightState], int] | None = None  # what is done in which states, from when
+        self._refused_ns: int | None = None  # what was under way was refused then, on the proxy's clock
         self._repeated = False  # for as long as a take-off may be
         self._last_refusal = ("", -_REFUSE_AGAIN_S)  # about sticks: why, and when [s]
         self._handlers: dict[type[AnyCommand], Callable[[Any], None]] = {
@@ -133,20 +139,22 @@ class ControlSession:
             Release: lambda command: self._run_in_turn(command, self._release),
             Answer: lambda command: self._run_in_turn(command, self._answer),
             TakeOff: lambda command: self._send_command(command, lambda pilot: pilot.command(Takeoff()), UP),
-            HoverHere: lambda command: self._send_command(command, lambda pilot: pilot.hover()),
+            HoverHere: self._hover_here,
             LandHere: lambda command: self._send_command(command, lambda pilot: pilot.command(Land()), _DOWN),
             Reset: lambda command: self._send_command(command, lambda pilot: pilot.reset_emergency()),
-            Stop: self._stop_motors,
+            Stop: lambda command: self._start_job(self._stop_motors(command)),
             Fly: self._fly,
             GoTo: lambda command: self._set_out(command, lambda pilot: to_place(command, pilot)),
             FlyBack: lambda command: self._set_out(command, to_start),
-            FlyRoute: lambda command: self._run_in_turn(command, self._fly_route),
+            FlyRoute: lambda command: self._run_in_turn(command, partial(self._fly_route, held=self._still_held())),
             PauseRoute: lambda command: self._steer_route(command, RouteSession.pause),
             ResumeRoute: lambda command: self._steer_route(command, RouteSession.resume),
             SkipWaypoint: lambda command: self._steer_route(command, RouteSession.skip),
             StopRoute: lambda command: self._steer_route(command, RouteSession.end),
             SelectTarget: lambda command: self._run_in_turn(command, self._select_target),
-            FollowTarget: lambda command: self._run_in_turn(command, self._follow_target),
+            FollowTarget: lambda command: self._run_in_turn(
+                command, partial(self._follow_target, held=self._still_held())
+            ),
             SetFollowMode: self._set_follow_mode,
             StopFollowing: self._stop_following,
             Write: lambda command: self._run_in_turn(command, self._write),
@@ -156,13 +164,17 @@ class ControlSession:
         """Serve the page until it is gone, then leave the vehicle in a safe state."""
         update = self._update
         self._station.pilot_came()
+        self._station.sessions.add(self)
         self._station.broadcast.subscribe(update)
         try:
             await self._page.serve(self._on_message)
         finally:
             self._station.broadcast.unsubscribe(update)
             self._on_page_gone()
-            await asyncio.shield(self._close())
+            try:
+                await asyncio.shield(self._close())
+            finally:
+                self._station.sessions.discard(self)
 
     # Messages of the page ----------------------------------------------------------------------------------------
 
@@ -185,6 +197,8 @@ class ControlSession:
             if not isinstance(command, Answer):
                 self._last_command = command.do
                 self._commands += 1
+            if _decides(command):
+                self._decisions += 1
             self._handlers[type(command)](command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
@@ -229,8 +243,22 @@ class ControlSession:
                 pilot.idle()  # or it would be done after all when the link is back soon
             raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
 
+    def _hover_here(self, command: HoverHere) -> None:
+        """Hover: as the person decided, or because the page finds that nothing is held any more."""
+        if command.automatic:
+            self._held()
+            self.let_go("nothing is held on the page any more")
+            self._acknowledge(command)
+        else:
+            self._send_command(command, lambda pilot: pilot.hover())
+
     def _fly(self, command: Fly) -> None:
         pilot = self._held()
+        if not self._hands.holds(command, seconds(self._clock())):
+            why = f"no hand has moved the sticks for {UNTOUCHED_S:g} s: the vehicle hovers until one does"
+            if self._steering:
+                self.let_go(why)
+            raise RefusedError(why)
         self._end_flight("the sticks were moved")
         pilot.velocity(forward=command.forward, left=command.left, up=command.up, yaw_rate=command.yaw_rate)
         self._steering = True
@@ -245,15 +273,15 @@ class ControlSession:
         self._acknowledge(command)
         self._restart_silence_timer()
 
-    async def _fly_route(self, command: FlyRoute) -> None:
+    async def _fly_route(self, command: FlyRoute, held: Callable[[], PilotConnection]) -> None:
         """Check a route again, as much may have changed, and fly it."""
         route = self._station.routes.get(command.id)
-        self._held()
+        held()
         check = await asyncio.to_thread(check_for, self._station.drone, route, wait_s=0.0)
         problem = next((one.reason for one in check.findings if one.severity == "error"), "")
         if problem := problem or untimely(command, seconds(self._clock())):
             raise RefusedError(f"the route can't be flown: {problem}")
-        pilot = self._held()
+        pilot = held()
         self._end_flight()
         self._end_route()
         self._route = RouteSession(route, pilot, self._station.drone, self._photos, self._send, self._aim)
@@ -276,9 +304,9 @@ class ControlSession:
         await self._follow.select(command)
         self._acknowledge(command)
 
-    async def _follow_target(self, command: FollowTarget) -> None:
+    async def _follow_target(self, command: FollowTarget, held: Callable[[], PilotConnection]) -> None:
         """Track what is in a box; without a mode that needs no authority."""
-        await self._follow.begin(command, self._held)
+        await self._follow.begin(command, held)
         self._acknowledge(command)
         self._restart_silence_timer()
 
@@ -304,20 +332,15 @@ class ControlSession:
             self._route.end(hover=False)
             self._route = None
 
-    def _stop_motors(self, command: Stop) -> None:
-        self._end_flight("the motors were stopped")
-        self._start_job(self._cut_motors(command))
-
-    async def _cut_motors(self, command: Stop) -> None:
-        """Cut the motors, trying for as long as the page shows the command as pending."""
+    async def _stop_motors(self, command: Stop) -> None:
+        """Stop the motors, trying for as long as the page shows the command as pending."""
         assert command.at_s is not None  # or it would be untimely
         until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))
         try:
-            await self._station.cut_motors(until_ns, self._pilot)
+            await self._station.stop_motors(until_ns, lambda: self._acknowledge(command))
         except SkyloopError as error:
             self._refuse_command(command, str(error))
         else:
-            self._acknowledge(command)
             self._done(command.do)
 
     async def _take(self, command: Take) -> None:
@@ -349,7 +372,7 @@ class ControlSession:
         self._done(command.do)
 
     async def _release(self, command: Release) -> None:
-        self._hover()
+        self.let_go("the page gives control back")
         self._authority.released()
         self._acknowledge(command)
         await self._close_pilot()
@@ -384,9 +407,25 @@ class ControlSession:
         pilot = self._pilot
         if pilot is None or pilot.authority.state == "none":
             raise AuthorityError("take control first", code="no_authority")
+        if self._station.is_stopping:
+            raise RefusedError("an emergency stop is under way: nothing else is commanded before it shows")
         if pilot.authority.state != "held":
             raise AuthorityError(f"{pilot.authority.holder or 'another application'} has control", code="no_authority")
         return pilot
+
+    def _still_held(self) -> Callable[[], PilotConnection]:
+        """Return what stands for :meth:`_held` in a job that waits for answers.
+
+        It raises :class:`RefusedError` once anything else was commanded, or ended a flight: the newest decision counts.
+        """
+        number = self._decisions
+
+        def held() -> PilotConnection:
+            if self._decisions != number:
+                raise RefusedError("something else was commanded meanwhile, or the page was away")
+            return self._held()
+
+        return held
 
     # The dead-man ----------------------------------------------------------------------------------------------
 
@@ -402,7 +441,7 @@ class ControlSession:
         self._silence = None
         if self._is_under_way:
             why = f"the page was silent for {SILENT_S:g} s: the vehicle hovers"
-            self._hover(why)
+            self.let_go(why)
             self._refuse(self._last_command, why)
 
     @property
@@ -413,20 +452,28 @@ class ControlSession:
 
     def _end_flight(self, why: str = "something else was commanded, or the page was away") -> None:
         """End what the page flew before; a route is paused, and may be resumed."""
+        self._decisions += 1
         self._steering = False
         self._follow.interrupt(why)
         if self._route is not None:
             self._route.pause(why, hover=False)
-        self._awaited = None
+        self._awaited = self._refused_ns = None
         self._place.cancel()
 
-    def _hover(self, why: str = "the page was away, or gave control back") -> None:
+    def let_go(self, why: str) -> None:
         """Hover if this page has the vehicle under way; a take-off or landing under way ends safely by itself."""
         flies = self._is_under_way
         self._end_flight(why)
         pilot = self._pilot
         if pilot is not None and (flies or pilot.is_flying):
-            pilot.hover_if_held()
+            pilot.let_go(why)
+
+    def stand_down(self, why: str) -> None:
+        """Command nothing any more, as the motors are being stopped; the authority is kept."""
+        self._end_flight(why)
+        if self._pilot is not None:
+            with suppress(SkyloopError):
+                self._pilot.idle()
 
     # The end ---------------------------------------------------------------------------------------------------
 
@@ -435,13 +482,13 @@ class ControlSession:
         if self._silence is not None:
             self._silence.cancel()
             self._silence = None
-        self._hover()
+        self.let_go("the page is gone")
 
     async def _close(self) -> None:
         """Wait for what is under way, and give the authority back."""
         await asyncio.gather(*self._jobs, return_exceptions=True)
         await self._follow.close()
-        self._hover()  # what was taken, or begun, only just now
+        self.let_go("the page is gone")  # what was taken, or begun, only just now
         await self._close_pilot()
         await self._station.pilot_went()
 
@@ -454,6 +501,8 @@ class ControlSession:
             if not message["mine"]:
                 self._end_flight(NO_CONTROL)
             self._send(message)
+        if self._refused_ns is not None and pilot is not None and pilot.knows_since(self._refused_ns):
+            self.let_go("what it flew was refused")
         if self._awaited is not None and pilot is not None:
             do, states, from_ns = self._awaited
             if do == TakeOff().do and not self._repeated:
@@ -477,12 +526,11 @@ class ControlSession:
         ours = event.kind is EventKind.COMMAND_REFUSED and event.app == self.app
         if ours and self._route is not None and self._route.is_under_way:
             if event.data.get("reason") not in OF_ONE_PACKET:
-                self._route.pause(event.text, hover=False)
-                pilot.hover_if_held()
+                self._stop_when_known(event)
             return
         if ours and self._follow.is_under_way:
             if event.data.get("reason") not in (*OF_ONE_PACKET, Refusal.FOREIGN_LEASE, Refusal.NO_AUTHORITY):
-                self._follow.end(event.text)  # of who has control the authority tells
+                self._stop_when_known(event)  # of who has control the authority tells
             return
         if not ours or self._refused_command == self._commands or event.data.get("reason") in OF_ONE_PACKET:
             return  # its repeats are refused too: nothing new
@@ -490,10 +538,15 @@ class ControlSession:
         self._awaited = None
         self._refuse(self._last_command, event.text)
         if self._place.is_under_way:
-            self._hover()
+            self._stop_when_known(event)
         if self._last_command == TakeOff().do:
             with suppress(SkyloopError):
                 pilot.idle()  # or it would take off, to everybody's surprise, once it can
+
+    def _stop_when_known(self, refusal: Event) -> None:
+        """Fly on no more, and hover as soon as the feedback is newer than the refusal: others may have the vehicle."""
+        self.stand_down(refusal.text)
+        self._refused_ns = refusal.at_ns
 
     def _refuse(self, do: str, why: str) -> None:
         self._send({"type": "refused", "do": do, "n": 0, "why": why})
@@ -517,11 +570,10 @@ class ControlSession:
         """Start work that takes a moment, after what was started before."""
         self._start_job(self._run(command, work))
 
-    def _start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def _start_job(self, work: Coroutine[Any, Any, None]) -> None:
         job = asyncio.create_task(work)
         self._jobs.add(job)
         job.add_done_callback(self._jobs.discard)
-        return job
 
     async def _run(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         try:
@@ -532,3 +584,10 @@ class ControlSession:
                 await work(command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
+
+
+def _decides(command: AnyCommand) -> bool:
+    """Return whether a command flies, or ends a flight."""
+    if isinstance(command, FollowTarget):
+        return command.mode is not None
+    return not isinstance(command, Take | Answer | Write | SelectTarget | Alive)

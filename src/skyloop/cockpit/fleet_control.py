@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 LANDING_S: Final = 60.0  #: as long as a landing is repeated
 BEGIN_S: Final = 2.0  #: a landing for which there is no connection by then is not begun
 _POLL_S: Final = 0.05
-_REPEAT_S: Final = 2.0  # an emergency stop is repeated for at most so long by its connection, which is kept as long
 
 Json = dict[str, Any]
 
@@ -80,9 +79,10 @@ class FleetSession:
         assert command.at_s is not None  # or it would be untimely
         station.pilot_came()
         try:
-            await station.cut_motors(nanoseconds(command.at_s - command.unsure_s + late_s(command)))
-            self._send({"type": "each", **subject, "state": "sent", "why": ""})
-            await asyncio.sleep(_REPEAT_S)
+            until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))
+            sent = {"type": "each", **subject, "state": "sent", "why": ""}
+            await station.stop_motors(until_ns, lambda: self._send(sent))
+            self._send({**sent, "state": "done"})
         finally:
             await station.pilot_went()
 

@@ -22,7 +22,7 @@ from skyloop.control.chase_law import FollowMode
 from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, LinkError, RefusedError, SkyloopError, UnknownNameError
-from skyloop.messages import CameraInfo, FrameHeader, Hover, Value
+from skyloop.messages import CameraInfo, Failsafe, Feedback, FrameHeader, Value
 from skyloop.vision.opencv import opencv
 from skyloop.vision.tracking import Box, checked_box
 
@@ -130,21 +130,20 @@ class FollowSession:
 
         Args:
             command: The page's.
-            held: Returns the connection that holds the authority; called if there is a mode.
+            held: Returns the connection that holds the authority, unless something newer was commanded; called if
+                there is a mode, at the beginning and when all is known.
 
         Raises:
             AuthorityError: There is a mode, and none does.
-            RefusedError: The frame is not kept, or the vehicle is not in the air.
+            RefusedError: The frame is not kept, the vehicle is not in the air, or something newer was commanded.
             UsageError: The box, mode, distance or camera can't be used.
             MissingExtraError: OpenCV is not installed.
         """
         camera = self._camera_info(command.camera)
         settings = _settings(command.distance_m)
-        pilot = None
         if command.mode is not None:
             _check_mode(command.mode)
-            pilot = held()
-            _check_in_air(pilot)
+            _check_in_air(held())
         await asyncio.to_thread(opencv, _WHAT)
         self._limits = await asyncio.to_thread(lambda: dict(self._drone.config.items()))
         keeper = self._keeper
@@ -152,6 +151,7 @@ class FollowSession:
             raise RefusedError(f"no frames of {camera.name} are kept: choose the camera first (follow_select)")
         first = keeper.find(int(command.captured_ns))
         box = checked_box(in_frame(command, first.header), (first.header.height, first.header.width))
+        pilot = None if command.mode is None else held()
         self.end("another target was marked")
         self._keeper = None  # it is the tracker's now
         self._camera, self._mode, self._pilot = camera.name, command.mode or "", pilot
@@ -216,7 +216,7 @@ class FollowSession:
             self._watch.cancel()
             self._watch = None
         if hover and flying and pilot is not None:
-            pilot.hover_if_held()
+            pilot.let_go(why or "following was ended")
         self._tell("ended", why)
         self._report = None
 
@@ -253,16 +253,19 @@ class FollowSession:
         if self._report is not None and self._report.action is not None:
             self._steer(self._report.action)
 
-    def _steer(self, action: AnyAction) -> None:
+    def _steer(self, action: AnyAction | None) -> None:
         """Send a set-point, or hover without new frames; ends with the first thing that goes wrong."""
         pilot = self._pilot
         assert pilot is not None
-        self._waits = self._stopped()
+        waited, self._waits = self._waits, self._stopped() or ("" if action else "the tracker does not report")
         try:
-            _check_in_air(pilot)
-            if self._action is not None and pilot.has_ended(self._action):
+            if _check_in_air(pilot).failsafe is not Failsafe.NONE or (self._action and pilot.has_ended(self._action)):
                 raise RefusedError("it was ended on the way, by a failsafe or a lost link")
-            action = Hover() if self._waits else action
+            if self._waits or action is None:
+                self._action = None
+                if not waited:
+                    pilot.let_go(self._waits)
+                return
             if not pilot.command(action):
                 pilot.idle()  # or it would be done after all when the link is back soon
                 raise LinkError(f"nothing can be sent: the link to the proxy is {pilot.link.application}")
@@ -288,7 +291,7 @@ class FollowSession:
         """Hover if the tracker has not reported for too long: its thread is stuck, or starved."""
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
         if self._clock() - self._reported_ns > nanoseconds(STOPPED_S):
-            self._steer(Hover())
+            self._steer(None)
             self._tell()
 
     # What the page is told -------------------------------------------------------------------------------------
@@ -355,8 +358,13 @@ def _settings(distance_m: float | None) -> ChaseSettings:
     return ChaseSettings() if distance_m is None else ChaseSettings(distance_m=distance_m)
 
 
-def _check_in_air(pilot: PilotConnection) -> None:
-    state = pilot.feedback(max_age_s=OLD_FEEDBACK_S).state
+def _check_in_air(pilot: PilotConnection) -> Feedback:
+    """Return the newest feedback of a vehicle that is in the air, and in nobody else's hands."""
+    feedback = pilot.feedback(max_age_s=OLD_FEEDBACK_S)
+    if feedback.others:
+        raise RefusedError(f"{feedback.others}: hover first to take it over")
+    state = feedback.state
     if state not in UP:
         hint = "" if state.airborne else ": take off first"
         raise RefusedError(f"it can't be flown after a target: it is {state.replace('_', ' ')}{hint}")
+    return feedback

@@ -10,7 +10,7 @@ from skyloop.client.commands import ANSWER_S
 from skyloop.client.completion import OVERRULED
 from skyloop.client.core import DroneCore
 from skyloop.clock import monotonic_ns
-from skyloop.errors import LinkError, RefusedError, SkyloopError
+from skyloop.errors import LinkError, RefusedError
 from skyloop.messages import AnswerTakeover, AnyAction, FlightState, Idle, LinkState, Refused
 from skyloop.transport.base import Dialer
 
@@ -110,11 +110,26 @@ class PilotConnection(Drone):
         outcome = None if newest is None else newest.outcome
         return outcome is not None and outcome.app_id == self.app_id and outcome.intent >= intent
 
-    def hover_if_held(self) -> None:
-        """Hover; if somebody else has the authority, or the link is lost, the proxy sees to it."""
-        with suppress(SkyloopError):
-            if self.authority.state == "held":
-                self.hover()
+    def let_go(self, reason: str, *, land: bool = False) -> bool:
+        """Hover, or land, because the cockpit finds that it has to: the only place where it does so by itself.
+
+        Nobody decided that, so it takes the vehicle from nobody who flies it by other means, and ends neither a landing
+        nor a failsafe. Never raises; if somebody else has the authority, or the link is lost, the proxy sees to it.
+
+        Args:
+            reason: Why, for the log.
+            land: Land, rather than hover.
+
+        Returns:
+            Whether something was sent.
+        """
+        return self._core.let_go(reason, land=land)
+
+    def knows_since(self, at_ns: int) -> bool:
+        """Whether there is feedback from after a time on the proxy's clock."""
+        with suppress(LinkError):
+            return self.feedback().published_ns > at_ns
+        return False
 
     @property
     def is_flying(self) -> bool:

@@ -11,7 +11,7 @@ from skyloop.client.commands import position_action
 from skyloop.client.completion import ReturnWatch
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import RefusedError, SkyloopError
-from skyloop.messages import Feedback, FlightState, Land, Position, ReturnPhase, ReturnToStart
+from skyloop.messages import Feedback, FlightState, Position, ReturnPhase, ReturnToStart
 
 if TYPE_CHECKING:
     from skyloop.cockpit.commands import GoTo
@@ -117,18 +117,19 @@ class PlaceFlight:
 
     async def _watch(self, do: str, pilot: PilotConnection, leg: Leg) -> None:
         try:
-            while not leg.is_over(pilot.feedback(max_age_s=1.0)):
+            while not leg.is_over(feedback := pilot.feedback(max_age_s=1.0)):
+                if feedback.others:
+                    raise RefusedError(feedback.others)
                 if pilot.has_ended(leg.action):
                     raise RefusedError("it was ended on the way, by a failsafe or a lost link")
                 await asyncio.sleep(PERIOD_S)
-            if pilot.feedback().return_phase is ReturnPhase.LANDING:  # which ends by itself from here on
-                pilot.command(Land())
-            elif pilot.feedback().state in UP:
-                pilot.hover()
+            lands = feedback.return_phase is ReturnPhase.LANDING  # which ends by itself from here on
+            if lands or feedback.state in UP:
+                pilot.let_go("it is there", land=lands)
             self._done(do)
         except SkyloopError as error:
             self._refused(do, str(error))
-            pilot.hover_if_held()
+            pilot.let_go(str(error))
         finally:
             if self._job is asyncio.current_task():
                 self._job = None

@@ -104,18 +104,19 @@ class RouteSession:
             if self._action is not None and self._pilot.has_ended(self._action):
                 raise RefusedError("it was ended on the way, by a failsafe or a lost link")
             feedback = self._pilot.feedback(max_age_s=OLD_S)
-            self._carry_out(self.law.update(feedback, feedback.captured_ns))
+            if feedback.others:
+                raise RefusedError(feedback.others)
+            self._carry_out(self.law.update(feedback, feedback.captured_ns), automatic=True)
         except SkyloopError as error:
             self.pause(str(error), hover=False)
-            with suppress(SkyloopError):  # somebody else has it, or the link is lost: then the proxy sees to it
-                self._pilot.hover()
+            self._pilot.let_go(str(error))
 
-    def _carry_out(self, effects: list[Effect], *, send: bool = True) -> None:
+    def _carry_out(self, effects: list[Effect], *, send: bool = True, automatic: bool = False) -> None:
         for effect in effects:
             if isinstance(effect, Command):
                 self._action = effect.action if isinstance(effect.action, Position) else None
                 if send:
-                    self._command(effect.action)
+                    self._command(effect.action, automatic=automatic)
             elif isinstance(effect, TakePhoto):
                 task = asyncio.create_task(self._photograph(effect))
                 self._photos.add(task)
@@ -125,8 +126,11 @@ class RouteSession:
         if effects:
             self._aim(self.law.goal if self.law.is_under_way else None)
 
-    def _command(self, action: Position | Hover | Land) -> None:
+    def _command(self, action: Position | Hover | Land, *, automatic: bool) -> None:
         pilot = self._pilot
+        if automatic and not isinstance(action, Position):  # nobody decides that now
+            pilot.let_go("of its route", land=isinstance(action, Land))
+            return
         if pilot.command(action):
             return
         with suppress(SkyloopError):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from skyloop.clock import monotonic_ns, seconds
 from skyloop.cockpit.broadcast import ROW_HZ, Cancellable, PeriodicBroadcast
@@ -18,7 +19,8 @@ from skyloop.cockpit.small_feed import SmallFeed
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.cockpit.thresholds import ThresholdReader
 from skyloop.control.waypoint import Waypoint
-from skyloop.errors import LinkError, SkyloopError
+from skyloop.errors import LinkError, NoAnswerError, SkyloopError
+from skyloop.messages import FlightState
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -29,7 +31,18 @@ TELEMETRY_HZ: Final = 18.0
 FRESH_S: Final = 0.2  #: for feedback of a vehicle's present state to come
 PILOT_S: Final = 2.0  #: for a pilot's connection to be made
 RECORDINGS: Final = ("replay:", "video:")  #: how addresses of what was recorded begin
+SHOWN_S: Final = 8.0  #: for the vehicle to show that its motors are stopped: as long as the stop may be repeated
 RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
+
+
+class FlyingSession(Protocol):
+    """What a page flies the drone by."""
+
+    def stand_down(self, why: str) -> None:
+        """Command nothing any more."""
+
+    def let_go(self, why: str) -> None:
+        """Hover, if the page has the vehicle under way."""
 
 
 class Station:
@@ -50,6 +63,7 @@ class Station:
         self.streams: dict[tuple[str, Form], EncodedFeed] = {}  #: as H.264, by camera and form
         self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by the name of the application that does
         self.routes = CheckedRoutes()
+        self.sessions: set[FlyingSession] = set()  #: of pages that may fly it
         self.pilots: set[PilotConnection] = set()  #: pilots' connections of pages
         self.thresholds = ThresholdReader(drone)
         self.view = TelemetryView(self)
@@ -58,6 +72,7 @@ class Station:
         self._whole: Cancellable | None = None  # a consumer of all feedback, while a page shows it
         self._stopper: asyncio.Task[PilotConnection] | None = None
         self._may_stop = 0
+        self._stops = 0  # emergency stops under way
         self._names: list[str] = []  # of streams for one page each, that are not in use
         self._named = 0
 
@@ -190,28 +205,49 @@ class Station:
             self._stopper = asyncio.create_task(self.open_pilot("cockpit stop"))
         return await asyncio.shield(self._stopper)
 
-    async def cut_motors(self, until_ns: int, pilot: PilotConnection | None = None) -> None:
-        """Send an emergency stop, trying until a time.
+    async def stop_motors(self, until_ns: int, sent: Callable[[], None]) -> None:
+        """Stop the motors, over the connection that nothing else uses; no page flies the vehicle meanwhile.
 
         Args:
-            until_ns: The time, on this process's monotonic clock.
-            pilot: The connection to send it by; None for the one that is kept for it.
+            until_ns: Until when it may be sent for the first time, on this process's monotonic clock.
+            sent: Called when it was sent.
 
         Raises:
             LinkError: It was not sent, and never will be.
+            NoAnswerError: The vehicle does not show within :data:`SHOWN_S` that its motors are stopped.
             UnsupportedError: The vehicle has no emergency stop.
         """
+        self._stops += 1
+        for session in self.sessions:
+            session.stand_down("the motors were stopped")
+        try:
+            stopper = await self._send_stop(until_ns)
+            sent()
+            await asyncio.to_thread(_wait_until_stopped, stopper, stopper.now_ns)
+        except SkyloopError:
+            for session in self.sessions:  # what it flew is not flown any more
+                session.let_go("the emergency stop does not show")
+            raise
+        finally:
+            self._stops -= 1
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether an emergency stop is under way, which the vehicle does not show yet."""
+        return self._stops > 0
+
+    async def _send_stop(self, until_ns: int) -> PilotConnection:
         why = "the proxy does not answer"
         while (left_s := seconds(until_ns - monotonic_ns())) > 0:
             try:
-                using = pilot if pilot is not None else await asyncio.wait_for(self.stopper(), left_s)
+                stopper = await asyncio.wait_for(self.stopper(), left_s)
                 if monotonic_ns() > until_ns:
                     break
-                if using.emergency_stop():
-                    return
-                why = f"the link to the proxy is {using.link.application}"
+                if stopper.emergency_stop():
+                    return stopper
+                why = f"the link to the proxy is {stopper.link.application}"
                 with suppress(SkyloopError):
-                    using.idle()  # or it would be sent whenever the link is back: it is tried again here instead
+                    stopper.idle()  # or it would be sent whenever the link is back: it is tried again here instead
             except LinkError as error:
                 why = str(error)
             except TimeoutError:
@@ -237,6 +273,17 @@ class Station:
         await asyncio.gather(stopper, return_exceptions=True)
         if not stopper.cancelled() and stopper.exception() is None:
             await self.close_pilot(stopper.result())
+
+
+def _wait_until_stopped(stopper: PilotConnection, from_ns: int) -> None:
+    def shows(feedback: Feedback) -> bool:
+        return feedback.captured_ns >= from_ns and feedback.state is FlightState.EMERGENCY
+
+    try:
+        stopper.wait(shows, SHOWN_S)
+    except NoAnswerError:
+        why = f"the vehicle has not shown for {SHOWN_S:g} s that its motors are stopped: stop them again, or land it"
+        raise NoAnswerError(why) from None
 
 
 def _nothing(_: Feedback) -> None:

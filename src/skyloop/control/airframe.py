@@ -15,15 +15,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.clock import seconds
+from skyloop.clock import nanoseconds, seconds
 from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped
 from skyloop.messages import Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler, wrap_angle
@@ -110,10 +110,8 @@ class Airframe:
         self.by_tilt = False
         self.interruptions = 0
         self._needs = needs
-        self._known_ns: dict[Part, int] = {}
+        self._known: dict[Part, tuple[int, Any]] = {}  # when, and what
         self._history: deque[Motion] = deque()
-        self._altitude: float | None = None
-        self._position: Vector | None = None
         self._reckoning = TiltVelocity()
         self._tilts: deque[tuple[int, float, float]] = deque()
 
@@ -121,10 +119,13 @@ class Airframe:
         """Update with the next sample; one that is not newer than the last is ignored.
 
         Args:
-            feedback: Numbers in it that are not finite count as missing.
+            feedback: Numbers in it that are not finite count as missing. One that is older by seconds begins anew: the
+                one before was stamped ahead, or the proxy's clock was set back.
         """
         at_ns = feedback.captured_ns
-        if self.feedback is not None and at_ns <= self.feedback.captured_ns:
+        if self.feedback is not None and seconds(self.feedback.captured_ns - at_ns) > _HISTORY_S:
+            self._begin_anew(at_ns)
+        elif self.feedback is not None and at_ns <= self.feedback.captured_ns:
             return
         self.feedback = feedback = _finite(feedback)
         roll, pitch, yaw = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
@@ -133,35 +134,42 @@ class Airframe:
             while seconds(at_ns - self._tilts[0][0]) > _TILTING_S:
                 self._tilts.popleft()
         if yaw is not None:
-            self._known_ns[Part.YAW] = at_ns
+            self._known[Part.YAW] = at_ns, yaw
             if roll is not None and pitch is not None:
-                self._known_ns[Part.ATTITUDE] = at_ns
+                self._known[Part.ATTITUDE] = at_ns, (roll, pitch, yaw)
             velocity = self._reckoning.step(feedback) if self.by_tilt else feedback.velocity_m_s
             if velocity is not None:
-                self._known_ns[Part.VELOCITY] = at_ns
+                self._known[Part.VELOCITY] = at_ns, velocity
                 self._integrate(feedback, velocity, yaw)
         if feedback.altitude_m is not None:
-            self._known_ns[Part.HEIGHT], self._altitude = at_ns, feedback.altitude_m
+            self._known[Part.HEIGHT] = at_ns, feedback.altitude_m
         if feedback.position_m is not None:
-            self._known_ns[Part.POSITION], self._position = at_ns, feedback.position_m
+            self._known[Part.POSITION] = at_ns, feedback.position_m
 
     def age_s(self, part: Part, now_ns: int) -> float:
         """Return how long ago a part of the motion was reported [s]; infinite if it never was."""
-        known_ns = self._known_ns.get(part)
-        return math.inf if known_ns is None else seconds(now_ns - known_ns)
+        known = self._known.get(part)
+        return math.inf if known is None else seconds(now_ns - known[0])
 
     def missing(self, now_ns: int) -> str:
         """Return what of the needed parts is not known now, as a sentence; empty if nothing is missing."""
-        old = [part.value for part in self._needs if self.age_s(part, now_ns) > STALE_S]
+        old = [part.value for part in self._needs if abs(self.age_s(part, now_ns)) > STALE_S]
         return f"the vehicle's {' and '.join(old)} {'is' if len(old) == 1 else 'are'} not known" if old else ""
 
     def altitude_m(self, now_ns: int) -> float | None:
         """Return the newest height above the ground [m]; None while it is not known."""
-        return self._altitude if self.age_s(Part.HEIGHT, now_ns) <= STALE_S else None
+        altitude: float | None = self._newest(Part.HEIGHT, now_ns)
+        return altitude
 
-    def position_m(self, now_ns: int) -> Vector | None:
-        """Return the newest position in world axes [m]; None while it is not known."""
-        return self._position if self.age_s(Part.POSITION, now_ns) <= STALE_S else None
+    def yaw_rad(self, now_ns: int) -> float | None:
+        """Return the newest yaw [rad]; None while it is not known."""
+        yaw: float | None = self._newest(Part.YAW, now_ns)
+        return yaw
+
+    def position_m(self, now_ns: int, *, longest_s: float = STALE_S) -> Vector | None:
+        """Return the newest position in world axes [m]; None if it was not reported for longer than ``longest_s``."""
+        position: Vector | None = self._newest(Part.POSITION, now_ns, longest_s)
+        return position
 
     @property
     def newest(self) -> Motion | None:
@@ -205,6 +213,19 @@ class Airframe:
             return 0.0
         _, rolls, pitches = zip(*self._tilts, strict=True)
         return math.hypot(max(rolls) - min(rolls), max(pitches) - min(pitches)) / (_TILTING_S / 2)
+
+    def _newest(self, part: Part, now_ns: int, longest_s: float = STALE_S) -> Any:
+        return self._known[part][1] if abs(self.age_s(part, now_ns)) <= longest_s and part in self._known else None
+
+    def _begin_anew(self, at_ns: int) -> None:
+        """Keep nothing but where it was last: in odometry axes it is somewhere near that."""
+        self._known.clear()
+        self._tilts.clear()
+        self._reckoning = TiltVelocity()
+        if self._history:
+            before = replace(self._history[-1], at_ns=at_ns - nanoseconds(STALE_S))
+            self._history = deque([before])
+            self.interruptions += 1
 
     def _integrate(self, feedback: Feedback, levelled: Vector, yaw: float) -> None:
         last, at_ns = self.newest, feedback.captured_ns
@@ -293,10 +314,10 @@ class AirframeLaw:
         """Forget what was noted in odometry axes, because the motion was interrupted."""
 
     def _ready(self, now_ns: int) -> bool:
-        """Whether all is known that the law needs; else it pauses."""
+        """Whether all is known that the law needs. Else it pauses, and where its last set-point was long ago."""
         self.problem = self.airframe.missing(now_ns)
         self._altitude = self.airframe.altitude_m(now_ns)
-        if self.problem:
+        if self.problem or (self._last_ns is not None and seconds(now_ns - self._last_ns) > STALE_S):
             self.pause()
         return not self.problem
 

@@ -8,7 +8,7 @@ cross-entropy", FUZZ-IEEE 2012. Here the rules take its bearing and apparent wid
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -104,11 +104,11 @@ class AvoidLaw(VelocityLaw):
         """Update with the obstacles that are in a frame.
 
         Args:
-            seen: The widest first; empty if there are none.
+            seen: The widest first; empty if there are none. One with an edge that is no number counts as close.
             captured_ns: Capture of the frame.
         """
-        self._seen = seen
-        for one in seen:
+        self._seen = [self._placed(one) for one in seen]
+        for one in self._seen:
             if one.width_rad > self.settings.avoiding_rad and abs(one.bearing_rad) > 0.25:
                 self._beside[math.copysign(1.0, one.bearing_rad)] = captured_ns
 
@@ -130,6 +130,14 @@ class AvoidLaw(VelocityLaw):
         wanted = np.array([s.speed_m_s * share, s.aside_m_s * aside])
         turn = clamped(s.yaw_gain * wrap_angle(self._yaw - motion.yaw), 1.0)
         return np.array([*wanted, -0.8 * way[2], turn])
+
+    def _placed(self, one: BlobSighting) -> BlobSighting:
+        """Return what is seen as it is, or, where the lens can't tell all of it, as wide as what is close."""
+        edges = [edge for edge in (one.left_rad, one.right_rad) if math.isfinite(edge)]
+        if len(edges) == 2:
+            return one
+        at, half = (edges or [0.0])[0], self.settings.close_rad / 2
+        return replace(one, left_rad=at + half, right_rad=at - half)
 
     def _share(self) -> float:
         """Return the share of the speed ahead: the wider an obstacle ahead looks, the less."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 from skyloop.clock import nanoseconds
 from skyloop.control.airframe import AirframeLaw
 from skyloop.control.controller import Controller
-from skyloop.errors import AuthorityError, UnknownNameError, UsageError
+from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Attitude, CameraInfo, EventKind, Feedback, Severity, Velocity
 from skyloop.messages.annotation import Shape
 
@@ -114,24 +114,22 @@ class Behaviour(Controller):
             now_ns: On the proxy's clock.
         """
         law = self._law
+        known = law.airframe.feedback if isinstance(law, AirframeLaw) else None
+        if isinstance(law, AirframeLaw) and known is not None and self._is_overruled(known):
+            law.pause()
         wanted = law.step(now_ns)
         self._report_phase()
         if self.done:
             return
-        problem = law.problem if isinstance(law, AirframeLaw) and law.airframe.feedback is not None else ""
+        problem = law.problem if isinstance(law, AirframeLaw) and known is not None else ""
         if problem != self.problem:
             self.problem = problem
             text = f"{problem}: hovering" if problem else "the vehicle's motion is known again: flying on"
             self.emit(text, Severity.WARNING if problem else Severity.INFO)
-        try:
-            if problem:
-                self.drone._core.let_go(problem)
-            else:
-                self.steer(wanted)
-        except AuthorityError:
-            if isinstance(law, AirframeLaw):
-                law.pause()  # others fly it now
-            raise
+        if problem:
+            self.drone._core.let_go(problem)
+        else:
+            self.steer(wanted)
 
     def steer(self, wanted: Velocity | Attitude) -> None:
         """Send a set-point to the vehicle.

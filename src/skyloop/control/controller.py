@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.errors import AuthorityError, ClosedError, UsageError
-from skyloop.messages import LinkState
+from skyloop.messages import Failsafe, LinkState
 
 if TYPE_CHECKING:
     from skyloop.client import AuthorityStatus, Drone, Frame
@@ -118,6 +118,10 @@ class Controller:
         inbox = self._inbox
         if inbox is not None:
             inbox.notifier.notify()
+
+    def _is_overruled(self, feedback: Feedback) -> bool:
+        """Whether set-points have no effect: another client, another controller or a failsafe has the vehicle."""
+        return self.drone.authority.state != "held" or bool(feedback.others) or feedback.failsafe is not Failsafe.NONE
 
     def _end(self) -> None:
         """Stop for good: a later :meth:`run` returns at once."""

@@ -199,17 +199,21 @@ def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
     return nearest
 
 
-def kept_apart(velocities: ArrayLike, positions: ArrayLike, apart_m: float, gain: float = 1.0) -> Places:
+def kept_apart(
+    velocities: ArrayLike, positions: ArrayLike, apart_m: float, gain: float = 1.0, *, fixed: int = 0
+) -> Places:
     """Change velocities so that drones closer than ``apart_m`` part.
 
     Along the line between two of them the velocities become such that the distance grows by ``gain`` times what is
-    missing; both give way by half. The components across that line stay.
+    missing; both give way by half. Who meets one that does not give way gives way alone, and comes no faster than
+    ``gain`` times what is left up to ``apart_m``. The components across that line stay.
 
     Args:
         velocities: Shape (n, 3), world axes [m/s].
         positions: Shape (n, 3), world axes [m].
         apart_m: The least distance.
         gain: [1/s]
+        fixed: How many, the last ones, fly as they do: others fly them.
 
     Returns:
         The changed velocities, shape (n, 3).
@@ -218,17 +222,20 @@ def kept_apart(velocities: ArrayLike, positions: ArrayLike, apart_m: float, gain
         UsageError: A number is not finite, or the shape is not (n, 3).
     """
     changed, at = places(velocities).copy(), places(positions)
-    for i in range(len(at)):
-        for j in range(i + 1, len(at)):
+    free = len(at) - fixed
+    # Those that give way to nobody come last, so that nothing undoes what they ask for.
+    for j in range(1, len(at)):
+        for i in range(min(j, free)):
             between = at[i] - at[j]
             distance = float(np.linalg.norm(between))
-            if distance >= apart_m:
+            if distance >= apart_m and j < free:
                 continue
             away = between / distance if distance > 1e-6 else np.array([1.0, 0.0, 0.0])
             missing = gain * (apart_m - distance) - float((changed[i] - changed[j]) @ away)
             if missing > 0.0:
-                changed[i] += 0.5 * missing * away
-                changed[j] -= 0.5 * missing * away
+                share = 0.5 if j < free else 1.0
+                changed[i] += share * missing * away
+                changed[j] -= (1.0 - share) * missing * away
     return changed
 
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from msgspec.structs import replace as replace_fields
 from numpy.typing import ArrayLike, NDArray
 
+from skyloop.control.airframe import STALE_S, Airframe, Part
 from skyloop.control.formation import Places, assign, closest_approach, kept_apart, places, solver
 from skyloop.control.limiting import within
 from skyloop.control.waypoint import Waypoint, WaypointSettings, lacking, reached, velocity_to
-from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
-from skyloop.messages import AnyAction, Feedback, Vector, Velocity
+from skyloop.errors import NoAnswerError, SkyloopError, UnknownNameError, UsageError
+from skyloop.messages import AnyAction, Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler
 
 if TYPE_CHECKING:
@@ -40,8 +43,9 @@ class FormationReport:
 class Formation:
     """Flies the active drones of a swarm in formation, on the calling thread.
 
-    Each drone must be airborne and report position and yaw. Drones that fail on the way are handled as ``on_error`` of
-    the swarm decides.
+    Each drone must be airborne and report position and yaw. Drones that fail on the way, as by a position that is not
+    known for half a second, are handled as ``on_error`` of the swarm decides. All others keep clear of them, and of
+    every drone of the swarm that this flight does not steer, where it was seen last.
 
     Attributes:
         drones: The swarm.
@@ -72,6 +76,7 @@ class Formation:
         self._rate_hz = rate_hz
         self._settings = settings or WaypointSettings()
         self._closest_m = math.inf
+        self._airframes = {name: Airframe(Part.POSITION, Part.YAW) for name in drones.names}
 
     def middle(self) -> Vector:
         """Return the mean of the drones' positions, world axes [m].
@@ -114,11 +119,11 @@ class Formation:
         elapsed_s = 0.0
         for tick in self.drones.ticks(self._rate_hz, limit_s):
             elapsed_s = tick.elapsed_s
-            now = {name: sample for name, sample in self._look().items() if name in ways}
+            now, others = self._look(ways)
             along, speed = _minimum_jerk(elapsed_s / planned_s)
             goal = {name: _waypoint(a + along * (b - a), yaw) for name, (a, b) in ways.items() if name in now}
             drift = {name: speed / planned_s * (ways[name][1] - ways[name][0]) for name in now}
-            self._steer(now, goal, drift)
+            self._steer(now, goal, drift, others)
             if along >= 1.0 and all(reached(goal[name], now[name], self._settings) for name in now):
                 break
         self.drones.hover()
@@ -137,8 +142,8 @@ class Formation:
         here = {name: np.array(sample.position_m) for name, sample in self._ready().items()}
         still = np.zeros(3)
         for _ in self.drones.ticks(self._rate_hz, seconds):
-            now = {name: sample for name, sample in self._look().items() if name in here}
-            self._steer(now, {name: _waypoint(here[name], None) for name in now}, dict.fromkeys(now, still))
+            now, others = self._look(here)
+            self._steer(now, {name: _waypoint(here[name], None) for name in now}, dict.fromkeys(now, still), others)
         return self._report(here, seconds)
 
     def follow(
@@ -176,29 +181,51 @@ class Formation:
         self._ready()
         slots: dict[str, NDArray[np.float64]] = {}
         for tick in self.drones.ticks(self._rate_hz, seconds):
-            now = self._look()
+            now, others = self._look({leader, *wanted})
             if leader not in now:
                 break
-            first = now[leader]
+            first = now.pop(leader)
             slots = {name: station(first, wanted[name], turn=turn) for name in wanted if name in now}
             goals = {name: _waypoint(slot, first.yaw_rad if turn else None) for name, slot in slots.items()}
             drift = dict.fromkeys(goals, _world_velocity(first))
-            followers = {name: now[name] for name in goals}
-            self._steer(
-                followers, goals, drift, fixed={leader: first}, also={} if lead is None else {leader: lead(tick)}
-            )
+            self._steer(now, goals, drift, {leader: first, **others}, also={} if lead is None else {leader: lead(tick)})
         self.drones.hover()
         return self._report(slots, seconds)
 
     # Inside ----------------------------------------------------------------------------------------------------
 
-    def _look(self) -> dict[str, Feedback]:
-        return self.drones.feedback(max_age_s=MAX_AGE_S)
+    def _look(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
+        """Return the newest state of those that are flown, and of all others in the air, where they were seen last.
+
+        One that is flown and whose position is not known any more has failed; then it is one of the others.
+        """
+        active, errors = self.drones.feedback(max_age_s=MAX_AGE_S), {}
+        for name, sample in active.items():
+            self._airframes[name].add(sample)
+            problem = self._airframes[name].missing(sample.captured_ns)
+            if problem and name in flown:
+                errors[name] = NoAnswerError(problem)
+        self.drones.fail("flying in formation", errors)
+        now, others = {}, {}
+        for name, drone in self.drones.items():
+            airframe = self._airframes[name]
+            if name in active and name in flown and name not in errors:
+                now[name] = _carried_on(airframe)
+                continue
+            heard = False
+            with suppress(SkyloopError):
+                airframe.add(drone.feedback(max_age_s=MAX_AGE_S))
+                heard = True
+            if airframe.feedback is not None and airframe.feedback.state is not FlightState.LANDED:
+                last = _carried_on(airframe)
+                if last.position_m is not None:  # kept clear of, also where nothing is heard of it any more
+                    others[name] = last if heard else replace_fields(last, velocity_m_s=None)
+        return now, others
 
     def _ready(self) -> dict[str, Feedback]:
         """Return the newest feedback of each drone; raise UsageError naming those that can't be flown by position."""
         self._closest_m = math.inf
-        found = self._look()
+        found = self.drones.feedback(max_age_s=MAX_AGE_S)
         if not found:
             aside = "; ".join(f"{name}: {error}" for name, error in self.drones.errors.items())
             raise UsageError(f"no drone of this swarm is active ({aside}): take them back with readmit()")
@@ -225,19 +252,18 @@ class Formation:
         now: Mapping[str, Feedback],
         goals: Mapping[str, Waypoint],
         drift: Mapping[str, NDArray[np.float64]],
+        others: Mapping[str, Feedback],
         *,
-        fixed: Mapping[str, Feedback] | None = None,
         also: Mapping[str, AnyAction] | None = None,
     ) -> None:
-        """Send each drone towards its goal, which moves by ``drift`` [m/s]; ``fixed``: others to keep away from."""
+        """Send each drone towards its goal, which moves by ``drift`` [m/s], and clear of the others."""
         towards = {name: velocity_to(goals[name], now[name], self._settings) for name in now}
-        others = fixed or {}
         positions = _positions({**now, **others})
         wanted = [_turned(towards[name], now[name], 1.0) + drift[name] for name in now]
         wanted += [_world_velocity(sample) for sample in others.values()]
         if len(positions) > 1:
             self._closest_m = min(self._closest_m, closest_approach(positions, positions).distance_m)
-        steered = kept_apart(np.array(wanted).reshape(-1, 3), positions, self.apart_m)
+        steered = kept_apart(np.array(wanted).reshape(-1, 3), positions, self.apart_m, fixed=len(others))
         actions: dict[str, AnyAction] = {
             name: _command(steered[k], now[name], towards[name].yaw_rate) for k, name in enumerate(now)
         }
@@ -245,7 +271,7 @@ class Formation:
 
     def _arrived(self, goals: Mapping[str, NDArray[np.float64]], yaw: float | None, seconds: float) -> FormationReport:
         report = self._report(goals, seconds)
-        now = self._look()
+        now, _ = self._look(goals)
         late = {
             name: NoAnswerError(f"it is {report.errors_m[name]:.2f} m from its place after {seconds:.1f} s")
             for name in report.errors_m
@@ -260,7 +286,7 @@ class Formation:
         return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
 
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
-        now = self._look()
+        now, _ = self._look(goals)
         slots = {name: _vector(goal) for name, goal in goals.items()}
         errors = {name: math.dist(slots[name], now[name].position_m or slots[name]) for name in slots if name in now}
         spread = self.drones.spread
@@ -287,6 +313,19 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
     relative = _offset(offset)
     turned = rotation_from_euler(0.0, 0.0, leader.yaw_rad) @ relative if turn else relative
     return np.asarray(leader.position_m + turned, dtype=np.float64)
+
+
+def _carried_on(airframe: Airframe) -> Feedback:
+    """Return a drone's newest feedback, with its last position carried on, and its last yaw, where it has none."""
+    sample = airframe.feedback
+    assert sample is not None, "nobody asks before there is any"
+    now_ns = sample.captured_ns
+    sample = replace_fields(sample, yaw_rad=airframe.yaw_rad(now_ns))
+    position = airframe.position_m(now_ns, longest_s=math.inf)
+    if position is not None:
+        blind_s = within(airframe.age_s(Part.POSITION, now_ns), 0.0, STALE_S)
+        position = _vector(position + blind_s * _world_velocity(sample))
+    return replace_fields(sample, position_m=position)
 
 
 def _minimum_jerk(share: float) -> tuple[float, float]:
@@ -321,7 +360,9 @@ def _turned(velocity: Velocity, sample: Feedback, way: float) -> NDArray[np.floa
 
 
 def _world_velocity(sample: Feedback) -> NDArray[np.float64]:
-    """Return the reported velocity in world axes; zero for a drone that does not report it."""
+    """Return the reported velocity in world axes; zero for a drone that does not report it, or not its yaw."""
+    if sample.yaw_rad is None:
+        return np.zeros(3)
     return _turned(Velocity(*(sample.velocity_m_s or (0.0, 0.0, 0.0))), sample, 1.0)
 
 

@@ -26,8 +26,8 @@ class LandOnMarker(Behaviour):
     A marker that is lost on the way makes the vehicle climb where the marker must be, then search. Low over the marker,
     where it no longer fits into the image, the vehicle descends by the marker's predicted motion; it aborts and tries
     again where it would miss. After too many aborted attempts, or too long a time, it climbs to a safe height, hovers
-    there, and :meth:`run` returns with :attr:`landed` false. The vehicle must be airborne when :meth:`run` is called;
-    a :meth:`run` that ends earlier leaves it hovering where it is.
+    there, and :meth:`run` returns with :attr:`landed` false; so it does where others land the vehicle. The vehicle must
+    be airborne when :meth:`run` is called; a :meth:`run` that ends earlier leaves it hovering where it is.
 
     Attributes:
         marker_id: Which marker.
@@ -67,6 +67,7 @@ class LandOnMarker(Behaviour):
         self._landing_law = LandingLaw((settings or LandingSettings()).within(limits))
         self._detector = MarkerDetector(dictionary, size_m)
         self.marker_id = marker_id
+        self._flew = False
         super().__init__(drone, self._landing_law, camera)
 
     @property
@@ -81,12 +82,15 @@ class LandOnMarker(Behaviour):
 
     def on_feedback(self, feedback: Feedback) -> None:
         """Update the law and send its set-point; once it is down, wait until the vehicle reports that it has landed."""
-        if self.phase is LandingPhase.DOWN:
+        self._flew = self._flew or feedback.state.airborne
+        down = self.phase is LandingPhase.DOWN
+        if self._flew and feedback.state is FlightState.LANDED and not self.done:
+            self.done = True
+            text = "standing on the marker" if down else "the vehicle was landed, and not by this behaviour"
+            self.emit(text, Severity.INFO if down else Severity.WARNING)
+            self._end()
+        if down or self.done:
             self._landing_law.feedback(feedback)  # others may take over and fly it from here
-            if feedback.state is FlightState.LANDED and not self.done:
-                self.done = True
-                self.emit("standing on the marker")
-                self._end()
             return
         super().on_feedback(feedback)
         if self._frame_ns is not None and not self.blind and not self.done:

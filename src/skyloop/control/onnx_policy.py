@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import nanoseconds, seconds
+from skyloop.control.airframe import STALE_S
 from skyloop.control.behaviour import BLIND_S, Behaviour
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.messages import Attitude, Feedback, Text, Velocity
@@ -229,7 +230,8 @@ class OnnxPolicy(Behaviour):
     """Flies by a learnt policy: with each frame, its network computes a set-point from the picture and the state.
 
     Limits, zones and failsafe of the proxy hold as for any application. It hovers, and says so in an event, when frames
-    stop, when the drone does not know a number of the state that the network takes, and when the action is not finite.
+    stop, when the drone does not know a number of the state that the network takes, or did not for half a second, and
+    when the action is not finite.
     A network that remembers starts anew after each of these.
     The vehicle must be airborne when :meth:`run` is called. All callbacks run on the thread that called it.
     """
@@ -280,7 +282,8 @@ class OnnxPolicy(Behaviour):
             self.network.forget()
         self._looked_at_ns = frame.captured_ns
         believed = frame.feedback
-        row = None if believed is None else state_row(believed, self.network.state)
+        old = believed is None or seconds(frame.captured_ns - believed.captured_ns) > STALE_S
+        row = None if believed is None or (old and self.network.state) else state_row(believed, self.network.state)
         if row is None:
             self._phase, self._newest.wanted = PolicyPhase.NO_STATE, Velocity()
             self.network.forget()

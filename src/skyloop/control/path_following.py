@@ -17,8 +17,8 @@ from skyloop.control.path import Path, Polyline
 from skyloop.control.path_law import PathLaw, PathSettings
 from skyloop.control.position import Fix, PositionSource, fix_of
 from skyloop.control.waypoint import Waypoint, lacking
-from skyloop.errors import AuthorityError, UsageError
-from skyloop.messages import EventKind, Feedback, Severity, Vector, Velocity
+from skyloop.errors import UsageError
+from skyloop.messages import EventKind, Feedback, Severity, Vector
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -88,7 +88,7 @@ class _PathFlyer(Controller):
         fix = fix_of(feedback) if self._source is None else self._source()
         if self._source is None and fix is None and self._law is None:
             raise UsageError(f"it can't fly a path: {lacking(feedback)}; or give the controller a source of positions")
-        if fix is None or not fix.finite or feedback.captured_ns - fix.at_ns > self._max_age_ns:
+        if fix is None or not fix.finite or abs(feedback.captured_ns - fix.at_ns) > self._max_age_ns:
             self._lose()
             return
         if self.lost:
@@ -96,10 +96,12 @@ class _PathFlyer(Controller):
             self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is known again: flying on", Severity.INFO)
         if self._law is None:
             self._law = self._begin(fix)
+        if self._is_overruled(feedback):
+            self._law.pause()
         wanted = self._law.step(fix)
         self._look(self._law, fix)
         if not self.done:
-            self._send(wanted)
+            self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def _begin(self, fix: Fix) -> PathLaw:
         """Return the law for the first fix."""
@@ -121,15 +123,6 @@ class _PathFlyer(Controller):
         if self._law is not None:
             self._law.pause()
         self.drone._core.let_go("the position is not known")
-
-    def _send(self, action: Velocity) -> None:
-        """Send a set-point; while others have the authority the law pauses."""
-        try:
-            self.drone.command(action)
-        except AuthorityError:
-            if self._law is not None:
-                self._law.pause()
-            raise
 
 
 class FollowPath(_PathFlyer):

@@ -28,7 +28,7 @@ from skyloop.messages.geometry import wrap_angle
 Array = NDArray[np.float64]
 _LONGEST_STEP_S = 0.5  # a longer gap between two fixes does not move the path on by more
 _MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
-_SHARE = 0.5  # of the greatest speed, for the integral at most: there is no wind to fly against beyond that
+_SHARE = 0.6  # of the greatest speed, for the integral at most: there is no wind to fly against beyond that
 _AHEAD_S = 0.1  # interval over which the rate of the wanted yaw is computed
 
 

@@ -237,6 +237,7 @@ class TargetFollower(AirframeLaw):
         """
         if not self._ready(now_ns):
             return Attitude() if self._relative else Velocity()
+        self._since_s(now_ns)
         finder = self._finder
         return self._law.step(
             now_ns,

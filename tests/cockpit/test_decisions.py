@@ -1,0 +1,233 @@
+"""What a page commanded last counts; and the cockpit takes a drone from nobody by itself."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from skyloop.client.parameters import Config
+from skyloop.cockpit.commands import LATE_S, UNTOUCHED_S, Fly, HandWatch
+from skyloop.cockpit.fleet import Fleet
+from skyloop.messages import Failsafe, FlightState, Hover, Land, Position, Velocity
+from tests.cockpit.fake import ORIGIN, Node, Nodes, cockpit, until
+from tests.cockpit.follower import StandIns
+from tests.cockpit.test_control import Page, count, page
+from tests.cockpit.test_follow import BOX, FORWARD, Marker
+from tests.cockpit.testclient import TestClient
+
+FAR = {"name": "far", "speed": 1.0, "waypoints": [{"x": 30.0, "y": 0.0, "z": 1.0}]}
+
+
+@pytest.fixture
+def client(node: Node) -> Iterator[TestClient]:
+    with cockpit(Fleet(Nodes(node), look_s=0.05), follower=StandIns()) as client:
+        client.headers.update(ORIGIN)
+        yield client
+
+
+@contextmanager
+def slow_parameters(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+    """The list of parameters takes as long as a network wants; called: until it was asked for."""
+    asked, go_on = threading.Event(), threading.Event()
+
+    def slow(real: Callable[[Config], object]) -> Callable[[Config], object]:
+        def read(config: Config) -> object:
+            asked.set()
+            go_on.wait(5)
+            return real(config)
+
+        return read
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Config, "items", slow(Config.items))
+        patch.setattr(Config, "parameters", slow(Config.parameters))
+
+        def until_asked() -> None:
+            assert asked.wait(5)
+
+        try:
+            yield until_asked
+            go_on.set()
+        finally:
+            go_on.set()
+
+
+@pytest.mark.parametrize("newer", ["hover", "land", "fly"])
+def test_a_flight_after_a_target_that_waits_for_answers_does_not_override_what_was_pressed_since(
+    client: TestClient, node: Node, newer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A landing was broken off by a target that was marked before it."""
+    with page(client) as first:
+        pilot = Marker(first)
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.select()
+            with slow_parameters(monkeypatch) as until_asked:
+                pilot.say("follow", camera="front", captured_ns=str(pilot.since_ns), box=BOX, mode="follow")
+                until_asked()
+                pilot.say(newer)
+                if newer == "fly":
+                    until(lambda: count(node, Velocity()))
+                else:
+                    pilot.wait("sent", do=newer)
+            assert "commanded meanwhile" in pilot.wait("refused", do="follow")["why"]
+            assert not count(node, FORWARD)
+
+
+@pytest.mark.parametrize("newer", ["hover", "land", "goto"])
+def test_a_route_that_is_still_checked_does_not_override_what_was_pressed_since(
+    client: TestClient, node: Node, newer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        number = client.post("/api/drones/alpha/route/check", json=FAR).json()["id"]
+        with pilot.staying():
+            with slow_parameters(monkeypatch) as until_asked:
+                pilot.say("route", id=number)
+                until_asked()
+                pilot.say(newer, **({"x": 0.1, "y": 0.0, "z": 0.3} if newer == "goto" else {}))
+                pilot.wait("sent", do=newer)
+            why = pilot.wait("refused", do="route")["why"]
+            assert "commanded meanwhile" in why
+            assert node.flyer.place[0] < 1.0
+
+
+def test_a_page_that_was_away_meanwhile_flies_no_route(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        number = client.post("/api/drones/alpha/route/check", json=FAR).json()["id"]
+        with slow_parameters(monkeypatch) as until_asked:
+            pilot.say("route", id=number)
+            until_asked()
+            pilot.say("hover", automatic=True)
+            pilot.wait("sent", do="hover")
+        assert "the page was away" in pilot.wait("refused", do="route")["why"]
+
+
+# What nobody decides ----------------------------------------------------------------------------------------------
+
+
+def go_to(client: TestClient, pilot: Page) -> None:
+    pilot.say("goto", x=30, y=0, z=1)
+
+
+def fly_a_route(client: TestClient, pilot: Page) -> None:
+    number = client.post("/api/drones/alpha/route/check", json=FAR).json()["id"]
+    pilot.say("route", id=number)
+
+
+def follow(client: TestClient, pilot: Page) -> None:
+    marker = Marker(pilot)
+    marker.mark(mode="follow")
+
+
+def steer(client: TestClient, pilot: Page) -> None:
+    pilot.say("fly", forward=0.4)
+
+
+FLIGHTS = pytest.mark.parametrize("begin", [go_to, fly_a_route, follow, steer])
+
+
+@FLIGHTS
+@pytest.mark.parametrize("leaves", [False, True])
+def test_a_safety_pilot_who_chooses_another_mode_keeps_the_drone(
+    client: TestClient, node: Node, begin: Callable[[TestClient, Page], None], *, leaves: bool
+) -> None:
+    """The page's go-to, route, and the page that was closed took it back 0.6 s later by a hover of their own."""
+    with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
+        pilot.take().take_off()
+        with pilot.staying():
+            begin(client, pilot)
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            node.flyer.others = "RTL"
+            watcher.wait(lambda feedback: feedback.others is not None, 5)
+            if begin is steer:
+                pilot.say("hover", automatic=True)  # the page's sticks are let go
+                pilot.wait("sent", do="hover")
+            if not leaves:
+                begun_s = time.monotonic()
+                watcher.wait(lambda _: time.monotonic() - begun_s > 1.0, 5)
+    if leaves:
+        watcher_gone = node.connect("later", access="observe")
+        with watcher_gone as later:
+            later.wait(lambda feedback: feedback.owner is None, 5)
+    assert node.flyer.taken == []
+    assert node.flyer.others == "RTL"
+
+
+def test_a_person_takes_it_back(client: TestClient, node: Node) -> None:
+    with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
+        pilot.take().take_off()
+        pilot.say("fly", forward=0.4)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+        node.flyer.others = "LOITER"
+        watcher.wait(lambda feedback: feedback.others is not None, 5)
+        pilot.say("hover")
+        until(lambda: node.flyer.taken == [Hover()])
+
+
+@pytest.mark.parametrize("begin", [go_to, fly_a_route, follow])
+def test_a_return_because_the_battery_is_low_is_ended_by_nobody_but_a_person(
+    client: TestClient, node: Node, begin: Callable[[TestClient, Page], None]
+) -> None:
+    """The end of a go-to or a route, and the tab that was closed half-way, made it hover until it fell."""
+    with node.connect("watcher", access="observe") as watcher:
+        with page(client) as pilot:
+            pilot.take().say("set", name="battery.return", value=0.5)
+            pilot.wait("done", do="set")
+            pilot.take_off()
+            with pilot.staying():
+                begin(client, pilot)
+                until(lambda: node.flyer.place[0] > 0.8)
+                node.flyer.battery = 0.4
+                watcher.wait(lambda feedback: feedback.failsafe is Failsafe.LAND, 5)
+                at = len(node.flyer.applied)
+                until(lambda: len(node.flyer.applied) > at + 5)
+        watcher.wait("landed", 20)
+    assert abs(node.flyer.place[0]) < 0.6, "at its start"
+    assert Hover() not in node.flyer.applied[at:]
+    assert not any(isinstance(action, Position) for action in node.flyer.applied[at:])
+    assert count(node, Land())
+
+
+# Hands -------------------------------------------------------------------------------------------------------------
+
+
+def test_sticks_that_no_hand_has_moved_are_in_nobodys_hand() -> None:
+    watch = HandWatch()
+    held = Fly(forward=0.5, touches=7)
+
+    def flies(sticks: Fly, from_s: float, for_s: float) -> list[bool]:
+        return [watch.holds(sticks, from_s + step * 0.05) for step in range(round(for_s / 0.05))]
+
+    assert all(flies(held, 0.0, UNTOUCHED_S - 0.1))
+    assert not any(flies(held, UNTOUCHED_S + 0.1, 30.0)[1:]), "as a gamepad whose radio link broke"
+    at_s = UNTOUCHED_S + 30.1
+    assert all(flies(Fly(forward=0.5, touches=8), at_s, 1.0)), "a hand is there again"
+    trembling = [watch.holds(Fly(forward=1.0, touches=step // 100), at_s + step * 0.05) for step in range(2000)]
+    assert all(trembling), "at the stick's end for 100 s, and a sign of the hand every 5 s"
+    at_s += 100.0 + LATE_S + 20.0
+    assert watch.holds(Fly(forward=1.0, touches=19), at_s), "let go in between"
+    assert all(flies(Fly(forward=0.5), at_s, 60.0)), "a program without hands"
+
+
+def test_a_page_whose_sticks_no_hand_moves_hovers(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skyloop.cockpit.commands.UNTOUCHED_S", 0.3)
+    with page(client) as pilot:
+        pilot.take().take_off()
+        hovers, deadline = count(node, Hover()), time.monotonic() + 5
+        while count(node, Hover()) == hovers:
+            assert time.monotonic() < deadline
+            pilot.say("fly", forward=0.4, touches=3)
+            time.sleep(0.03)
+        assert "no hand has moved" in pilot.wait("refused", do="fly")["why"]
+        pilot.say("fly", forward=0.4, touches=4)
+        until(lambda: node.flyer.state is FlightState.FLYING)

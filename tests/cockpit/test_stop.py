@@ -1,0 +1,87 @@
+"""The emergency stop of a page: nothing that the page does besides can lose it, and "done" means that it shows."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from skyloop.cockpit import station
+from skyloop.messages import EmergencyStop, FlightState, Hover, Velocity
+from tests.cockpit.fake import Node, open_socket, until
+from tests.cockpit.test_control import Page, count, page
+from tests.cockpit.testclient import TestClient
+
+
+@contextmanager
+def sticks_held(pilot: Page) -> Iterator[None]:
+    """As a gamepad's pilot presses it: the sticks stay where they are, twenty times a second."""
+    ended = threading.Event()
+
+    def hold() -> None:
+        while not ended.wait(0.05):
+            pilot.say("fly", forward=0.5)
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def test_a_stop_whose_first_packets_are_lost_comes_while_the_sticks_are_held(client: TestClient, node: Node) -> None:
+    """Sticks that are held took the place of the stop: one lost packet, and it flew on, told as done."""
+    with page(client) as pilot:
+        pilot.take().take_off()
+        with sticks_held(pilot):
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            node.stops_lost = 3
+            pilot.say("stop", n=70)
+            pilot.wait("done", do="stop")
+            assert node.flyer.state is FlightState.EMERGENCY
+            assert node.stops_lost == 0
+            assert "emergency stop is under way" in next(
+                told["why"] for told in pilot.told if told.get("do") == "fly" and told["type"] == "refused"
+            )
+    kinds = [type(action) for action in node.flyer.applied]
+    assert Velocity not in kinds[kinds.index(EmergencyStop) :]
+
+
+def test_a_stop_that_does_not_show_is_never_done_and_the_drone_hovers(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page said "done" of a stop of which nothing had come."""
+    monkeypatch.setattr(station, "SHOWN_S", 0.5)
+    with page(client) as pilot:
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.say("fly", forward=0.5)
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            node.stops_lost = 1000
+            pilot.say("stop", n=71)
+            pilot.wait("sent", do="stop", n=71)
+            pilot.say("land")
+            assert "under way" in pilot.wait("refused", do="land")["why"], "nothing takes its place meanwhile"
+            assert "has not shown" in pilot.wait("refused", do="stop", n=71)["why"]
+            until(lambda: node.flyer.applied[-1] == Hover(), "what it flew is not flown on")
+            assert not [told for told in pilot.told if told["type"] == "done" and told["do"] == "stop"]
+            pilot.say("land")
+            pilot.wait("done", do="land")
+
+
+def test_a_stop_of_all_silences_the_sticks_of_every_page(client: TestClient, node: Node) -> None:
+    with page(client) as pilot, open_socket(client, "control") as socket:
+        pilot.take().take_off()
+        everybody = Page(socket)
+        with sticks_held(pilot):
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            node.stops_lost = 3
+            everybody.say("stop_all")
+            everybody.wait("each", drone="alpha", state="sent")
+            everybody.wait("each", drone="alpha", state="done")
+            assert node.flyer.state is FlightState.EMERGENCY
+    assert count(node, EmergencyStop()) >= 1

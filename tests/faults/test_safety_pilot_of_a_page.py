@@ -1,0 +1,54 @@
+"""A safety pilot who chooses another mode while a page flies: an emulated autopilot, and what the proxy says to it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from skyloop.cockpit.discovery import Found
+from skyloop.cockpit.fleet import Fleet
+from skyloop.emulators.mavlink import Kind
+from skyloop.transport.testing import wait_until
+from tests.cockpit.fake import cockpit
+from tests.cockpit.test_control import page
+from tests.faults.test_vehicle_of_others import KINDS, Scene, taken_off
+
+pytestmark = pytest.mark.timeout(60)
+
+
+class Finder:
+    """Finds the proxy of a scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+
+    def __call__(self) -> list[Found]:
+        return [Found("alpha", "memory", self._scene.server.dial)]
+
+    def add_name(self, name: str) -> None: ...
+
+    def close(self) -> None: ...
+
+
+@KINDS
+def test_a_page_on_its_way_to_a_place_leaves_the_vehicle_to_who_changes_its_mode(kind: Kind, tmp_path: Path) -> None:
+    """It was in GUIDED again 0.6 s later, by the page's own hover; and again when the page was closed."""
+    with Scene(kind, tmp_path / "alpha.flight") as scene:
+        proxy = scene.proxy()
+        with taken_off(scene), cockpit(Fleet(Finder(scene), look_s=0.05)) as client:
+            with page(client) as pilot, pilot.staying():
+                pilot.take(4)
+                pilot.say("goto", x=80, y=0, z=6)
+                pilot.wait("sent", do="goto")
+                wait_until(lambda: scene.set_points > 5, "it flies there")
+                scene.station_mode("RTL")
+                wait_until(lambda: scene.mode.endswith("RTL"), "it is in that mode")
+                scene.ours.clear()
+                pilot.wait("refused", do="goto")
+                scene.watched(proxy)
+                assert scene.ours == []
+                assert scene.mode.endswith("RTL")
+            scene.watched(proxy)
+            assert scene.ours == []
+            assert scene.mode.endswith("RTL")
