@@ -183,6 +183,18 @@ def test_a_private_proxy_ends_with_the_drone() -> None:
 
 
 @pytest.mark.process
+def test_a_private_proxy_that_still_lands_its_vehicle_is_left_to_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who closes a drone in the air waits for a moment only, and its proxy is not terminated meanwhile."""
+    monkeypatch.setattr(private_proxy, "GRACE_S", 0.1)
+    lands = CHILD.replace("os.read(descriptor, 1)", "os.read(descriptor, 1); import time; time.sleep(1.0)")
+    proxy = PrivateProxy("fake://", command(lands))
+    drone = open_drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close, timeout_s=20.0)
+    drone.close()
+    assert alive(proxy.pid)
+    assert proxy._process.wait(20.0) == 0, "it ended by itself"
+
+
+@pytest.mark.process
 def test_by_address(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(private_proxy, "PrivateProxy", lambda uri: PrivateProxy(uri, command(CHILD)))
     with connect("fake://here") as drone:

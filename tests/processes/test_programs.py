@@ -69,3 +69,14 @@ def test_a_script_that_ends_in_flight_leaves_a_drone_that_lands(
         assert script.wait(60.0) == 0, script.text
         observer.wait("landed", timeout_s=30.0)
         assert (last == "program") is (owners[0] == "program")
+
+
+def test_a_take_off_raises_no_refusal_of_what_a_callback_commands() -> None:
+    """A callback that flies is registered before the take-off: its velocities are refused on the ground, not that."""
+    refused: list[str] = []
+    with skyloop.connect(SIM, name="program") as drone:
+        drone.on_event(lambda event: refused.append(event.text) if "velocity refused" in event.text else None)
+        drone.on_feedback(lambda _: drone.velocity(forward=0.2))
+        eventually(lambda: bool(refused), "one is refused")
+        drone.takeoff()
+        drone.wait("flying", timeout_s=20.0)
