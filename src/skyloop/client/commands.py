@@ -221,6 +221,11 @@ class CommandSender:
                 return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
             return self._schedule.over
 
+    @property
+    def may_ask(self) -> bool:
+        """Whether something may be commanded now: the authority is held, and there is a connection."""
+        return self._authority.held and self._connection.connected
+
     def give_up(self, intent: int, *, flies: bool) -> None:
         """Hover, or want nothing, instead of an intent that its caller no longer waits for; leave a newer one alone.
 
