@@ -257,6 +257,11 @@ class CommandSender:
                 return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
             return self._schedule.over
 
+    @property
+    def may_ask(self) -> bool:
+        """Whether something may be commanded now: the authority is held, and there is a connection."""
+        return self._authority.held and self._connection.connected
+
     def drop(self) -> None:
         """Clear the set-point: nothing of it is sent later."""
         with self._lock:

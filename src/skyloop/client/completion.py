@@ -190,7 +190,7 @@ class ActionWait:
         if outcome.fate in _OUTDONE:
             return RefusedError(f"{name} was ended on the way: another command took its place", code="replaced")
         if outcome.fate in OVERRULED:
-            if not self._can_ask():
+            if not self._commands.may_ask:
                 return None
             return RefusedError(
                 f"{name} was ended on the way, by a failsafe or a lost link: send the command again", code="not_fresh"
@@ -199,7 +199,7 @@ class ActionWait:
 
     def _why_no_takeoff(self, outcome: Outcome) -> Exception | None:
         if outcome.reason in _NOT_YET or outcome.fate is Fate.TIMED_OUT:
-            if self._state.scheduler.clock() - self._asked_ns >= AGAIN_NS and self._can_ask():
+            if self._state.scheduler.clock() - self._asked_ns >= AGAIN_NS and self._commands.may_ask:
                 self._again()
             return None
         if outcome.fate in _OUTDONE or outcome.fate in OVERRULED:
@@ -209,13 +209,10 @@ class ActionWait:
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
         """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
         if outcome.fate in OVERRULED or outcome.fate is Fate.TIMED_OUT:
-            if self._can_ask():
+            if self._commands.may_ask:
                 self._again()
             return None
         return None if outcome.fate in _OUTDONE else _refused(outcome)
-
-    def _can_ask(self) -> bool:
-        return self._connection.connected and self._commands.status.state == "held"
 
     def _again(self) -> None:
         self._asked_ns = self._state.scheduler.clock()

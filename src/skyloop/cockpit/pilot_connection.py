@@ -98,10 +98,10 @@ class PilotConnection(Drone):
         return sent
 
     def has_ended(self, action: AnyAction) -> bool:
-        """Whether a failsafe, a lost link or a lost lease ended this action, while it was the newest."""
+        """Whether a failsafe, a lost link or a lost lease ended this action, and it could be sent again now."""
         newest, intent = self._newest
         outcome = self._core.commands.outcome(intent) if newest is action else None
-        return outcome is not None and outcome.fate in OVERRULED
+        return outcome is not None and outcome.fate in OVERRULED and self._core.commands.may_ask
 
     @property
     def is_told(self) -> bool:

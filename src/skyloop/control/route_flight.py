@@ -144,8 +144,9 @@ class FlyRoute(Controller):
 
     def _why_ended(self) -> str:
         """Return why the present leg is not flown any more, once; empty if it is."""
-        outcome = None if self._leg is None else self.drone._core.commands.outcome(self._leg)
-        if outcome is None or not outcome.failed:
+        commands = self.drone._core.commands
+        outcome = None if self._leg is None else commands.outcome(self._leg)
+        if outcome is None or not outcome.failed or not commands.may_ask:
             return ""
         self._leg = None
         if outcome.fate in (Fate.REPLACED, Fate.WITHDRAWN):
