@@ -191,7 +191,9 @@ def see(law: AirframeLaw, seen: Feedback, place: Any) -> None:
         law.see(place[:2] * 0.01, seen.captured_ns)
     elif isinstance(law, ImageServoLaw):
         corners = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
-        law.see(corners * place[0] / 2 + place[1] / 10, seen, seen.captured_ns)
+        with np.errstate(invalid="ignore"):
+            corners = corners * place[0] / 2 + place[1] / 10
+        law.see(corners, seen, seen.captured_ns)
 
 
 def step(law: Any, at_s: float) -> Velocity | Attitude:
@@ -318,6 +320,20 @@ def test_nan_anywhere_yields_no_set_point_that_is_not_finite_or_grows(
             assert max(map(abs, (setpoint.forward, setpoint.left, setpoint.up, setpoint.yaw_rate))) < 9.0
         else:
             assert max(map(abs, (setpoint.roll, setpoint.pitch, setpoint.climb))) < 1.0
+
+
+def test_a_landing_holds_where_attitude_and_velocity_never_come_together() -> None:
+    law = LandingLaw()
+    for k in range(6):
+        wrong = {"velocity_m_s": None} if k % 2 else {"roll_rad": math.nan}
+        law.feedback(state(1.0 + 0.05 * k, **dict[str, Any](wrong)))
+    assert law.step(nanoseconds(1.3)) == Velocity()
+    assert "never known at the same time" in law.problem
+    turning = state(1.4, angular_velocity_rad_s=(math.inf, math.nan, 0.0))
+    law.feedback(turning)
+    law.see(np.array([0.1, 0.0, -1.0]), turning, turning.captured_ns + 20_000_000)
+    assert law.step(nanoseconds(1.42)).finite
+    assert law.problem == ""
 
 
 def test_an_obstacle_whose_edge_the_lens_can_not_tell_counts_as_close() -> None:

@@ -155,7 +155,7 @@ class LandingLaw(AirframeLaw):
         if found is None:
             return
         motion, rotation = found
-        turning = np.nan_to_num(at_capture.angular_velocity_rad_s or (0.0, 0.0, 0.0))
+        turning = np.nan_to_num(at_capture.angular_velocity_rad_s or (0.0, 0.0, 0.0), posinf=0.0, neginf=0.0)
         turned = turning * clamped(seconds(captured_ns - at_capture.captured_ns), _LATEST_S)
         place = motion.position + rotation @ rotation_from_euler(*turned.tolist()) @ position
         s, sweep_m_s = self.settings, float(np.linalg.norm(np.cross(turning, position)))
@@ -176,8 +176,9 @@ class LandingLaw(AirframeLaw):
         if self.phase is LandingPhase.DOWN or not self._ready(now_ns):
             return Velocity()
         newest, ahead = self.airframe.newest, self._response.predict(now_ns)
-        assert newest is not None
-        assert ahead is not None
+        if newest is None or ahead is None:
+            self.problem = "the vehicle's attitude and velocity were never known at the same time"
+            return Velocity()
         if self._began_ns is None:
             self._began_ns = now_ns
         own = _then(newest, ahead)
