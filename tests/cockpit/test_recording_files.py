@@ -239,6 +239,7 @@ class Played(Node):
 
     def __init__(self, path: Path) -> None:
         self.name = "flight"
+        self.stops_lost = 0
         self._server = MemoryServer("flight")
         self._proxy = Proxy(make_driver(f"replay://{path}?loop=1"), self._server, name="flight")
         self._proxy.start()

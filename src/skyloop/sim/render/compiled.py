@@ -12,6 +12,7 @@ import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -160,7 +161,7 @@ class Compiler:
         with self._lock:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="skyloop-sim-compiler", daemon=True)
-                atexit.register(self._hold, os.getpid())
+                atexit.register(partial(self._hold, os.getpid()))
                 self._thread.start()
             return self._thread
 
