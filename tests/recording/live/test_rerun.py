@@ -175,9 +175,12 @@ def test_a_flight_live(fly: Fly, tmp_path: Path, streams: list[Stream]) -> None:
     viewer = RerunViewer([drone], save=tmp_path / "flight.rrd")
     with View([drone], viewer) as view:
         drone.takeoff()
+        end = time.monotonic() + 10.0
+        while "logs" not in view.subscribed.get("alpha", ()):
+            assert time.monotonic() < end, view.subscribed
+            time.sleep(0.01)
         drone.log.text("found it")
         stream = streams[0]
-        end = time.monotonic() + 10.0
         while not (
             len(stream.of(CAMERA, "EncodedImage")) > 3
             and len(stream.of("world/drones/alpha", "Transform3D")) > 3
