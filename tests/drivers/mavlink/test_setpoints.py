@@ -132,6 +132,30 @@ def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(a
 
 
 @AUTOPILOTS
+def test_a_vehicle_killed_in_a_take_off_right_after_a_landing_is_not_armed_again(autopilot: int) -> None:
+    """The landing before it is over by then: it was another's switch, and somebody may walk up to it."""
+    bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
+    vehicle = bench.vehicle
+    bench.apply(Hover())
+    bench.go_on(1.2)
+    bench.apply(Land())
+    vehicle.mode, vehicle.landed, vehicle.place = LAND[autopilot][0], Landed.ON_GROUND, (0.0, 0.0, 0.0)
+    bench.go_on(0.3)
+    bench.apply(Takeoff())
+    bench.go_on(0.2)
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.TAKEOFF"}[autopilot]
+    bench.go_on(1.0)
+    bench.answer(TAKEOFF)
+    bench.go_on(0.2 if autopilot == ARDUPILOT else 1.5)  # one accepts it only while armed, the other soon disarms
+    assert bench.state() is FlightState.TAKING_OFF
+    bench.commands()
+    vehicle.armed, vehicle.mode = False, {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.go_on(4.0)
+    assert (ARM, 1.0, 0.0, 0.0, 0.0) not in bench.commands()
+    assert bench.state() is FlightState.LANDED
+
+
+@AUTOPILOTS
 def test_a_vehicle_that_others_armed_and_disarm_again_is_not_armed_from_here(autopilot: int) -> None:
     """A pilot's switch, in a take-off that has not left the ground."""
     bench = Bench(Vehicle(autopilot)).found()
