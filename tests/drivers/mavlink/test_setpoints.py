@@ -810,6 +810,28 @@ def test_landing_while_arming_is_on_its_way_disarms_what_arms_then(autopilot: in
 
 
 @AUTOPILOTS
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_hover_after_that_landing_leaves_it_to_disarm_what_arms_then(autopilot: int, alone: bool) -> None:
+    """A pilot who hovers and lands at once, or a failsafe after a take-off was withdrawn: nothing disarmed it."""
+    bench = Bench(Vehicle(autopilot)).found()
+    bench.vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.hear(bench.vehicle.heartbeat())
+    bench.apply(Takeoff())
+    bench.go_on(0.1)
+    assert (ARM, 1.0, 0.0, 0.0, 0.0) in bench.commands()
+    bench.apply(Land())
+    bench.go_on(0.1)
+    bench.apply(Hover(), alone=alone)
+    bench.commands()
+    bench.vehicle.armed = True
+    bench.go_on(1.0)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) in bench.commands()
+    bench.vehicle.armed = False
+    bench.go_on(0.5)
+    assert bench.state() is FlightState.LANDED
+
+
+@AUTOPILOTS
 def test_landing_before_an_arming_that_never_comes_ends_soon(autopilot: int) -> None:
     bench = arming(autopilot)
     bench.apply(Land())
