@@ -119,6 +119,7 @@ def test_a_take_off_that_is_withdrawn_while_it_arms_does_not_arm_later(climb: fl
     bench.run(2.0)
     bench.fly(climb=0.7)
     bench.run(0.3)
+    assert bench.feedback.native is not None
     assert bench.feedback.native["phase"] == "arming"
     bench.fly(climb=climb)
     with pytest.raises(AssertionError, match="not within"):
