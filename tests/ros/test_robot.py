@@ -234,6 +234,42 @@ def test_a_refused_take_off_is_told_and_over() -> None:
     assert rig.tell() is FlightState.LANDED
 
 
+def test_a_refused_take_off_is_not_asked_for_again_by_its_repeats() -> None:
+    """Whoever frees the propellers meanwhile must not be under a robot that takes off."""
+    rig = Rig()
+    rig.tell()
+    rig.session.command(Takeoff())
+    rig.answer(False, "propellers blocked")
+    with pytest.raises(DriverError, match="propellers blocked"):
+        rig.session.command(Takeoff(), new=False)
+    assert rig.robot.called == ["/robot/takeoff"]
+    rig.session.command(Takeoff())
+    rig.answer(True)
+    rig.session.command(Takeoff(), new=False)
+    assert rig.robot.called == ["/robot/takeoff"] * 2
+
+
+def test_a_take_off_that_succeeded_and_does_not_show_yet_can_be_withdrawn() -> None:
+    """A service that answers before the robot rises: it stands by its odometry, and is landed all the same."""
+    rig = Rig()
+    for _ in range(2):
+        rig.tell()
+        rig.session.command(Takeoff())
+        rig.answer(True)
+        rig.tell(z=1.0)
+        rig.session.command(Land())
+        rig.answer(True)
+        rig.tell()
+    rig.robot.called.clear()
+    rig.session.command(Takeoff())
+    rig.answer(True)
+    assert rig.tell() is FlightState.LANDED
+    rig.session.command(Takeoff(), new=False)
+    assert rig.robot.called == ["/robot/takeoff"], "nor is the service called twice"
+    rig.session.command(Land(), new=False)
+    assert rig.robot.called == ["/robot/takeoff", "/robot/land"]
+
+
 def test_a_service_that_never_answers_is_waited_for_no_longer() -> None:
     rig = Rig()
     rig.tell()

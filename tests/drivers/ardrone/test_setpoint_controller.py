@@ -128,6 +128,25 @@ def test_landing_is_said_until_something_else_is_decided(condition: Condition | 
     assert [cockpit.ref() for _ in range(5)] == [Ref(0)] * 5
 
 
+def test_a_landing_that_withdraws_a_takeoff_is_said_when_the_drone_rises_all_the_same() -> None:
+    """What it had heard last of us was the take-off: it was taken for another program's flight, and left to hover."""
+    cockpit = at(GROUND)
+    cockpit.take(Takeoff())
+    assert cockpit.ref() == Ref.TAKEOFF
+    cockpit.take(Land())
+    cockpit.hears(GROUND)
+    assert cockpit.ref() == Ref(0)
+    cockpit.now_s += 0.5
+    cockpit.hears(AIR)
+    assert cockpit.ref() == Ref(0)
+    cockpit.hears(LANDING)
+    assert cockpit.ref() == Ref(0)
+    cockpit.now_s += 5.0
+    cockpit.hears(GROUND)
+    cockpit.hears(AIR)
+    assert cockpit.ref() is None, "another program flies it"
+
+
 def test_a_landing_of_ours_can_be_broken_off() -> None:
     cockpit = at(AIR)
     cockpit.take(Land())

@@ -132,6 +132,30 @@ def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(a
 
 
 @AUTOPILOTS
+def test_a_vehicle_killed_in_a_take_off_right_after_a_landing_is_not_armed_again(autopilot: int) -> None:
+    """The landing before it is over by then: it was another's switch, and somebody may walk up to it."""
+    bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
+    vehicle = bench.vehicle
+    bench.apply(Hover())
+    bench.go_on(1.2)
+    bench.apply(Land())
+    vehicle.mode, vehicle.landed, vehicle.place = LAND[autopilot][0], Landed.ON_GROUND, (0.0, 0.0, 0.0)
+    bench.go_on(0.3)
+    bench.apply(Takeoff())
+    bench.go_on(0.2)
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.TAKEOFF"}[autopilot]
+    bench.go_on(1.0)
+    bench.answer(TAKEOFF)
+    bench.go_on(0.2 if autopilot == ARDUPILOT else 1.5)  # one accepts it only while armed, the other soon disarms
+    assert bench.state() is FlightState.TAKING_OFF
+    bench.commands()
+    vehicle.armed, vehicle.mode = False, {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.go_on(4.0)
+    assert (ARM, 1.0, 0.0, 0.0, 0.0) not in bench.commands()
+    assert bench.state() is FlightState.LANDED
+
+
+@AUTOPILOTS
 def test_a_vehicle_that_others_armed_and_disarm_again_is_not_armed_from_here(autopilot: int) -> None:
     """A pilot's switch, in a take-off that has not left the ground."""
     bench = Bench(Vehicle(autopilot)).found()
@@ -783,6 +807,28 @@ def test_landing_while_arming_is_on_its_way_disarms_what_arms_then(autopilot: in
     bench.commands()
     bench.go_on(3.0)
     assert bench.commands() == []
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_hover_after_that_landing_leaves_it_to_disarm_what_arms_then(autopilot: int, alone: bool) -> None:
+    """A pilot who hovers and lands at once, or a failsafe after a take-off was withdrawn: nothing disarmed it."""
+    bench = Bench(Vehicle(autopilot)).found()
+    bench.vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.hear(bench.vehicle.heartbeat())
+    bench.apply(Takeoff())
+    bench.go_on(0.1)
+    assert (ARM, 1.0, 0.0, 0.0, 0.0) in bench.commands()
+    bench.apply(Land())
+    bench.go_on(0.1)
+    bench.apply(Hover(), alone=alone)
+    bench.commands()
+    bench.vehicle.armed = True
+    bench.go_on(1.0)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) in bench.commands()
+    bench.vehicle.armed = False
+    bench.go_on(0.5)
+    assert bench.state() is FlightState.LANDED
 
 
 @AUTOPILOTS

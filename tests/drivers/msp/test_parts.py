@@ -364,6 +364,7 @@ def test_one_that_is_disarmed_in_its_take_off_is_not_armed_again_by_the_take_off
     estimate.on_altitude(msp.Altitude(0.0, 0.0), 0)
     setpoints.on_motion(estimate.at(0))
     setpoints.on_report(Report(armed=False), 0)
+    assert setpoints.ask_takeoff(1) == ""
     setpoints.apply(Attitude(climb=0.5), 1)
     setpoints.on_report(Report(armed=True), 2)
     if climbs:

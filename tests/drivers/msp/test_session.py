@@ -112,6 +112,21 @@ def test_an_interrupted_take_off_disarms() -> None:
     assert bench.height_m < 0.1
 
 
+@pytest.mark.parametrize("climb", [0.0, -0.5])
+def test_a_take_off_that_is_withdrawn_while_it_arms_does_not_arm_later(climb: float) -> None:
+    """It armed as soon as what kept it from that had passed, and its propellers turned for a second."""
+    bench = Bench(BoardSettings(boot_s=4.0))
+    bench.run(2.0)
+    bench.fly(climb=0.7)
+    bench.run(0.3)
+    assert bench.feedback.native is not None
+    assert bench.feedback.native["phase"] == "arming"
+    bench.fly(climb=climb)
+    with pytest.raises(AssertionError, match="not within"):
+        bench.until(lambda: bench.board.armed, 5.0)
+    assert bench.session.setpoints.phase is Phase.STANDING
+
+
 def test_limits() -> None:
     bench = Bench()
     bench.take_off()

@@ -111,6 +111,28 @@ def test_a_drone_that_does_not_take_off_is_told() -> None:
     assert "takeoff" not in rig.said
 
 
+@pytest.mark.parametrize("after_s", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_a_take_off_that_a_landing_withdraws_before_it_shows_is_landed(after_s: float, lost: float) -> None:
+    """It still stood when it was landed, so nothing was sent, and it rose all the same and hovered for good."""
+    rig = Rig(lost=lost)
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: "takeoff" in rig.said, 1.0)
+    rig.run(after_s)
+    assert rig.state is FlightState.LANDED
+    rig.do(Land())
+    rig.run(0.3)
+    rig.do(Velocity(up=1.0))
+    rig.do(Hover())  # what stands is not flown by them, nor let rise
+    rig.run(15.0)
+    assert rig.bench.flight is FlightState.LANDED
+    assert rig.state is FlightState.LANDED
+    rig.take_said()
+    rig.run(3.0)
+    assert not [text for text in rig.said if text.startswith(("rc", "land", "takeoff"))]
+
+
 def test_a_drone_that_refuses_to_take_off_is_told() -> None:
     rig = Rig()
     rig.ready()

@@ -111,6 +111,7 @@ def _within(value: float, limit: float) -> float:
 
 
 TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not started by then refuses to
+RISES_NS: Final = nanoseconds(3.0)  #: so long after a take-off was sent what rises is no other program's flight
 TOGGLE_NS: Final = nanoseconds(0.5)  #: the emergency bit is cleared and set again if it showed no effect for so long
 
 
@@ -155,6 +156,7 @@ class SetpointController:
         self._stick: Stick | None = None
         self._landing_is_ours = False
         self._decided_ns = 0
+        self._rises_until_ns = 0  # a take-off was sent, and may show until then
         self._releasing = False  # a reset was asked for, and does not show
         self._edge_ns = 0  # when the emergency bit was set or cleared last for want of an effect
         self._received_ns = 0
@@ -181,7 +183,7 @@ class SetpointController:
             emergency stop is in force.
 
         Raises:
-            DriverError: A take-off while nothing is received or in emergency, a reset while nothing is reced, or an
+            DriverError: A take-off while nothing is received or in emergency, a reset while nothing is received, or an
                 action that the drone does not have.
         """
         if isinstance(action, Idle):
@@ -260,7 +262,8 @@ class SetpointController:
             self._stick = None
         self.condition, self._received_ns = condition, now_ns
         self._releasing &= condition.emergency
-        if not (condition.flying or condition.emergency) and self._decision is not Decision.TAKE_OFF:
+        stands = not (condition.flying or condition.emergency)
+        if stands and self._decision is not Decision.TAKE_OFF and now_ns >= self._rises_until_ns:
             self._steering = False
         if condition.emergency:
             self._decision, self._stick = Decision.LAND, None
@@ -309,6 +312,7 @@ class SetpointController:
     def _flight_bits(self, now_ns: int) -> Ref | None:
         if self._decision is Decision.TAKE_OFF:
             if now_ns - self._decided_ns < TAKEOFF_PATIENCE_NS:
+                self._rises_until_ns = now_ns + RISES_NS
                 return Ref.TAKEOFF
             self._decision = Decision.STAY
             text = "the drone did not take off: it may refuse because of its battery, its tilt or its sensors"

@@ -213,6 +213,7 @@ PATIENCE_NS: Final = nanoseconds(6.0)  #: a take-off that nobody asked for in so
 RISING_NS: Final = nanoseconds(8.0)  #: an armed one that does not leave the ground by then is given up
 ARM_PACE_S: Final = 1.0
 ARMED_NS: Final = nanoseconds(2.5)  #: how long an acknowledgement of arming counts, until a heartbeat shows it
+LANDED_NS: Final = nanoseconds(2.5)  #: after this a landing has disarmed it, or does not: a PX4 does after 2 s
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 LEFT_GROUND_M: Final = 0.3
 CUT_SHORT: Final = 0.5  #: a take-off that holds its position below this share of its height was stopped by somebody
@@ -304,6 +305,8 @@ class TakeoffSequence:
             if self._armed_ns is None and now_ns - self.asked_ns > PATIENCE_NS:
                 self.given_up = self.refused or "the vehicle does not answer"
             return
+        if vehicle.armed and self._disarms:
+            self._disarms = not self._landing_is_over(commands, now_ns)
         height = vehicle.altitude_m if vehicle.altitude_m is not None else 0.0
         self._seen = self._seen or vehicle.mode in self._autopilot.TAKING_OFF
         commanded = self._climb_command is not None or vehicle.mode in self._autopilot.TAKING_OFF
@@ -324,6 +327,11 @@ class TakeoffSequence:
             self.done = True  # as high as it gets, by the altitude that it reports
         if height > self._best_m + 0.05:
             self._best_m, self._best_ns = height, now_ns
+
+    def _landing_is_over(self, commands: CommandSender, now_ns: int) -> bool:
+        """Return whether the landing before can't disarm it any more: one that disarms from here on was killed."""
+        accepted = commands.result(m.MAV_CMD_NAV_TAKEOFF, self._begun_ns) == ACCEPTED
+        return (accepted and not self._autopilot.TAKING_OFF) or now_ns - self._begun_ns > LANDED_NS
 
     def _is_off_ground(self, landed: Landed, height_m: float) -> bool:
         """Return whether the vehicle is off the ground, by its own word, or by its altitude where it has none."""

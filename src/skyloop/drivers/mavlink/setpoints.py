@@ -202,7 +202,8 @@ class SetpointController:
                 self._land(vehicle)  # who asked for the take-off wants it no more: it stays on the ground
             return  # a take-off ends in a hover
         if vehicle is not None and vehicle.airborne is False:
-            self._end()
+            if self.goal is not Goal.LAND:  # which goes on to disarm what is armed, or may be any moment
+                self._end()
         elif alone or vehicle is None:
             self._end()
             self.goal = Goal.HOLD

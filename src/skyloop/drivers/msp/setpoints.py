@@ -197,6 +197,8 @@ class SetpointController:
             climb=_within(action.climb, limits.climb),
             yaw_rate=_within(action.yaw_rate, min(limits.yaw_rate, self._turn(1.0))),
         )
+        if self.phase is Phase.ARMING and self._wanted.climb <= 0:
+            self._enter(Phase.STANDING, now_ns)  # nobody wants it any more: it must not arm when it can
         if self.phase is Phase.STANDING and self._wanted.climb > 0:
             self._start(now_ns)  # only after a take-off was asked for: what stands climbs by no other set-point
         return self._wanted

@@ -14,7 +14,7 @@ from skyloop.clock import Clock, nanoseconds, seconds
 from skyloop.drivers.base import Sink
 from skyloop.drivers.ros2.options import Options
 from skyloop.drivers.ros2.telemetry import CaptureClock, battery_of, state_of
-from skyloop.errors import DecodeError
+from skyloop.errors import DecodeError, DriverError
 from skyloop.messages import (
     AnyAction,
     Encoding,
@@ -100,6 +100,7 @@ class RobotSession:
         self._commanded_ns = 0  # when it was commanded
         self._pending: _Pending | None = None
         self._up: bool | None = False if options.ground else None  # by the robot's services, or the drive's begin
+        self._refused = ""  # why the robot refused the newest take-off
         self._complained: set[str] = set()
 
     # From the robot --------------------------------------------------------------------------------------------------
@@ -157,7 +158,7 @@ class RobotSession:
             new: Whether somebody newly asked for it; a repeated take-off or landing calls no service once more.
 
         Raises:
-            DriverError: The robot does not offer the service.
+            DriverError: The robot does not offer the service, or it is a repeat of a take-off that the robot refused.
         """
         with self._lock:
             if isinstance(action, Velocity):
@@ -226,11 +227,15 @@ class RobotSession:
             self._up = up
             self._robot.send(Velocity())
             return
+        if up and not new and self._refused:
+            raise DriverError(self._refused)
         under_way = self._pending is not None and self._pending.state is state
         there = (self._state is FlightState.LANDED) is not up and self._state is not FlightState.UNKNOWN
+        if self._up:
+            there = up  # by the services; a take-off that succeeded may not show yet
         if (under_way or there) and not new:
             return
-        if not up and self._state is FlightState.LANDED and (self._measures_height or self._up is False):
+        if not (up or self._up) and self._state is FlightState.LANDED and (self._measures_height or self._up is False):
             return  # it stands on the ground
         pending = _Pending(state, self._clock())
 
@@ -238,12 +243,15 @@ class RobotSession:
             with self._lock:
                 if success:
                     self._up = up
+                elif up:
+                    self._refused = f"the robot refused {service}: {text or 'without a reason'}"
                 if self._pending is pending:
                     self._pending = None
             if not success:
                 text = f"the robot refused {service}: {text or 'without a reason'}"
                 self._sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, reason="service_failed")
 
+        self._refused = ""
         self._robot.call(service, answered)
         self._pending = pending
 

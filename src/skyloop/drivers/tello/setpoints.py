@@ -87,6 +87,7 @@ def _within(value: float, limit: float) -> float:
 
 AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that does not show is sent again
 TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone that has not started by then refuses to
+RISES_NS: Final = nanoseconds(3.0)  #: so long after a take-off was sent what stands may rise: real ones do after 1.1 s
 
 TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
 
@@ -117,6 +118,7 @@ class SetpointController:
         self._stick = LEVEL
         self._decided_ns = 0
         self._sent_ns: int | None = None  # the take-off or landing
+        self._rises_until_ns = 0  # a take-off was sent, and may show until then
         self._state_ns = 0  # when its state came last
         self._was_in_air = False  # when its state came last
         self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
@@ -131,6 +133,8 @@ class SetpointController:
         """Return the flight state for feedback."""
         if self.stop.shown:
             return FlightState.EMERGENCY
+        if self._decision is Decision.LAND and self.watch.phase is FlightState.LANDED:
+            return FlightState.LANDING  # it may be about to rise
         if self.watch.in_air and self._stick != LEVEL:
             return FlightState.FLYING
         return self.watch.phase
@@ -192,6 +196,8 @@ class SetpointController:
         self.watch.landing_answered = False
 
     def _remain(self, stick: Stick, now_ns: int) -> None:
+        if self._decision is Decision.LAND and self.watch.phase is FlightState.LANDED:
+            return  # or a take-off that was withdrawn would show after all
         if self._decision is Decision.LAND:
             self._decide(Decision.STAY, now_ns)
         self._stick = stick
@@ -224,7 +230,7 @@ class SetpointController:
         self.receiving, self._state_ns = True, now_ns
         self._was_in_air = phase.airborne
         shown = {Decision.TAKE_OFF: FlightState.HOVERING, Decision.LAND: FlightState.LANDED}.get(self._decision)
-        if phase is shown:
+        if phase is shown and not (self._decision is Decision.LAND and now_ns < self._rises_until_ns):
             self._decide(Decision.STAY, now_ns)
         elif phase is FlightState.LANDED:
             self._stick, self.left_alone = LEVEL, False
@@ -272,8 +278,12 @@ class SetpointController:
                 text = "the drone did not take off: it may refuse because of its battery, its heat or its tilt"
                 self._events.append(message(text, "no_takeoff", Severity.WARNING))
                 return []
-            return self._again(TAKEOFF, now_ns)
-        landed = self.receiving and self.watch.phase is FlightState.LANDED
+            sent = self._again(TAKEOFF, now_ns)
+            if sent:
+                self._rises_until_ns = now_ns + RISES_NS
+            return sent
+        stands = self.receiving and self.watch.phase is FlightState.LANDED
+        landed = stands and now_ns >= self._rises_until_ns
         if self._decision is Decision.LAND and not landed:
             return self._again(LAND, now_ns)
         return []
