@@ -106,6 +106,7 @@ def test_before_anything_was_received_intent_zero_is_new() -> None:
         (Takeoff(), [S.LANDED, S.TAKING_OFF], Fate.UNDER_WAY),
         (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDED], Fate.LANDED),  # tipped over, or killed by a switch
         (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDING], Fate.LANDED),  # somebody else lands it
+        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.UNKNOWN, S.LANDED], Fate.LANDED),  # and nothing was known meanwhile
         (Takeoff(), [S.LANDED, S.TAKING_OFF, S.EMERGENCY], Fate.EMERGENCY),
         (Land(), [S.HOVERING, S.LANDING], Fate.UNDER_WAY),
         (Land(), [S.HOVERING, S.LANDING, S.LANDED], Fate.COMPLETED),
@@ -135,6 +136,21 @@ def test_a_take_off_has_a_time_on_the_ground_and_none_in_the_air() -> None:
     stands.observe(S.LANDED, NOW + TAKEOFF_NS)
     climbs.observe(S.TAKING_OFF, NOW + 2 * TAKEOFF_NS)
     assert (stands.fate, climbs.fate) == (Fate.TIMED_OUT, Fate.UNDER_WAY)
+
+
+def test_a_take_off_of_a_vehicle_that_does_not_report_its_state_has_a_time_too(bench: Bench) -> None:
+    """A robot whose service does not answer: the repeats called it again for ever, until it did."""
+    pilot = bench.pilot()
+    bench.driver.answers = False
+    bench.driver.report(state=S.UNKNOWN)
+    pilot.command(Takeoff())
+    repeats(bench, pilot, Takeoff(), TAKEOFF_NS / NS_PER_S + 0.1)
+    bench.driver.told.clear()
+    repeats(bench, pilot, Takeoff())
+    assert bench.driver.told == []
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert outcome.fate is Fate.TIMED_OUT
 
 
 def test_a_landing_that_withdrew_a_take_off_waits_for_an_arming_that_is_on_its_way() -> None:
