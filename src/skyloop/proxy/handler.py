@@ -613,8 +613,12 @@ class CommandHandler:
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
-            self._events.publish_draft(position_jumped_event(airspace.jumped_m))
-            self._start_over(Fate.JUMPED, now_ns)
+            holder = self.authority.holder
+            session = self._sessions.get(holder.app_id) if holder is not None else None
+            lands = session is not None and session.intents.lands  # wherever it is
+            self._events.publish_draft(position_jumped_event(airspace.jumped_m, lands=lands))
+            if not lands:
+                self._start_over(Fate.JUMPED, now_ns)
         airspace.jumped_m = 0.0
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:

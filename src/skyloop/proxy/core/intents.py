@@ -157,6 +157,11 @@ class Intents:
         self.newest = newest = Intent(number, command.action, now_ns, state)
         return newest, True
 
+    @property
+    def lands(self) -> bool:
+        """Whether a landing where the vehicle is was asked for, and is under way."""
+        return type(self.newest.action) is Land and not self.newest.over
+
     def stop(self, command: Command) -> None:
         """Take an emergency stop, which is carried out whatever its sequence: all that was asked for ends."""
         assert type(command.action) is EmergencyStop
