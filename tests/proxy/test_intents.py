@@ -289,7 +289,7 @@ def test_a_driver_that_gives_up_on_its_way_is_told_to_forget_the_take_off(bench:
     bench.driver.fail = set()
     assert pilot.refusals() == [Refusal.DRIVER_FAILED]
     repeats(bench, pilot, Takeoff())
-    assert bench.driver.told == [Takeoff()]
+    assert bench.driver.told == [Takeoff(), Land()]
 
 
 def lease_lost(bench: Bench, pilot: App) -> None:
@@ -352,6 +352,31 @@ def test_a_take_off_that_ends_before_it_shows_is_withdrawn_from_the_vehicle(
     end(bench, pilot)
     assert bench.driver.told[-1] == Land(), "which makes a driver forget it"
     assert bench.driver.told.count(Land()) == 1
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        lambda pilot: pilot.command(Hover()),
+        lambda pilot: pilot.command(Land()),
+        lambda pilot: pilot.ask(ReleaseAuthority()),
+    ],
+    ids=["hover", "land", "release"],
+)
+def test_a_take_off_that_a_driver_fails_to_withdraw_is_withdrawn_once_it_can(
+    bench: Bench, end: Callable[[App], object]
+) -> None:
+    """The driver raised once when it was told to land: its take-off went on, although the person had ended it."""
+    pilot = bench.pilot()
+    bench.driver.answers = False
+    pilot.command(Takeoff())
+    bench.driver.told.clear()
+    bench.driver.fail = {"apply"}
+    end(pilot)
+    bench.run(0.5)
+    bench.driver.fail = set()
+    bench.run(1.0)
+    assert bench.driver.told == [Land()]
 
 
 @pytest.mark.parametrize("action", [Velocity(0.1), Takeoff()], ids=lambda action: action.name)

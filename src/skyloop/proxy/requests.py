@@ -276,7 +276,7 @@ class ParameterRequests:
         """Write one for the holder of the authority. Raises what :meth:`Parameters.set` raises."""
         waited_ns = self._clock() - now_ns
         if waited_ns > MOMENT_NS and self._parameters.get(request.name).momentary:
-            why = f"{request.name} waited {seconds(waited_ns):.1f} s for the vehicle, and is not done so late: ask again"
+            why = f"{request.name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
             return Refused(Refusal.STALE, why)
         if request.name in self._free and session.role is Role.PILOT:
             return ParameterValue(self._parameters.set(request.name, request.value))
