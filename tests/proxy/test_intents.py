@@ -32,7 +32,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.intent import ENDINGS
 from skyloop.proxy.core.intents import SETTLED_NS, TAKEOFF_NS, Intent, Intents
-from tests.proxy.fake import App, Bench
+from tests.proxy.fake import ALL, App, Bench
 
 NOW = 100 * NS_PER_S
 S = FlightState
@@ -290,6 +290,36 @@ def test_a_driver_that_gives_up_on_its_way_is_told_to_forget_the_take_off(bench:
     assert pilot.refusals() == [Refusal.DRIVER_FAILED]
     repeats(bench, pilot, Takeoff())
     assert bench.driver.told == [Takeoff(), Land()]
+
+
+def test_a_set_point_that_a_driver_fails_at_leaves_the_one_before_it_not_in_force(bench: Bench) -> None:
+    """The driver raised once at a repeat: the library sent Idle from then on, and it flew on with the old velocity."""
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.driver.told.clear()
+    bench.driver.fail = {"apply"}
+    pilot.command(Velocity(0.5), repeat=True)
+    bench.run(0.3, lambda: pilot.command(Idle(), repeat=True))
+    bench.driver.fail = set()
+    bench.run(1.0, lambda: pilot.command(Idle(), repeat=True))
+    assert bench.driver.told == [Hover()]
+    pilot.command(Velocity(0.5))
+    bench.run(0.5, lambda: pilot.command(Velocity(0.5), repeat=True))
+    assert set(map(type, bench.driver.told[1:])) == {Velocity}, "a new one is flown"
+
+
+def test_a_place_that_the_vehicle_can_not_fly_to_leaves_no_velocity_in_force() -> None:
+    """It was refused and replaced the velocity, which nobody repeated, and nothing ended."""
+    with Bench(ALL - {"position"}) as bench:
+        pilot = bench.airborne()
+        pilot.command(Velocity(0.5))
+        bench.driver.told.clear()
+        bench.driver.report(position_m=(0.0, 0.0, 1.0), yaw_rad=0.0)
+        bench.driver.refuses = "no GPS"
+        pilot.command(Position(1.0, 0.0, 1.0))
+        bench.driver.refuses = ""
+        bench.run(0.5, lambda: pilot.command(Idle(), repeat=True))
+        assert bench.driver.told == [Hover()]
 
 
 def lease_lost(bench: Bench, pilot: App) -> None:

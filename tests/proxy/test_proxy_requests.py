@@ -269,7 +269,8 @@ def test_an_action_that_waited_behind_a_slow_driver_is_not_done_long_after_it_wa
         bench.driver.while_setting = slowly
         slow = app.post(SetParameter("camera.fps", 20, app.lease))
         assert begun.wait(WAIT_S)
-        late, value = (app.post(SetParameter(*write, app.lease)) for write in (("flip", "left"), ("camera.fps", 10)))
+        late = app.post(SetParameter("flip", "left", app.lease))
+        value = app.post(SetParameter("camera.fps", 10, app.lease))
         app.sync()
         bench.clock.advance(2.1)
         go_on.set()

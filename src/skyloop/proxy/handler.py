@@ -19,6 +19,7 @@ import msgspec
 from skyloop.clock import NS_PER_S, Clock, nanoseconds, seconds
 from skyloop.errors import RefusedError
 from skyloop.messages import (
+    Action,
     AnswerTakeover,
     AnyAction,
     AnyReply,
@@ -362,8 +363,8 @@ class CommandHandler:
         new = new and not automatic  # what the library does by itself is nobody's decision
         decision = checks.decide(action, intent, state, vehicle.link_state, known, now_ns, new=new, automatic=automatic)
         if decision.refusal is not None:
-            if decision.action is not None:
-                self._stop_instead(decision.action, now_ns)
+            if decision.action is None or not self._stop_instead(decision.action, now_ns):
+                self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
         applied: AnyAction = _NOTHING
         if decision.action is not None:
@@ -374,9 +375,11 @@ class CommandHandler:
             try:
                 applied = self._executor.execute(decision.action, now_ns, new=new)
             except RefusedError as error:
+                self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.WRONG_STATE, str(error), now_ns), now_ns
             except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
                 why = vehicle.driver_refused("apply", error)
+                self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.DRIVER_FAILED, why, now_ns), now_ns
             intent.begun = True
             if decision.takes_off:
@@ -400,6 +403,13 @@ class CommandHandler:
             self._vehicle.driver_failed("apply", error)
             return False
         return True
+
+    def _stop_before(self, kind: type[Action], now_ns: int) -> None:
+        """Hover where a set-point is refused, as soon as the driver does: what it took the place of must not go on."""
+        moves = self._executor.state in (FlightState.FLYING, FlightState.HOVERING)
+        if kind in SET_POINTS and moves and self.ladder.idle and not self.ladder.barred:
+            self.ladder.hand_over(now_ns)
+            self._update_failsafe(now_ns)
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
