@@ -34,6 +34,19 @@ from tests.host.fleet import Flight, Hosting, closing_reason
 from tests.proxy.fake import WAIT_S, FakeDriver
 
 
+def test_one_that_is_removed_the_moment_before_it_starts_does_not_go_on_to_serve(hosting: Hosting) -> None:
+    """It was taken for ended, and served then without anybody who knew of it."""
+    hosting.vehicle("a")
+    vehicle = hosting.host._make(hosting.settings("a"), None)
+    vehicle.condition = vehicles.Condition.STARTING  # as the host has it before it calls start()
+    ending = threading.Thread(target=vehicle.end, args=(0.0, "it was removed"))
+    ending.start()
+    ending.join(0.1)
+    vehicle.start()
+    ending.join()
+    assert not vehicle.runs
+
+
 def test_a_driver_that_blocks_in_a_command_ends_only_its_own_vehicle(hosting: Hosting) -> None:
     stuck = hosting.add("stuck")
     hosting.add("good")

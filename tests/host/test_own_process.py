@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.child_process import ChildProcess
+from skyloop.child_process import ChildProcess, RestartingChild
 from skyloop.errors import RefusedError
 from skyloop.host import own_process
 from skyloop.host.fleet import VehicleSettings
@@ -94,6 +94,26 @@ time.sleep(60)
     landing.end(0.0, "it was removed")
     assert lines == []
     assert landing.end(0.0, "it was removed", unless_flying=True)
+
+
+def test_in_a_hurry_one_that_goes_on_to_land_is_not_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A vehicle that does not hover by itself lands all the same: killed after 8 s its process let it fall."""
+    stop = RestartingChild.stop
+    monkeypatch.setattr(RestartingChild, "stop", lambda runner: stop(runner, 0.05, 0.05))
+    landing = vehicle(
+        f"""
+import signal
+signal.signal(signal.SIGTERM, lambda *_: None)
+say(airborne=True)
+sys.stdin.read()  # its host is in a hurry
+time.sleep(0.5)
+open({str(tmp_path / "landed")!r}, "w").close()
+""",
+        [],
+    )
+    landing.start()
+    assert landing.end(10.0, "its host ends", lambda: True)
+    assert (tmp_path / "landed").exists()
 
 
 def test_one_that_does_not_land_is_ended(tmp_path: Path) -> None:

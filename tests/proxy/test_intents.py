@@ -32,7 +32,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.intent import ENDINGS
 from skyloop.proxy.core.intents import SETTLED_NS, TAKEOFF_NS, Intent, Intents
-from tests.proxy.fake import App, Bench
+from tests.proxy.fake import ALL, App, Bench
 
 NOW = 100 * NS_PER_S
 S = FlightState
@@ -106,6 +106,7 @@ def test_before_anything_was_received_intent_zero_is_new() -> None:
         (Takeoff(), [S.LANDED, S.TAKING_OFF], Fate.UNDER_WAY),
         (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDED], Fate.LANDED),  # tipped over, or killed by a switch
         (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDING], Fate.LANDED),  # somebody else lands it
+        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.UNKNOWN, S.LANDED], Fate.LANDED),  # and nothing was known meanwhile
         (Takeoff(), [S.LANDED, S.TAKING_OFF, S.EMERGENCY], Fate.EMERGENCY),
         (Land(), [S.HOVERING, S.LANDING], Fate.UNDER_WAY),
         (Land(), [S.HOVERING, S.LANDING, S.LANDED], Fate.COMPLETED),
@@ -135,6 +136,21 @@ def test_a_take_off_has_a_time_on_the_ground_and_none_in_the_air() -> None:
     stands.observe(S.LANDED, NOW + TAKEOFF_NS)
     climbs.observe(S.TAKING_OFF, NOW + 2 * TAKEOFF_NS)
     assert (stands.fate, climbs.fate) == (Fate.TIMED_OUT, Fate.UNDER_WAY)
+
+
+def test_a_take_off_of_a_vehicle_that_does_not_report_its_state_has_a_time_too(bench: Bench) -> None:
+    """A robot whose service does not answer: the repeats called it again for ever, until it did."""
+    pilot = bench.pilot()
+    bench.driver.answers = False
+    bench.driver.report(state=S.UNKNOWN)
+    pilot.command(Takeoff())
+    repeats(bench, pilot, Takeoff(), TAKEOFF_NS / NS_PER_S + 0.1)
+    bench.driver.told.clear()
+    repeats(bench, pilot, Takeoff())
+    assert bench.driver.told == []
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert outcome.fate is Fate.TIMED_OUT
 
 
 def test_a_landing_that_withdrew_a_take_off_waits_for_an_arming_that_is_on_its_way() -> None:
@@ -273,7 +289,37 @@ def test_a_driver_that_gives_up_on_its_way_is_told_to_forget_the_take_off(bench:
     bench.driver.fail = set()
     assert pilot.refusals() == [Refusal.DRIVER_FAILED]
     repeats(bench, pilot, Takeoff())
-    assert bench.driver.told == [Takeoff()]
+    assert bench.driver.told == [Takeoff(), Land()]
+
+
+def test_a_set_point_that_a_driver_fails_at_leaves_the_one_before_it_not_in_force(bench: Bench) -> None:
+    """The driver raised once at a repeat: the library sent Idle from then on, and it flew on with the old velocity."""
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.driver.told.clear()
+    bench.driver.fail = {"apply"}
+    pilot.command(Velocity(0.5), repeat=True)
+    bench.run(0.3, lambda: pilot.command(Idle(), repeat=True))
+    bench.driver.fail = set()
+    bench.run(1.0, lambda: pilot.command(Idle(), repeat=True))
+    assert bench.driver.told == [Hover()]
+    pilot.command(Velocity(0.5))
+    bench.run(0.5, lambda: pilot.command(Velocity(0.5), repeat=True))
+    assert set(map(type, bench.driver.told[1:])) == {Velocity}, "a new one is flown"
+
+
+def test_a_place_that_the_vehicle_can_not_fly_to_leaves_no_velocity_in_force() -> None:
+    """It was refused and replaced the velocity, which nobody repeated, and nothing ended."""
+    with Bench(ALL - {"position"}) as bench:
+        pilot = bench.airborne()
+        pilot.command(Velocity(0.5))
+        bench.driver.told.clear()
+        bench.driver.report(position_m=(0.0, 0.0, 1.0), yaw_rad=0.0)
+        bench.driver.refuses = "no GPS"
+        pilot.command(Position(1.0, 0.0, 1.0))
+        bench.driver.refuses = ""
+        bench.run(0.5, lambda: pilot.command(Idle(), repeat=True))
+        assert bench.driver.told == [Hover()]
 
 
 def lease_lost(bench: Bench, pilot: App) -> None:
@@ -336,6 +382,31 @@ def test_a_take_off_that_ends_before_it_shows_is_withdrawn_from_the_vehicle(
     end(bench, pilot)
     assert bench.driver.told[-1] == Land(), "which makes a driver forget it"
     assert bench.driver.told.count(Land()) == 1
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        lambda pilot: pilot.command(Hover()),
+        lambda pilot: pilot.command(Land()),
+        lambda pilot: pilot.ask(ReleaseAuthority()),
+    ],
+    ids=["hover", "land", "release"],
+)
+def test_a_take_off_that_a_driver_fails_to_withdraw_is_withdrawn_once_it_can(
+    bench: Bench, end: Callable[[App], object]
+) -> None:
+    """The driver raised once when it was told to land: its take-off went on, although the person had ended it."""
+    pilot = bench.pilot()
+    bench.driver.answers = False
+    pilot.command(Takeoff())
+    bench.driver.told.clear()
+    bench.driver.fail = {"apply"}
+    end(pilot)
+    bench.run(0.5)
+    bench.driver.fail = set()
+    bench.run(1.0)
+    assert bench.driver.told == [Land()]
 
 
 @pytest.mark.parametrize("action", [Velocity(0.1), Takeoff()], ids=lambda action: action.name)

@@ -16,6 +16,7 @@ from skyloop.messages import (
     FlightState,
     Hover,
     Idle,
+    Land,
     Position,
     Refusal,
     SetParameter,
@@ -388,6 +389,23 @@ def test_a_position_that_jumps_is_told_and_the_vehicle_hovers(actions: frozenset
         assert set(pilot.refusals()) == {Refusal.NOT_FRESH}
         pilot.command(Position(5.0, 0.0, 1.0))
         assert pilot.applied[-1].applied != Idle(), "a new one is flown"
+
+
+def test_a_landing_that_does_not_show_yet_is_not_broken_off_by_a_position_that_jumps() -> None:
+    """Who lands it because its position jumps would have to do so again after each jump."""
+    with Bench() as bench:
+        pilot = bench.airborne()
+        bench.driver.report(position_m=(0.0, 0.0, 1.0))
+        bench.tick()
+        bench.driver.answers = False
+        pilot.command(Land())
+        for x in (3.0, 6.0):
+            bench.clock.advance(0.1)
+            bench.driver.report(position_m=(x, 0.0, 1.0))
+            bench.tick()
+        pilot.command(Land(), repeat=True)
+        assert len(bench.published(EventKind.VEHICLE_MESSAGE)) == 2
+        assert bench.driver.told == [Land(), Land()]
 
 
 def test_a_vehicle_that_is_carried_or_was_not_seen_for_long_does_not_jump() -> None:

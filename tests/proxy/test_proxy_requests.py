@@ -253,6 +253,36 @@ def test_a_repeated_write_is_answered_and_not_written_again() -> None:
         assert len(written) == 1
 
 
+def test_an_action_that_waited_behind_a_slow_driver_is_not_done_long_after_it_was_asked_for() -> None:
+    """Who asked for the flip was told after 2 s that there is no answer, and does not expect it any more."""
+    flip = Parameter("flip", ParameterType.TEXT, "none", choices=("none", "left"), momentary=True)
+    with Bench(parameters=[FPS, flip]) as bench:
+        app = bench.pilot()
+        begun, go_on = threading.Event(), threading.Event()
+        written: list[int] = []
+
+        def slowly() -> None:
+            written.append(1)
+            begun.set()
+            assert go_on.wait(WAIT_S)
+
+        bench.driver.while_setting = slowly
+        slow = app.post(SetParameter("camera.fps", 20, app.lease))
+        assert begun.wait(WAIT_S)
+        late = app.post(SetParameter("flip", "left", app.lease))
+        value = app.post(SetParameter("camera.fps", 10, app.lease))
+        app.sync()
+        bench.clock.advance(2.1)
+        go_on.set()
+        assert isinstance(app.answer(slow), ParameterValue)
+        refused = app.answer(late)
+        assert isinstance(refused, Refused)
+        assert refused.code is Refusal.STALE
+        assert isinstance(app.answer(value), ParameterValue)
+        assert len(written) == 2
+        assert isinstance(app.ask(SetParameter("flip", "left", app.lease)), ParameterValue)
+
+
 def test_a_repeated_request_does_not_undo_a_release(bench: Bench) -> None:
     """The reply to a grant was lost: the library's repeat of the request must not take the authority back."""
     app = bench.join("app")

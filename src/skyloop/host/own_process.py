@@ -150,7 +150,9 @@ class OwnProcessVehicle(HostedVehicle):
             if not asked:
                 child.terminate()
             deadline_s = time.monotonic() + within_s
-            while (left_s := deadline_s - time.monotonic()) > 0 and not hurry() and child.code is None:
+            while (left_s := deadline_s - time.monotonic()) > 0 and child.code is None:
+                if hurry():
+                    child.part()  # it ends at once, unless without it its vehicle would fall: then it lands
                 child.wait(min(left_s, _POLL_S))
             if unless_flying and child.code is None:
                 return False

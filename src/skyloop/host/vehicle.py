@@ -153,10 +153,8 @@ class SharedVehicle(HostedVehicle):
         self._network = network
         self._life = threading.Lock()  # guards starting, failing and stopping
         self._settled = threading.Event()  # it runs, or has failed to start
-        self._settled.set()
 
     def start(self) -> None:
-        self._settled.clear()
         try:
             self._start()
         finally:
@@ -228,7 +226,8 @@ class SharedVehicle(HostedVehicle):
         *,
         unless_flying: bool = False,
     ) -> bool:
-        self._settled.wait(OPEN_S + 1.0)  # else it would go on to serve, with nobody who knows of it
+        if self.condition is not Condition.STOPPED:
+            self._settled.wait(OPEN_S + 1.0)  # else it would go on to serve, with nobody who knows of it
         proxy = self.proxy
         if proxy is not None and self.condition is Condition.RUNNING:
             patience_s = OPEN_S + (within_s if proxy.handler.airborne else 0.0)

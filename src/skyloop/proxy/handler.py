@@ -19,6 +19,7 @@ import msgspec
 from skyloop.clock import NS_PER_S, Clock, nanoseconds, seconds
 from skyloop.errors import RefusedError
 from skyloop.messages import (
+    Action,
     AnswerTakeover,
     AnyAction,
     AnyReply,
@@ -140,7 +141,8 @@ class CommandHandler:
         self._slept = slept
         self._slept_seen = slept()  # when last looked at, or noticed
         self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
-        self._rising: Intent | None = None  # a take-off that the vehicle was told of, and does not show yet
+        #: Until when a take-off that the vehicle was told of, and does not show yet, has time to; None: there is none.
+        self._rising_until_ns: int | None = None
         self._enforced = True  # whether the safety box and zones could be, at the last set-point
         self._episodes = Episodes()  # of limits that touch what the proxy does with nobody in command
         self._stamp()
@@ -259,6 +261,7 @@ class CommandHandler:
             session = self._sessions.get(holder.app_id) if holder is not None else None
             if session is not None:
                 self._observe_intent(session, now_ns)
+            self._observe_takeoff(now_ns)
             if self._back.update(now_ns, ours=self.flight.ours):
                 self._stamp()
             steered = self._executor.step(now_ns)
@@ -360,8 +363,8 @@ class CommandHandler:
         new = new and not automatic  # what the library does by itself is nobody's decision
         decision = checks.decide(action, intent, state, vehicle.link_state, known, now_ns, new=new, automatic=automatic)
         if decision.refusal is not None:
-            if decision.action is not None:
-                self._stop_instead(decision.action, now_ns)
+            if decision.action is None or not self._stop_instead(decision.action, now_ns):
+                self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
         applied: AnyAction = _NOTHING
         if decision.action is not None:
@@ -372,14 +375,16 @@ class CommandHandler:
             try:
                 applied = self._executor.execute(decision.action, now_ns, new=new)
             except RefusedError as error:
+                self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.WRONG_STATE, str(error), now_ns), now_ns
             except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
                 why = vehicle.driver_refused("apply", error)
+                self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.DRIVER_FAILED, why, now_ns), now_ns
             intent.begun = True
             if decision.takes_off:
                 flight.claim(now_ns)
-                self._rising = intent
+                self._rising_until_ns = intent.asked_ns + TAKEOFF_NS
             if not flight.ours or kind is Takeoff:
                 self._take_vehicle(session, applied, new)
         if kind is not ReturnToStart and decision.action is not None:
@@ -390,12 +395,21 @@ class CommandHandler:
             self._apply_failsafe(self.ladder.fresh_command(), now_ns)
         return applied, applied_ns
 
-    def _stop_instead(self, action: AnyAction, now_ns: int) -> None:
-        """Do what a refused set-point leaves to be done: the one before it must not go on."""
+    def _stop_instead(self, action: AnyAction, now_ns: int) -> bool:
+        """Do what a refusal leaves to be done: what was asked for before must not go on. Return whether it is done."""
         try:
             self._executor.execute(action, now_ns, new=False)
         except Exception as error:  # noqa: BLE001  both the error and the refusal are published
             self._vehicle.driver_failed("apply", error)
+            return False
+        return True
+
+    def _stop_before(self, kind: type[Action], now_ns: int) -> None:
+        """Hover where a set-point is refused, as soon as the driver does: what it took the place of must not go on."""
+        moves = self._executor.state in (FlightState.FLYING, FlightState.HOVERING)
+        if kind in SET_POINTS and moves and self.ladder.idle and not self.ladder.barred:
+            self.ladder.hand_over(now_ns)
+            self._update_failsafe(now_ns)
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
@@ -413,7 +427,7 @@ class CommandHandler:
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         if in_time and self.holds(session, command.lease):
             self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent meanwhile
-        self._rising = None  # nothing but the stop is sent
+        self._rising_until_ns = None  # nothing but the stop is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
@@ -495,19 +509,25 @@ class CommandHandler:
                 self._tell(session, intent)
                 if intent.fate is not Fate.COMPLETED:
                     self._withdraw_takeoff(now_ns)
-        rising = self._rising
-        if rising is not None and not self._executor.stands:
-            self._rising = None  # it has left the ground
-        elif rising is not None and now_ns - rising.asked_ns >= TAKEOFF_NS:
-            self._withdraw_takeoff(now_ns)  # a set-point took its place meanwhile
-        return state if rising is None else self._executor.state
+        if self._rising_until_ns is None:
+            return state
+        self._observe_takeoff(now_ns)
+        return self._executor.state
+
+    def _observe_takeoff(self, now_ns: int) -> None:
+        """Withdraw a take-off that has had its time, although a set-point may have taken its place meanwhile."""
+        if self._rising_until_ns is not None and not self._executor.stands:
+            self._rising_until_ns = None  # it has left the ground
+        elif self._rising_until_ns is not None and now_ns >= self._rising_until_ns:
+            self._withdraw_takeoff(now_ns)
 
     def _withdraw_takeoff(self, now_ns: int) -> bool:
         """Make the vehicle forget a take-off that it has not begun to show; return whether there was one."""
-        rising, self._rising = self._rising, None
-        if rising is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
+        until_ns, self._rising_until_ns = self._rising_until_ns, None
+        if until_ns is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
             return False
-        self._stop_instead(_LAND, now_ns)
+        if not self._stop_instead(_LAND, now_ns) and self.flight.ours:  # once more, while that take-off may show
+            self._rising_until_ns = now_ns + nanoseconds(self.ladder.settings.retry_s)
         return True
 
     def _tell(self, session: Session, intent: Intent) -> None:
@@ -613,8 +633,12 @@ class CommandHandler:
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
-            self._events.publish_draft(position_jumped_event(airspace.jumped_m))
-            self._start_over(Fate.JUMPED, now_ns)
+            holder = self.authority.holder
+            session = self._sessions.get(holder.app_id) if holder is not None else None
+            lands = session is not None and session.intents.lands  # wherever it is
+            self._events.publish_draft(position_jumped_event(airspace.jumped_m, lands=lands))
+            if not lands:
+                self._start_over(Fate.JUMPED, now_ns)
         airspace.jumped_m = 0.0
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:

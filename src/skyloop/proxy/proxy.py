@@ -150,7 +150,7 @@ class Proxy:
         self.workers = ProcessorWorkers(server_end, self.events, self._counters, self.publisher.cameras)
         self._relay = Relay(driver, server_end, self.publisher, self.events, self._counters)
         self._parameter_requests = ParameterRequests(
-            self.parameters, self.handler, self.publisher, self.events, driver.parameters_without_authority
+            self.parameters, self.handler, self.publisher, self.events, clock, driver.parameters_without_authority
         )
         self._requests = RequestDispatcher(
             server_end,

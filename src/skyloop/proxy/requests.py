@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from queue import SimpleQueue
 from typing import Any, Final, Protocol
 
+from skyloop.clock import NS_PER_S, Clock, seconds
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import (
     AnswerTakeover,
@@ -45,6 +46,8 @@ from skyloop.transport.base import TransportServer
 
 MAX_PENDING: Final = 16  #: requests of one application that wait for their thread; further ones are refused
 MAX_MESSAGE: Final = 1000  #: characters of a refusal
+#: A momentary parameter, such as a flip, is written within this time or never: its writer waits no longer.
+MOMENT_NS: Final = 2 * NS_PER_S
 
 _AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
 #: Requests that change something. The others may be answered again, with what is true then.
@@ -221,6 +224,7 @@ class ParameterRequests:
         handler: Knows who holds the authority, and gets new settings.
         publisher: Reports a driver that fails.
         events: Where changes are published.
+        clock: The proxy's clock [ns].
         free: Parameters that any pilot may write without the authority. They change by themselves: each is read anew,
             and a change is no event.
     """
@@ -231,6 +235,7 @@ class ParameterRequests:
         handler: CommandHandler,
         publisher: VehiclePublisher,
         events: EventPublisher,
+        clock: Clock,
         free: frozenset[str] = frozenset(),
     ) -> None:
         self._free = free
@@ -238,6 +243,7 @@ class ParameterRequests:
         self._handler = handler
         self._publisher = publisher
         self._events = events
+        self._clock = clock
 
     def read_driver(self) -> None:
         """Read the driver's parameters; a driver that raises keeps those it had."""
@@ -266,8 +272,12 @@ class ParameterRequests:
         self.read_driver()
         return self._parameters.page(request.first)
 
-    def set(self, session: Session, request: SetParameter, _now_ns: int) -> AnyReply:
+    def set(self, session: Session, request: SetParameter, now_ns: int) -> AnyReply:
         """Write one for the holder of the authority. Raises what :meth:`Parameters.set` raises."""
+        waited_ns = self._clock() - now_ns
+        if waited_ns > MOMENT_NS and self._parameters.get(request.name).momentary:
+            why = f"{request.name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
+            return Refused(Refusal.STALE, why)
         if request.name in self._free and session.role is Role.PILOT:
             return ParameterValue(self._parameters.set(request.name, request.value))
         if not self._handler.holds(session, request.lease):

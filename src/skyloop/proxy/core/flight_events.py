@@ -42,9 +42,10 @@ def thin_zones_event(space: Space) -> EventDraft:
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "thin_zones"})
 
 
-def position_jumped_event(jumped_m: float) -> EventDraft:
-    """The position changed by more than the vehicle can have flown."""
-    text = f"the vehicle's position jumped by {jumped_m:.1f} m: it hovers, until something new is commanded"
+def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
+    """The position changed by more than the vehicle can have flown; ``lands``: while it was landed."""
+    what = "goes on to land" if lands else "hovers, until something new is commanded"
+    text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
     data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 

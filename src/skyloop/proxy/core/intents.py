@@ -76,7 +76,9 @@ class Intent:
 
     def observe(self, state: FlightState, now_ns: int) -> None:
         """End or complete it by what the vehicle does."""
-        before, self.state = self.state, state
+        before = self.state
+        if state is not FlightState.UNKNOWN:  # what was known before that still counts
+            self.state = state
         if self.fate is not Fate.UNDER_WAY:
             return
         kind = type(self.action)
@@ -86,8 +88,6 @@ class Intent:
                     self.end(Fate.COMPLETED)
             elif before.airborne:
                 self.end(Fate.COMPLETED if kind is ReturnToStart else Fate.LANDED)
-            elif kind is Takeoff and now_ns - self.asked_ns >= TAKEOFF_NS:
-                self.end(Fate.TIMED_OUT)
         elif state is FlightState.LANDING:
             if before is not state and kind not in _LANDINGS:
                 self.end(Fate.LANDED)
@@ -96,6 +96,8 @@ class Intent:
                 self.end(Fate.EMERGENCY)
         elif kind is Takeoff and state in _UP and (self.begun or before.airborne):
             self.end(Fate.COMPLETED)
+        if kind is Takeoff and not self.state.airborne and now_ns - self.asked_ns >= TAKEOFF_NS:
+            self.end(Fate.TIMED_OUT)
         if kind is ResetEmergency and self.begun and state is not FlightState.EMERGENCY:
             self.end(Fate.COMPLETED)
 
@@ -154,6 +156,11 @@ class Intents:
         newest.end(Fate.WITHDRAWN if type(command.action) is Idle else Fate.REPLACED)
         self.newest = newest = Intent(number, command.action, now_ns, state)
         return newest, True
+
+    @property
+    def lands(self) -> bool:
+        """Whether a landing where the vehicle is was asked for, and is under way."""
+        return type(self.newest.action) is Land and not self.newest.over
 
     def stop(self, command: Command) -> None:
         """Take an emergency stop, which is carried out whatever its sequence: all that was asked for ends."""
