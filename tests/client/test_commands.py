@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from skyloop.client import command_schedule
 from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.core import DroneCore
 from skyloop.client.drone import open_drone
@@ -355,6 +356,21 @@ def test_a_take_off_that_is_not_possible_yet_is_asked_for_anew_until_its_time_is
         drone.takeoff(timeout_s=0.9)
     refusing.join(WAIT_S)
     assert 2 <= len({command.intent for command in proxy.commands if command.action == Takeoff()}) <= 3
+
+
+def test_a_take_off_is_asked_for_anew_each_20_s_while_its_caller_waits(
+    proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After 20 s the library itself withdrew it, and the call waited for nothing until its 120 s were over."""
+    monkeypatch.setitem(command_schedule._AT_MOST_NS, Takeoff, 300_000_000)
+    with pytest.raises(NoAnswerError):
+        drone.takeoff(timeout_s=1.2)
+    assert len({command.intent for command in proxy.commands if command.action == Takeoff()}) >= 2
+    drone.takeoff(wait=False)
+    before = drone._core.commands.intent
+    after = len(proxy.commands)
+    proxy.until(lambda: proxy.actions()[after:].count(Idle()) >= 3, "the end of one that nobody waits for")
+    assert drone._core.commands.intent == before
 
 
 def test_a_refused_take_off_that_nobody_waits_for_is_not_repeated(proxy: ScriptedProxy, drone: Drone) -> None:

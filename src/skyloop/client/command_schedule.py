@@ -173,6 +173,8 @@ class CommandSchedule:
         if self._decays(now_ns):
             self.action, self.automatic = _HOVER, True
         elif self._expired(now_ns):
+            if type(self.action) is Takeoff:  # who still waits for it asks for it again
+                self.clear(Fate.TIMED_OUT)
             self.action, self.owed = _IDLE, None
         if not self._is_sent:
             self._sent_intent, self._new_sent_ns = self.intent, now_ns
