@@ -231,9 +231,10 @@ class CommandSender:
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
-            if self.barred and not (stop or automatic):
+            wanted = not automatic or type(action) is Takeoff  # one that is asked for again: its caller still waits
+            if self.barred and wanted and not stop:
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
-            if not automatic and isinstance(action, _FLYING) and cancelled.get()():
+            if wanted and isinstance(action, _FLYING) and cancelled.get()():
                 raise GivenUpError  # before it was sent: what was asked for since then stays
             if automatic and type(action) is not Land and type(self._schedule.action) in LANDING:
                 return self._schedule.intent, False

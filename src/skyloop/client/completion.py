@@ -84,7 +84,7 @@ class ActionWait:
         self,
         action: AnyAction,
         is_done: Callable[[Feedback], bool],
-        ask: Callable[[AnyAction], int],
+        ask: Callable[[AnyAction, bool], int],
         closed: Callable[[], bool],
         commands: CommandSender,
         state: ClientState,
@@ -95,7 +95,8 @@ class ActionWait:
         Args:
             action: The action.
             is_done: Whether feedback that is newer than the action shows it.
-            ask: Sends it under a new number, now and where it is commanded again; returns the number.
+            ask: Sends it under a new number, now and where it is commanded again, which the second argument tells;
+                returns the number.
             closed: Whether the drone was closed.
             commands: Tells what became of an intent.
             state: Newest feedback.
@@ -115,7 +116,7 @@ class ActionWait:
         self._why = ""  # it was not done yet, for people
         self._flew = False  # it was in the air meanwhile
         self._asked_ns = state.scheduler.clock()
-        self._intent = ask(action)
+        self._intent = ask(action, False)
 
     @property
     def outdone(self) -> bool:
@@ -219,7 +220,7 @@ class ActionWait:
 
     def _again(self) -> None:
         self._asked_ns = self._state.scheduler.clock()
-        self._intent = self._ask(self._action)
+        self._intent = self._ask(self._action, True)
 
     def _not_reached(self, timeout_s: float) -> str:
         newest, connection = self._state.newest, self._connection

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, Final, Literal, Protocol, TypedDict
 
 from skyloop.child_process import leave_to_parent
@@ -476,7 +475,8 @@ class DroneCore:
             waiting = ActionWait(
                 action,
                 is_done,
-                partial(self.ask, automatic=automatic),
+                # A take-off that is asked for again takes no vehicle from others meanwhile.
+                lambda asked, again: self.ask(asked, automatic=automatic or (again and type(asked) is Takeoff)),
                 lambda: self.closed or (self.ending and not automatic),
                 self.commands,
                 self.state,

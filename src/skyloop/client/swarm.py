@@ -14,8 +14,7 @@ from typing import Final, Literal, Self, TypeVar, get_args
 import numpy as np
 
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import above_zero, checked, number, position_action, return_action
-from skyloop.client.commands import cancelled
+from skyloop.client.commands import above_zero, cancelled, checked, number, position_action, return_action
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate

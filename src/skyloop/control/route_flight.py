@@ -37,8 +37,9 @@ class FlyRoute(Controller):
 
     The vehicle must be airborne when :meth:`run` is called. Each step is an event of kind ``vehicle_message`` with
     ``data["route"]`` as ``route.waypoint_reached``, and is logged on the drone. When the proxy refuses a leg, or a
-    failsafe or another command of this program ends it, the route pauses with the reason, and :meth:`resume` goes on. :meth:`pause`, :meth:`resume`,
-    :meth:`skip` and :meth:`end` may be called from any thread; they take effect with the next feedback.
+    failsafe or another command of this program ends it, the route pauses with the reason, and :meth:`resume` goes on.
+    :meth:`pause`, :meth:`resume`, :meth:`skip` and :meth:`end` may be called from any thread; they take effect with the
+    next feedback.
 
     Attributes:
         law: The course: its state, waypoint and problem.
