@@ -203,6 +203,8 @@ def test_a_landing_that_something_ended_is_asked_for_anew(
     drone.land(timeout_s=2 * WAIT_S)
     landing.join(WAIT_S)
     assert {command.action for command in proxy.commands if command.intent > 0} <= {Land(), Idle()}
+    again = [command for command in proxy.commands if command.action == Land()][-1]
+    assert again.automatic is (ending is not failsafe), "a pilot who took it meanwhile keeps it"
 
 
 def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -95,8 +95,8 @@ class ActionWait:
         Args:
             action: The action.
             is_done: Whether feedback that is newer than the action shows it.
-            ask: Sends it under a new number, now and where it is commanded again, which the second argument tells;
-                returns the number.
+            ask: Sends it under a new number, which it returns, now and where it is commanded again. The second argument:
+                the library asks by itself, and takes no vehicle from others.
             closed: Whether the drone was closed.
             commands: Tells what became of an intent.
             state: Newest feedback.
@@ -210,17 +210,17 @@ class ActionWait:
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
         """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
         if outcome.fate in OVERRULED or outcome.fate is Fate.TIMED_OUT:
-            if self._can_ask():
-                self._again()
+            if self._can_ask():  # a pilot may have taken it by hand while a link was lost
+                self._again(automatic=outcome.fate is not Fate.FAILSAFE)
             return None
         return None if outcome.fate in _OUTDONE else _refused(outcome)
 
     def _can_ask(self) -> bool:
         return self._connection.connected and self._commands.status.state == "held"
 
-    def _again(self) -> None:
+    def _again(self, *, automatic: bool = True) -> None:
         self._asked_ns = self._state.scheduler.clock()
-        self._intent = self._ask(self._action, True)
+        self._intent = self._ask(self._action, automatic)
 
     def _not_reached(self, timeout_s: float) -> str:
         newest, connection = self._state.newest, self._connection

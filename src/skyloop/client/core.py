@@ -475,8 +475,7 @@ class DroneCore:
             waiting = ActionWait(
                 action,
                 is_done,
-                # A take-off that is asked for again takes no vehicle from others meanwhile.
-                lambda asked, again: self.ask(asked, automatic=automatic or (again and type(asked) is Takeoff)),
+                lambda asked, by_itself: self.ask(asked, automatic=automatic or by_itself),
                 lambda: self.closed or (self.ending and not automatic),
                 self.commands,
                 self.state,
