@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -13,9 +14,9 @@ import typer
 
 from skyloop.cli import ending
 from skyloop.client.core import DroneCore
-from skyloop.client.drone import open_drone
-from skyloop.errors import AuthorityError, NoAnswerError
-from skyloop.messages import EmergencyStop, FlightState, RequestAuthority
+from skyloop.client.drone import Drone, open_drone
+from skyloop.errors import AuthorityError, ClosedError, NoAnswerError
+from skyloop.messages import EmergencyStop, FlightState, Hover, RequestAuthority, ReturnToStart
 from skyloop.transport.base import Peer
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
 
@@ -116,3 +117,35 @@ def test_who_lands_it_at_the_same_priority_already_lands_it_for_both(
     )
     assert ending._land("alpha", 0) == outcome
     down.join(WAIT_S)
+
+
+@pytest.mark.parametrize("connected", [True, False])
+def test_no_return_begins_after_ctrl_c(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch, connected: bool) -> None:
+    """One that was still being connected to flew home after it."""
+    proxy.state = FlightState.FLYING
+
+    def connect(_name: str, _advice: str, **_: object) -> Drone:
+        return open_drone(proxy.server.dial, app="me", on_exit="hover", policy=QUICK)
+
+    monkeypatch.setattr("skyloop.cli.piloting.connect_pilot", connect)
+    monkeypatch.setattr(ending, "_over_already", lambda *_: "")
+    flown: list[Drone] = []
+    interrupted = threading.Event()
+    if connected:
+        monkeypatch.setattr(Drone, "return_to_start", _interrupted(Drone.return_to_start))
+    else:
+        interrupted.set()
+    with pytest.raises(ClosedError, match="too late"):
+        ending._return("alpha", 16, None, flown, interrupted)
+    assert not [one for one in proxy.actions() if isinstance(one, ReturnToStart)]
+    assert Hover() in proxy.actions()
+
+
+def _interrupted(fly: Any) -> Any:
+    """Ctrl-C, between the connection and the command."""
+
+    def flown(drone: Drone, *arguments: Any, **options: Any) -> None:
+        ending._stay(drone)
+        fly(drone, *arguments, **options)
+
+    return flown

@@ -31,7 +31,7 @@ from skyloop.cli.keyboard import (
     Tokenizer,
 )
 from skyloop.cli.teleop import Teleop
-from skyloop.messages import EmergencyStop, FlightState, Hover, Land, Velocity
+from skyloop.messages import EmergencyStop, FlightState, Hover, Land, Takeoff, Velocity
 from tests.cli.conftest import Run
 from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
 from tests.processes.conftest import Process
@@ -280,6 +280,20 @@ def proxy() -> Iterator[ScriptedProxy]:
     with scripted() as proxy:
         proxy.state = FLYING
         yield proxy
+
+
+def test_a_hover_ends_a_take_off_that_does_not_show_yet(proxy: ScriptedProxy) -> None:
+    """T, then Esc or H while it still stood: nothing was sent, and it took off."""
+    proxy.state = FlightState.LANDED
+    with flown(proxy) as drone:
+        drone.wait("landed", WAIT_S)
+        pilot = Teleop(drone, 0.5, 0.8)
+        pilot.obey("hover")
+        pilot.obey("takeoff")
+        proxy.until_commanded(Takeoff())
+        assert Hover() not in proxy.actions(), "nothing was to be ended"
+        pilot.obey("hover")
+        assert not proxy.until_commanded(Hover()).automatic
 
 
 def test_what_the_hands_ask_for_is_flown(proxy: ScriptedProxy) -> None:

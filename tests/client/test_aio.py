@@ -16,7 +16,19 @@ from skyloop.aio.bridge import in_thread
 from skyloop.client.drone import open_drone
 from skyloop.client.swarm import in_parallel
 from skyloop.errors import ClosedError, NoAnswerError, UsageError
-from skyloop.messages import AnyAction, Encoding, EventKind, FlightState, Hover, Idle, Land, ResetEmergency, Takeoff
+from skyloop.messages import (
+    AnyAction,
+    Encoding,
+    EventKind,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    Position,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+)
 from skyloop.transport.base import results
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
 from tests.client.test_results import Sender
@@ -424,3 +436,52 @@ def test_an_interrupted_flight_of_a_swarm_is_not_carried_out(
     proxy.until(lambda: proxy.actions()[after:].count(Idle()) >= 3)
     assert Takeoff() not in proxy.actions()[-2:]
     drone.close()
+
+
+def test_a_command_cancelled_before_it_was_sent_is_not_sent_any_more(proxy: ScriptedProxy) -> None:
+    """Its thread came to it after the hover that the program had asked for meanwhile."""
+    proxy.state = FlightState.FLYING
+    go_on, ended = threading.Event(), threading.Event()
+
+    async def fly() -> None:
+        drone = await aio.connect("me", on_exit="hover")
+
+        def late() -> None:
+            go_on.wait(WAIT_S)
+            try:
+                drone.sync.go_to(x=1.0, y=0.0, z=1.0, timeout_s=WAIT_S)
+            finally:
+                ended.set()
+
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(in_thread(late), 0.02)
+        assert drone.command(Velocity(forward=0.1))
+        go_on.set()
+        assert await asyncio.to_thread(ended.wait, WAIT_S)
+        after = len(proxy.commands)
+        await asyncio.to_thread(proxy.until, lambda: len(proxy.commands) > after + 3)
+        assert not [one for one in proxy.actions() if isinstance(one, Position)]
+        assert set(proxy.actions()[after + 1 :]) == {Velocity(forward=0.1)}
+        await drone.close()
+
+    run(fly())
+
+
+def test_a_cancelled_flight_leaves_alone_what_was_asked_for_since(proxy: ScriptedProxy) -> None:
+    """Its hover, some milliseconds later, ended the new one."""
+    proxy.state = FlightState.FLYING
+
+    async def fly() -> None:
+        drone = await aio.connect("me", on_exit="hover")
+        flight = asyncio.ensure_future(drone.go_to(x=1.0, y=0.0, z=1.0, timeout_s=WAIT_S))
+        await asyncio.to_thread(proxy.until_commanded, Position(1.0, 0.0, 1.0))
+        flight.cancel()
+        assert drone.command(Position(2.0, 0.0, 1.0))
+        for worker in [thread for thread in threading.enumerate() if thread.name == "skyloop-aio"]:
+            await asyncio.to_thread(worker.join, WAIT_S)
+        after = len(proxy.commands)
+        await asyncio.to_thread(proxy.until, lambda: len(proxy.commands) > after + 3)
+        assert set(proxy.actions()[after + 1 :]) == {Position(2.0, 0.0, 1.0)}
+        await drone.close()
+
+    run(fly())

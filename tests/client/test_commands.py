@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from skyloop.client import Authority, AuthorityStatus, Drone
+from skyloop.client import Authority, AuthorityStatus, Drone, command_schedule
 from skyloop.client.core import DroneCore
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
@@ -41,6 +41,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.proxy.core.intents import TAKEOFF_NS
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
 
 
@@ -202,6 +203,8 @@ def test_a_landing_that_something_ended_is_asked_for_anew(
     drone.land(timeout_s=2 * WAIT_S)
     landing.join(WAIT_S)
     assert {command.action for command in proxy.commands if command.intent > 0} <= {Land(), Idle()}
+    again = [command for command in proxy.commands if command.action == Land()][-1]
+    assert again.automatic is (ending is not failsafe), "a pilot who took it meanwhile keeps it"
 
 
 def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, drone: Drone) -> None:
@@ -355,6 +358,32 @@ def test_a_take_off_that_is_not_possible_yet_is_asked_for_anew_until_its_time_is
         drone.takeoff(timeout_s=0.9)
     refusing.join(WAIT_S)
     assert 2 <= len({command.intent for command in proxy.commands if command.action == Takeoff()}) <= 3
+
+
+def test_a_take_off_that_the_proxy_ended_after_20_s_is_asked_for_anew_while_its_caller_waits(
+    proxy: ScriptedProxy, drone: Drone
+) -> None:
+    """The library withdrew it before that, and the call waited for nothing until its 120 s were over."""
+    assert command_schedule._AT_MOST_NS[Takeoff] >= TAKEOFF_NS + 500_000_000, "the proxy's word comes first"
+
+    def vehicle() -> None:
+        first = proxy.until_commanded(Takeoff())
+        assert not first.automatic
+        refuse(proxy, first, Refusal.NOT_FRESH, "me: it stands", Fate.TIMED_OUT)
+        proxy.until(lambda: proxy.commands[-1].intent > first.intent and proxy.commands[-1].action == Takeoff())
+        assert proxy.commands[-1].automatic, "nobody decided anew to take it from others"
+        del proxy.more["outcome"]
+        proxy.state = FlightState.FLYING
+
+    flying = background(vehicle)
+    drone.takeoff(timeout_s=WAIT_S)
+    flying.join(WAIT_S)
+
+
+def test_no_take_off_is_asked_for_anew_once_the_flight_ends(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone._core.commands.bar()
+    with pytest.raises(ClosedError, match="too late"):
+        drone._core.ask(Takeoff(), automatic=True)
 
 
 def test_a_refused_take_off_that_nobody_waits_for_is_not_repeated(proxy: ScriptedProxy, drone: Drone) -> None:

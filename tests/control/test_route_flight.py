@@ -9,7 +9,7 @@ import pytest
 
 import skyloop
 from skyloop.control import FlyRoute, Photo, Route, RouteWaypoint, Wait
-from skyloop.control.route_flight import ENDED, check_for, save_photo
+from skyloop.control.route_flight import ENDED, TAKEN, check_for, save_photo
 from skyloop.control.route_law import Progress, TakePhoto
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Event, EventKind, Fate, Outcome, Refusal
@@ -81,7 +81,7 @@ def test_a_refused_leg_pauses_with_the_reason_and_can_be_skipped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fate", "told"), [(Fate.FAILSAFE, ENDED), (Fate.REFUSED, "position refused: a zone"), (Fate.REPLACED, "")]
+    ("fate", "told"), [(Fate.FAILSAFE, ENDED), (Fate.REFUSED, "position refused: a zone"), (Fate.REPLACED, TAKEN)]
 )
 def test_a_stall_of_this_program_is_told_as_what_it_was(fate: Fate, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with rehearse(CALM) as drone:
@@ -90,6 +90,26 @@ def test_a_stall_of_this_program_is_told_as_what_it_was(fate: Fate, told: str, m
         outcome = Outcome(1, 7, fate, Refusal.NOT_FRESH, "position refused: a zone")
         monkeypatch.setattr(drone._core.commands, "outcome", lambda intent: outcome if intent == 7 else None)
         assert [flight._why_ended(), flight._why_ended()] == [told, ""]
+
+
+def test_a_hover_of_the_same_program_is_not_ended_by_the_next_leg() -> None:
+    """It hovered through the rest of a wait at a waypoint, then flew on by itself."""
+    told: list[Progress] = []
+    route = Route(waypoints=(RouteWaypoint(0.0, 0.0, 1.0, actions=(Wait(1.0),)), RouteWaypoint(3.0, 0.0, 1.0)))
+    with rehearse(CALM) as drone:
+        drone.takeoff()
+
+        def stop(step: Progress) -> None:
+            told.append(step)
+            if step.kind == "route.waypoint_reached":
+                drone.hover()
+
+        flight = FlyRoute(drone, route, on_progress=stop)
+        flight.run(seconds=10.0)
+        assert flight.law.state == "paused"
+        assert math.hypot(*(drone.feedback().position_m or ())[:2]) < 0.4
+        assert not drone._core.commands._schedule.automatic, "the hover that was asked for goes on"
+    assert told[-1].text == TAKEN
 
 
 def test_it_is_paused_and_ended_from_another_place() -> None:

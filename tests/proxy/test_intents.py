@@ -542,6 +542,33 @@ def test_a_landing_wanted_while_others_land_does_not_take_the_vehicle_by_a_repea
     assert pilot.refusals() == [Refusal.WRONG_STATE]
 
 
+def test_a_take_off_asked_for_again_takes_no_vehicle_from_others(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """takeoff() waited for GPS, and a safety pilot took off by hand: the next attempt stopped it in the air."""
+    begun: list[bool] = []
+    apply = bench.driver.apply
+
+    def noted(action: AnyAction, *, new: bool = True) -> AnyAction | None:
+        begun.append(new)
+        return apply(action, new=new)
+
+    monkeypatch.setattr(bench.driver, "apply", noted)
+    pilot = bench.pilot()
+    pilot.command(Takeoff(), automatic=True)
+    assert (begun, bench.driver.told) == ([True], [Takeoff()]), "on the ground it begins"
+    pilot.command(Idle())
+    bench.driver.report(state=S.LANDED)
+    bench.tick()
+    bench.driver.told.clear()
+    bench.driver.left = "STABILIZE"
+    bench.driver.report(state=S.FLYING)
+    bench.tick()
+    pilot.command(Takeoff(), automatic=True)
+    assert bench.driver.told == []
+    assert pilot.refusals()[-1] == Refusal.WRONG_STATE
+    pilot.command(Takeoff())
+    assert bench.driver.told == [Hover()], "which a person's own still does"
+
+
 def test_what_became_of_an_intent_is_in_each_sample_until_a_newer_one_comes(bench: Bench) -> None:
     pilot = bench.pilot()
     pilot.command(Velocity(0.5))

@@ -118,7 +118,9 @@ class Node:
     def destroy_subscription(self, topic: str) -> None:
         del self.subscriptions[topic]
 
-    def create_service(self, _kind: type, name: str, callback: Callable[[Any, Any], Any], callback_group: Any) -> None:
+    def create_service(
+        self, _kind: type, name: str, callback: Callable[[Any, Any], Any], callback_group: Any = None
+    ) -> None:
         self.services[name] = callback
 
     def create_client(self, _kind: type, name: str) -> Client:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from skyloop.errors import MissingExtraError, UnsupportedError, UsageError
-from skyloop.messages import FlightState, Position, Velocity
+from skyloop.messages import EmergencyStop, FlightState, Position, Velocity
 from skyloop.proxy.proxy import Proxy
 from skyloop.ros import Bridge, Settings
 from skyloop.ros.names import Frames, namespaces_of
@@ -211,11 +211,19 @@ def test_a_flight_and_the_dead_mans_hover(rig: Rig) -> None:
     rig.commands.subscriptions["cmd_vel"](twist(x=0.5, turn=0.2))
     until(lambda: any(isinstance(each, Velocity) for each in rig.vehicle.applied), "a velocity")
     until(lambda: rig.vehicle.state is FlightState.HOVERING, "hover after half a second of silence")
-    assert rig.node.call("hover").success
+    assert rig.commands.call("hover").success
     assert rig.node.call("land").success
     assert rig.published("state").data in ("landed", "landing")
     assert rig.node.call("authority/release").success
     until(lambda: rig.node.publishers["pilot"].newest.data == "", "nobody flies")
+
+
+def test_a_stop_does_not_wait_for_services_that_wait(rig: Rig) -> None:
+    """Four that waited for the drone held up the emergency stop."""
+    assert {"hover", "emergency_stop"} <= rig.commands.services.keys()
+    assert not {"hover", "emergency_stop"} & rig.node.services.keys()
+    assert rig.commands.call("emergency_stop").success
+    until(lambda: EmergencyStop() in rig.vehicle.applied, "the stop")
 
 
 def test_velocities_do_not_end_a_landing(rig: Rig) -> None:
@@ -346,7 +354,7 @@ def test_goals_are_places_with_a_heading(rig: Rig) -> None:
     answer = services.call("go_to", Message(goal=goal(1.0, 2.0, 3.0, "odom"), tolerance=0.5))
     assert flown[2]["tolerance_m"] == 0.5
     assert [pose.pose.position.z for pose in answer.plan.poses] == [1.2, 3.0]
-    refused = services.call("hover")
+    refused = topics.call("hover")
     assert (refused.success, "not sent" in refused.message) == (False, True)
 
 

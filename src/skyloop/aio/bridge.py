@@ -12,7 +12,7 @@ from contextlib import AbstractAsyncContextManager
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
-from skyloop.client.completion import cancelled
+from skyloop.client.commands import cancelled
 from skyloop.client.mailbox import Notifier
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
@@ -64,7 +64,7 @@ def on_loop(function: Callback[T]) -> Callable[[T], Any]:
 async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], object] | None = None) -> T:
     """Run a function that waits on a thread of its own: a pool could be full when the vehicle has to land.
 
-    If the caller is cancelled meanwhile, a wait for a command ends (see :data:`skyloop.client.completion.cancelled`),
+    If the caller is cancelled meanwhile, a wait for a command ends (see :data:`skyloop.client.commands.cancelled`),
     and ``abandoned`` is called with the result that nobody waits for.
     """
     loop = asyncio.get_running_loop()

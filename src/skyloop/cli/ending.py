@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -87,12 +88,17 @@ def return_to_start(
     chosen = _chosen(names, drone, every, network, keys)
     wanted = _priority(priority, every)
     flown: list[Drone] = []
+    interrupted = threading.Event()
 
     def stay() -> None:
+        interrupted.set()
         for one in flown:
-            one._core.let_go("its return was interrupted")
+            _stay(one)
 
-    _each(chosen, lambda name: _return(name, wanted, height, flown), "NOT returned", json, stay)
+    def back(name: str) -> str:
+        return _return(name, wanted, height, flown, interrupted)
+
+    _each(chosen, back, "NOT returned", json, stay)
 
 
 def stop(
@@ -203,7 +209,13 @@ def _lands_for_others(name: str) -> bool:
         return _on_the_ground(seen)
 
 
-def _return(name: str, priority: int, height_m: float | None, flown: list[Drone]) -> str:
+def _stay(drone: Drone) -> None:
+    """Hover, and begin no return any more."""
+    drone._core.commands.bar()
+    drone._core.let_go("its return was interrupted")
+
+
+def _return(name: str, priority: int, height_m: float | None, flown: list[Drone], interrupted: threading.Event) -> str:
     from skyloop.cli.piloting import connect_pilot
     from skyloop.client import Authority
 
@@ -213,6 +225,8 @@ def _return(name: str, priority: int, height_m: float | None, flown: list[Drone]
     authority = Authority(priority=priority)
     with connect_pilot(name, LEAVE, name="skyloop return", authority=authority, on_exit="hover") as back:
         flown.append(back)
+        if interrupted.is_set():  # while it was connected to
+            _stay(back)
         back.return_to_start(height_m, land=True, timeout_s=RETURN_S)
     return "landed at its start"
 

@@ -119,7 +119,7 @@ class Teleop:
         elif order == "land":
             drone.land(wait=False)
         elif order == "hover":
-            if drone.feedback().state.airborne:
+            if drone.feedback().state.airborne or drone._core.commands.wants_flight:  # a take-off may not show yet
                 drone.hover()
         elif order == "take":
             drone.request_authority()

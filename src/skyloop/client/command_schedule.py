@@ -53,7 +53,7 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     ResetEmergency: nanoseconds(0.1),
 }
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
-    Takeoff: nanoseconds(20.0),
+    Takeoff: nanoseconds(21.0),  # the proxy ends it after 20 s, and tells whether it may be asked for again
     Land: nanoseconds(60.0),
     EmergencyStop: nanoseconds(8.0),  # the driver goes on for 10 s: a late repeat must not press it again
     ResetEmergency: nanoseconds(2.0),

@@ -6,6 +6,7 @@ import math
 import numbers
 import threading
 from collections.abc import Callable
+from contextvars import ContextVar
 from typing import Final
 
 from skyloop.client.authority import AuthorityStatus, AuthorityTracker
@@ -37,8 +38,10 @@ from skyloop.messages import (
     Refused,
     ReleaseAuthority,
     RequestAuthority,
+    ResetEmergency,
     ReturnToStart,
     Role,
+    Takeoff,
     Velocity,
     encode,
 )
@@ -59,6 +62,14 @@ _ACTIONS: Final = frozenset(ACTION_NAMES)
 _REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: so ended, the next set-point is most likely refused, too
 #: What a program sends again and again: that one of them is not sent is no error.
 _STREAMED: Final = (Idle, Hover, Velocity, Attitude)
+
+_FLYING: Final = (Takeoff, ResetEmergency, *SET_POINTS)  #: what is not sent for a caller who waits no longer
+#: Whether the caller of the present thread, or task, waits no longer; set for threads that wait for somebody else.
+cancelled: Final[ContextVar[Callable[[], bool]]] = ContextVar("cancelled", default=lambda: False)
+
+
+class GivenUpError(Exception):
+    """The caller waits no longer; nobody sees this."""
 
 
 class CommandSender:
@@ -211,6 +222,7 @@ class CommandSender:
 
         Raises:
             ClosedError: After :meth:`bar`.
+            GivenUpError: If the caller waits no longer; see :data:`cancelled`.
             RefusedError: If such a stop keeps back what is to be done once, or what is to be sent ``now``.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
                 with ``now`` also while the authority is still awaited.
@@ -219,8 +231,11 @@ class CommandSender:
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
-            if self.barred and not (stop or automatic):
+            wanted = not automatic or type(action) is Takeoff  # one that is asked for again: its caller still waits
+            if self.barred and wanted and not stop:
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
+            if wanted and isinstance(action, _FLYING) and cancelled.get()():
+                raise GivenUpError  # before it was sent: what was asked for since then stays
             if automatic and type(action) is not Land and type(self._schedule.action) in LANDING:
                 return self._schedule.intent, False
             authority = self._authority

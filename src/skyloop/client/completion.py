@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from contextvars import ContextVar
 from typing import Final
 
-from skyloop.client.commands import CommandSender
+from skyloop.client.commands import CommandSender, GivenUpError, cancelled
 from skyloop.client.connection import ProxyConnection
 from skyloop.client.telemetry import ClientState
 from skyloop.errors import (
@@ -31,6 +30,7 @@ from skyloop.messages import (
     ReturnToStart,
     Takeoff,
 )
+from skyloop.messages.command import SET_POINTS
 from skyloop.messages.geometry import wrap_angle
 
 AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
@@ -43,13 +43,6 @@ AGAIN_NS: Final = 500_000_000  #: between a take-off that is not possible yet an
 _NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
 OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refused: it may be asked for again
 _OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
-
-#: Whether the caller of the present thread, or task, waits no longer; set for threads that wait for somebody else.
-cancelled: Final[ContextVar[Callable[[], bool]]] = ContextVar("cancelled", default=lambda: False)
-
-
-class _GivenUpError(Exception):
-    """The caller waits no longer; nobody sees this."""
 
 
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
@@ -91,7 +84,7 @@ class ActionWait:
         self,
         action: AnyAction,
         is_done: Callable[[Feedback], bool],
-        ask: Callable[[AnyAction], int],
+        ask: Callable[[AnyAction, bool], int],
         closed: Callable[[], bool],
         commands: CommandSender,
         state: ClientState,
@@ -102,7 +95,8 @@ class ActionWait:
         Args:
             action: The action.
             is_done: Whether feedback that is newer than the action shows it.
-            ask: Sends it under a new number, now and where it is commanded again; returns the number.
+            ask: Sends it under a new number, which it returns, now and where it is commanded again. The second argument:
+                the library asks by itself, and takes no vehicle from others.
             closed: Whether the drone was closed.
             commands: Tells what became of an intent.
             state: Newest feedback.
@@ -122,7 +116,14 @@ class ActionWait:
         self._why = ""  # it was not done yet, for people
         self._flew = False  # it was in the air meanwhile
         self._asked_ns = state.scheduler.clock()
-        self._intent = ask(action)
+        self._intent = ask(action, False)
+
+    @property
+    def outdone(self) -> bool:
+        """Whether the application asked for something else since, which a set-point behind a take-off is not."""
+        commands = self._commands
+        behind = type(self._action) is Takeoff and isinstance(commands.newest, SET_POINTS)
+        return commands.intent != self._intent and not behind
 
     def wait(self, timeout_s: float, deadline_s: float) -> None:
         """Wait until the action is done.
@@ -173,7 +174,7 @@ class ActionWait:
         if self._closed():
             return ClosedError(f"this drone was closed while {name} was under way")
         if cancelled.get()():
-            return _GivenUpError()
+            return GivenUpError()
         status = self._commands.status
         if status.state in ("queued", "preempted"):
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
@@ -209,14 +210,14 @@ class ActionWait:
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
         """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
         if outcome.fate in OVERRULED or outcome.fate is Fate.TIMED_OUT:
-            if self._commands.may_ask:
-                self._again()
+            if self._commands.may_ask:  # a pilot may have taken it by hand while a link was lost
+                self._again(automatic=outcome.fate is not Fate.FAILSAFE)
             return None
         return None if outcome.fate in _OUTDONE else _refused(outcome)
 
-    def _again(self) -> None:
+    def _again(self, *, automatic: bool = True) -> None:
         self._asked_ns = self._state.scheduler.clock()
-        self._intent = self._ask(self._action)
+        self._intent = self._ask(self._action, automatic)
 
     def _not_reached(self, timeout_s: float) -> str:
         newest, connection = self._state.newest, self._connection

@@ -9,14 +9,13 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, Final, Literal, Protocol, TypedDict
 
 from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
 from skyloop.client.channels import Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
-from skyloop.client.commands import LANDING, CommandSender
+from skyloop.client.commands import LANDING, CommandSender, GivenUpError
 from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.logbook import Logbook
@@ -471,11 +470,12 @@ class DroneCore:
         if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
             self.check_may_wait()
         deadline_s = time.monotonic() + timeout_s
+        waiting = None
         try:
             waiting = ActionWait(
                 action,
                 is_done,
-                partial(self.ask, automatic=automatic),
+                lambda asked, by_itself: self.ask(asked, automatic=automatic or by_itself),
                 lambda: self.closed or (self.ending and not automatic),
                 self.commands,
                 self.state,
@@ -487,8 +487,9 @@ class DroneCore:
             if isinstance(error, NoAnswerError) and type(action) is Takeoff:
                 self.let_go("it did not take off in time")
             raise
-        except BaseException:
-            if type(action) is not Land:
+        except BaseException as error:
+            unasked = isinstance(error, GivenUpError) and (waiting is None or waiting.outdone)
+            if type(action) is not Land and not unasked:
                 self.let_go(f"nobody waits for {action.name} any more")
             raise
 

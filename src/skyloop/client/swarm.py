@@ -14,8 +14,7 @@ from typing import Final, Literal, Self, TypeVar, get_args
 import numpy as np
 
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import above_zero, checked, number, position_action, return_action
-from skyloop.client.completion import cancelled
+from skyloop.client.commands import above_zero, cancelled, checked, number, position_action, return_action
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
@@ -687,7 +686,7 @@ def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict
     """Run all jobs at the same time, each on a thread of its own, and wait for the last.
 
     The threads are daemons. An interrupt of the waiting ends their waits for commands, see
-    :data:`skyloop.client.completion.cancelled`; what else they do ends by itself.
+    :data:`skyloop.client.commands.cancelled`; what else they do ends by itself.
 
     Args:
         jobs: By name.

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
 
 ENDED: Final = "a failsafe took over on the way: this program sent nothing for a while, or a link was lost"
+TAKEN: Final = "another command of this program took its place"
 PHOTOS: Final = "photos"  #: the folder that photos are saved to where none is named
 LOG: Final = "route"  #: under this name the progress is logged on the drone
 WAYPOINTS: Final = "waypoints"  #: and under this one the places that are left, for maps
@@ -35,9 +36,10 @@ class FlyRoute(Controller):
     """Flies along a route, does what is to be done at its waypoints, and returns from :meth:`run` at its end.
 
     The vehicle must be airborne when :meth:`run` is called. Each step is an event of kind ``vehicle_message`` with
-    ``data["route"]`` as ``route.waypoint_reached``, and is logged on the drone. When the proxy refuses a leg or a
-    failsafe ends it, the route pauses with the reason, and :meth:`resume` goes on. :meth:`pause`, :meth:`resume`,
-    :meth:`skip` and :meth:`end` may be called from any thread; they take effect with the next feedback.
+    ``data["route"]`` as ``route.waypoint_reached``, and is logged on the drone. When the proxy refuses a leg, or a
+    failsafe or another command of this program ends it, the route pauses with the reason, and :meth:`resume` goes on.
+    :meth:`pause`, :meth:`resume`, :meth:`skip` and :meth:`end` may be called from any thread; they take effect with the
+    next feedback.
 
     Attributes:
         law: The course: its state, waypoint and problem.
@@ -101,7 +103,10 @@ class FlyRoute(Controller):
         while self._asked:
             self._carry_out(self._asked.pop(0)())
         if refused := self._why_ended():
-            self._carry_out(law.pause(refused))
+            effects = law.pause(refused)
+            if refused == TAKEN:  # which goes on, in place of a hover
+                effects = [each for each in effects if not isinstance(each, Command)]
+            self._carry_out(effects)
         self._carry_out(law.update(feedback, feedback.captured_ns))
         if law.over:
             self._end()
@@ -150,7 +155,7 @@ class FlyRoute(Controller):
             return ""
         self._leg = None
         if outcome.fate in (Fate.REPLACED, Fate.WITHDRAWN):
-            return ""
+            return TAKEN
         return ENDED if outcome.fate in OVERRULED else outcome.text
 
 

@@ -359,7 +359,7 @@ class CommandHandler:
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
         intent.action = action  # a set-point may have decayed to hover
-        known, automatic = vehicle.feedback_now, command.automatic
+        known, automatic, fresh = vehicle.feedback_now, command.automatic, new
         new = new and not automatic  # what the library does by itself is nobody's decision
         decision = checks.decide(action, intent, state, vehicle.link_state, known, now_ns, new=new, automatic=automatic)
         if decision.refusal is not None:
@@ -373,7 +373,8 @@ class CommandHandler:
                 if decision.clamps:
                     self._counts["commands.clamped"] += 1
             try:
-                applied = self._executor.execute(decision.action, now_ns, new=new)
+                begins = new or (fresh and decision.takes_off)  # also one that a waiting call asks for again
+                applied = self._executor.execute(decision.action, now_ns, new=begins)
             except RefusedError as error:
                 self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.WRONG_STATE, str(error), now_ns), now_ns

@@ -62,12 +62,13 @@ class Pilot:
         topics.create_subscription(TwistStamped, "cmd_vel_stamped", self.on_stamped_velocity, newest)
         topics.create_subscription(PoseStamped, "goal_pose", self.on_goal, newest)
         group = ReentrantCallbackGroup()
+        # These never wait, and must not wait for services that do.
+        topics.create_service(Trigger, "hover", self._trigger("hover", drone.hover))
+        topics.create_service(Trigger, "emergency_stop", self._trigger("emergency_stop", drone.emergency_stop))
         actions: dict[str, Callable[[], object]] = {
             "takeoff": drone.takeoff,
             "land": drone.land,
-            "hover": drone.hover,
             "return_to_start": drone.return_to_start,
-            "emergency_stop": drone.emergency_stop,
             "authority/request": self.request_authority,
             "authority/release": drone.release_authority,
         }
