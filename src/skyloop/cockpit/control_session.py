@@ -186,7 +186,7 @@ class ControlSession:
             return
         now_ns = self._clock()
         problem = untimely(command, seconds(now_ns))
-        if not problem:
+        if not problem and not _is_deaf(command, now_ns):
             self._restart_silence_timer()  # what is old is no sign of life
         if isinstance(command, Alive):
             self._on_ping(command, now_ns)
@@ -584,6 +584,13 @@ class ControlSession:
                 await work(command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
+
+
+def _is_deaf(command: AnyCommand, now_ns: int) -> bool:
+    """Return whether a ping shows that its page receives nothing: it hovers before it is no longer present."""
+    if not isinstance(command, Alive) or command.seen_s is None:
+        return False
+    return seconds(now_ns) - command.seen_s > GONE_S - SILENT_S
 
 
 def _decides(command: AnyCommand) -> bool:
