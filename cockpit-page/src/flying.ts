@@ -62,9 +62,9 @@ export class Flying {
     // Seen before anything else on the page can keep a key to itself.
     window.addEventListener("keydown", (event) => this.down(event), { capture: true });
     window.addEventListener("keyup", (event) => this.up(event), { capture: true });
-    window.addEventListener("blur", () => this.rest());
-    window.addEventListener("pagehide", () => this.rest());
-    document.addEventListener("visibilitychange", () => document.hidden && this.rest());
+    window.addEventListener("blur", () => this.leave());
+    window.addEventListener("pagehide", () => this.leave());
+    document.addEventListener("visibilitychange", () => document.hidden && this.leave());
     document.addEventListener("focusin", () => (this.typing() || ownKeys() !== null) && this.keys.clear());
     settings.on("mode", () => this.rest()); // another tab may change it in flight
     setInterval(() => this.round(), STEER_MS);
@@ -79,6 +79,12 @@ export class Flying {
       thumbs.release();
       pilot.rest();
     }
+  }
+
+  /** Releases that come now are not seen: keys that counted as held would keep the gamepad from stopping the motors. */
+  private leave(): void {
+    if (this.stopping === "keys") this.stop("keys", null);
+    this.rest();
   }
 
   private down(event: KeyboardEvent): void {

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.client.parameters import Config
-from skyloop.cockpit.commands import LATE_S, UNTOUCHED_S, Fly, HandWatch
+from skyloop.cockpit.commands import UNTOUCHED_S, Fly, HandWatch
+from skyloop.cockpit.control_session import GONE_S
 from skyloop.cockpit.fleet import Fleet
 from skyloop.messages import Failsafe, FlightState, Hover, Land, Position, Velocity
 from tests.cockpit.fake import ORIGIN, Node, Nodes, cockpit, until
@@ -161,6 +162,28 @@ def test_a_safety_pilot_who_chooses_another_mode_keeps_the_drone(
     assert node.flyer.others == "RTL"
 
 
+@pytest.mark.parametrize("begin", [go_to, follow])
+def test_a_page_that_pings_and_hears_nothing_flies_nothing(
+    client: TestClient, node: Node, begin: Callable[[TestClient, Page], None]
+) -> None:
+    """It followed its target without end: each report of the tracker was a new command of a silent pilot."""
+    with page(client) as pilot:
+        pilot.take().take_off()
+        heard_s = time.monotonic()
+        begin(client, pilot)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+        until_s = heard_s + GONE_S + 0.5
+        while Hover() not in node.flyer.applied and time.monotonic() < until_s:
+            pilot.say("ping", seen_s=heard_s)  # no pong since
+            time.sleep(0.05)
+        assert Hover() in node.flyer.applied
+        at = len(node.flyer.applied)
+        for _ in range(10):
+            pilot.say("ping", seen_s=heard_s)
+            time.sleep(0.05)
+        assert not any(isinstance(action, Velocity) for action in node.flyer.applied[at:][1:])
+
+
 def test_a_person_takes_it_back(client: TestClient, node: Node) -> None:
     with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
         pilot.take().take_off()
@@ -212,8 +235,9 @@ def test_sticks_that_no_hand_has_moved_are_in_nobodys_hand() -> None:
     assert all(flies(Fly(forward=0.5, touches=8), at_s, 1.0)), "a hand is there again"
     trembling = [watch.holds(Fly(forward=1.0, touches=step // 100), at_s + step * 0.05) for step in range(2000)]
     assert all(trembling), "at the stick's end for 100 s, and a sign of the hand every 5 s"
-    at_s += 100.0 + LATE_S + 20.0
-    assert watch.holds(Fly(forward=1.0, touches=19), at_s), "let go in between"
+    at_s += 120.0
+    assert not watch.holds(Fly(forward=1.0, touches=19), at_s), "a network that paused is no hand"
+    assert watch.holds(Fly(forward=1.0, touches=20), at_s + 1.0), "let go, and pushed again"
     assert all(flies(Fly(forward=0.5), at_s, 60.0)), "a program without hands"
 
 

@@ -9,7 +9,9 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.cockpit import station
-from skyloop.messages import EmergencyStop, FlightState, Hover, Velocity
+from skyloop.cockpit.pilot_connection import PilotConnection
+from skyloop.errors import DriverError, UnsupportedError
+from skyloop.messages import AnyAction, EmergencyStop, FlightState, Hover, Velocity
 from tests.cockpit.fake import Node, open_socket, until
 from tests.cockpit.test_control import Page, count, page
 from tests.cockpit.testclient import TestClient
@@ -85,3 +87,41 @@ def test_a_stop_of_all_silences_the_sticks_of_every_page(client: TestClient, nod
             everybody.wait("each", drone="alpha", state="done")
             assert node.flyer.state is FlightState.EMERGENCY
     assert count(node, EmergencyStop()) >= 1
+
+
+def test_a_stop_that_the_vehicle_refuses_is_told_with_its_reason(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(station, "SHOWN_S", 0.5)
+
+    def refuse(action: AnyAction) -> AnyAction:
+        if isinstance(action, EmergencyStop):
+            raise DriverError("its motors can't be cut above 10 m")
+        return obey(action)
+
+    obey = node.flyer._apply
+    with page(client) as pilot:
+        pilot.take().take_off()
+        with pilot.staying():
+            monkeypatch.setattr(node.flyer, "_apply", refuse)
+            pilot.say("stop", n=72)
+            assert "above 10 m" in pilot.wait("refused", do="stop", n=72)["why"]
+            pilot.say("land")
+            pilot.wait("done", do="land")
+
+
+def test_a_stop_that_the_vehicle_cannot_do_is_told_at_once_and_the_drone_hovers(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cannot(_: object) -> bool:
+        raise UnsupportedError("emergency_stop is not possible: the vehicle cannot stop its motors")
+
+    monkeypatch.setattr(PilotConnection, "emergency_stop", cannot)
+    with page(client) as pilot:
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.say("fly", forward=0.5)
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            pilot.say("stop", n=73)
+            assert "cannot stop its motors" in pilot.wait("refused", do="stop", n=73)["why"]
+            until(lambda: node.flyer.applied[-1] == Hover())

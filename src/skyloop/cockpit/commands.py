@@ -240,7 +240,7 @@ class HandWatch:
     def __init__(self) -> None:
         """Begin with sticks that nobody has pushed."""
         self._last: Fly | None = None
-        self._moved_s = self._seen_s = 0.0
+        self._moved_s = 0.0
 
     def holds(self, sticks: Fly, now_s: float) -> bool:
         """Return whether a hand was seen on them within :data:`UNTOUCHED_S`; called with each command of the sticks."""
@@ -248,9 +248,8 @@ class HandWatch:
         same = last is not None and all(
             getattr(last, name) == getattr(sticks, name) for name in ("forward", "left", "up", "yaw_rate", "touches")
         )
-        if not same or sticks.touches is None or now_s - self._seen_s > LATE_S:
+        if not same or sticks.touches is None:  # a pause is no sign of a hand: the network makes them, too
             self._moved_s = now_s
-        self._seen_s = now_s
         return now_s - self._moved_s <= UNTOUCHED_S
 
 

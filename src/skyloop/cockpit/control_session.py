@@ -122,6 +122,7 @@ class ControlSession:
         self._route: RouteSession | None = None
         self._photos = photos / station.found.name
         self._steering = False  # by sticks: the newest set-point is a velocity of this page
+        self._stood_down = False  # with the vehicle under way: nothing was commanded since
         self._silence: asyncio.TimerHandle | None = None
         self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
@@ -186,7 +187,7 @@ class ControlSession:
             return
         now_ns = self._clock()
         problem = untimely(command, seconds(now_ns))
-        if not problem:
+        if not problem and not _is_deaf(command, now_ns):
             self._restart_silence_timer()  # what is old is no sign of life
         if isinstance(command, Alive):
             self._on_ping(command, now_ns)
@@ -453,7 +454,7 @@ class ControlSession:
     def _end_flight(self, why: str = "something else was commanded, or the page was away") -> None:
         """End what the page flew before; a route is paused, and may be resumed."""
         self._decisions += 1
-        self._steering = False
+        self._steering = self._stood_down = False
         self._follow.interrupt(why)
         if self._route is not None:
             self._route.pause(why, hover=False)
@@ -462,7 +463,7 @@ class ControlSession:
 
     def let_go(self, why: str) -> None:
         """Hover if this page has the vehicle under way; a take-off or landing under way ends safely by itself."""
-        flies = self._is_under_way
+        flies = self._is_under_way or self._stood_down
         self._end_flight(why)
         pilot = self._pilot
         if pilot is not None and (flies or pilot.is_flying):
@@ -470,7 +471,9 @@ class ControlSession:
 
     def stand_down(self, why: str) -> None:
         """Command nothing any more, as the motors are being stopped; the authority is kept."""
+        flies = self._is_under_way or self._stood_down
         self._end_flight(why)
+        self._stood_down = flies
         if self._pilot is not None:
             with suppress(SkyloopError):
                 self._pilot.idle()
@@ -584,6 +587,13 @@ class ControlSession:
                 await work(command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
+
+
+def _is_deaf(command: AnyCommand, now_ns: int) -> bool:
+    """Return whether a ping shows that its page receives nothing: it hovers before it is no longer present."""
+    if not isinstance(command, Alive) or command.seen_s is None:
+        return False
+    return seconds(now_ns) - command.seen_s > GONE_S - SILENT_S
 
 
 def _decides(command: AnyCommand) -> bool:

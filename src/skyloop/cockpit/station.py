@@ -20,18 +20,19 @@ from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.cockpit.thresholds import ThresholdReader
 from skyloop.control.waypoint import Waypoint
 from skyloop.errors import LinkError, NoAnswerError, SkyloopError
-from skyloop.messages import FlightState
+from skyloop.messages import EventKind, FlightState
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.pilot_connection import PilotConnection
-    from skyloop.messages import Feedback
+    from skyloop.messages import Event, Feedback
 
 TELEMETRY_HZ: Final = 18.0
 FRESH_S: Final = 0.2  #: for feedback of a vehicle's present state to come
 PILOT_S: Final = 2.0  #: for a pilot's connection to be made
 RECORDINGS: Final = ("replay:", "video:")  #: how addresses of what was recorded begin
 SHOWN_S: Final = 8.0  #: for the vehicle to show that its motors are stopped: as long as the stop may be repeated
+STOPPER: Final = "cockpit stop"  #: the application that sends emergency stops, and nothing else
 RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
 
 
@@ -185,7 +186,7 @@ class Station:
         """Prepare the connection for emergency stops, as a page that may stop the motors is there."""
         self._may_stop += 1
         if self._stopper is None:
-            self._stopper = asyncio.create_task(self.open_pilot("cockpit stop"))
+            self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
             self._stopper.add_done_callback(_ignore_error)
 
     async def pilot_went(self) -> None:
@@ -202,7 +203,7 @@ class Station:
             SkyloopError: It can't be opened.
         """
         if self._stopper is None or (self._stopper.done() and self._stopper.exception() is not None):
-            self._stopper = asyncio.create_task(self.open_pilot("cockpit stop"))
+            self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
         return await asyncio.shield(self._stopper)
 
     async def stop_motors(self, until_ns: int, sent: Callable[[], None]) -> None:
@@ -218,9 +219,9 @@ class Station:
             UnsupportedError: The vehicle has no emergency stop.
         """
         self._stops += 1
-        for session in self.sessions:
-            session.stand_down("the motors were stopped")
         try:
+            for session in self.sessions:
+                session.stand_down("the motors were stopped")
             stopper = await self._send_stop(until_ns)
             sent()
             await asyncio.to_thread(_wait_until_stopped, stopper, stopper.now_ns)
@@ -279,11 +280,20 @@ def _wait_until_stopped(stopper: PilotConnection, from_ns: int) -> None:
     def shows(feedback: Feedback) -> bool:
         return feedback.captured_ns >= from_ns and feedback.state is FlightState.EMERGENCY
 
+    refused: list[str] = []
+
+    def hear(event: Event) -> None:
+        if event.kind is EventKind.COMMAND_REFUSED and event.app == STOPPER:
+            refused.append(event.text)
+
+    listener = stopper.on_event(hear, inline=True)
     try:
         stopper.wait(shows, SHOWN_S)
     except NoAnswerError:
         why = f"the vehicle has not shown for {SHOWN_S:g} s that its motors are stopped: stop them again, or land it"
-        raise NoAnswerError(why) from None
+        raise NoAnswerError(f"{why} ({refused[-1]})" if refused else why) from None
+    finally:
+        listener.cancel()
 
 
 def _nothing(_: Feedback) -> None:

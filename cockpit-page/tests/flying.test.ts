@@ -1,0 +1,38 @@
+// What keys and the gamepad do to a page that is left and comes back.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import type { Pad } from "../src/gamepad.js";
+
+type Listener = (event: never) => void;
+
+/** As much of a browser as flying looks at. */
+function browser(): { tell(name: string, event?: object): void; pads: Pad[] } {
+  const listeners = new Map<string, Listener[]>();
+  const addEventListener = (name: string, listener: Listener): void => void listeners.set(name, [...(listeners.get(name) ?? []), listener]);
+  const pads: Pad[] = [];
+  const element = (): object => ({ append: () => undefined, replaceChildren: () => undefined, setAttribute: () => undefined, addEventListener: () => undefined, style: { setProperty: () => undefined }, dataset: {}, classList: { toggle: () => undefined } });
+  Object.assign(globalThis, {
+    window: { addEventListener },
+    document: { addEventListener, hidden: false, hasFocus: () => true, querySelector: () => null, activeElement: null, createElement: element, createElementNS: element, documentElement: element() },
+    addEventListener,
+  });
+  Object.defineProperty(globalThis, "navigator", { configurable: true, value: { getGamepads: () => pads } });
+  return { tell: (name, event = {}) => listeners.get(name)?.forEach((listener) => listener(event as never)), pads };
+}
+
+test("keys that were let go while the page was left do not keep the gamepad from stopping the motors", async (context) => {
+  context.mock.timers.enable({ apis: ["setInterval"] });
+  const { tell, pads } = browser();
+  const { Flying } = await import("../src/flying.js");
+  const held: (string | null)[] = [];
+  new Flying({ flown: () => [], selected: () => null, act: () => undefined, hold: (which) => held.push(which), inputs: () => undefined });
+  const keys = { code: "Enter", key: "Enter", ctrlKey: true, shiftKey: false, altKey: false, metaKey: false, repeat: false, preventDefault: () => undefined, stopImmediatePropagation: () => undefined };
+  tell("keydown", keys);
+  tell("blur"); // the releases go to another window
+  assert.deepEqual(held, ["one", null]);
+  const { STANDARD_MAP } = await import("../src/padmap.js");
+  pads.push({ id: "pad", index: 0, mapping: "standard", connected: true, axes: [0, 0, 0, 0], buttons: Array.from({ length: 17 }, (_, one) => ({ pressed: STANDARD_MAP.buttons.stop.includes(one) })) });
+  context.mock.timers.tick(50);
+  assert.deepEqual(held, ["one", null, "one"]);
+});
