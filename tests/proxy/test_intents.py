@@ -448,6 +448,21 @@ def test_after_a_stop_of_the_motors_nothing_else_is_sent(bench: Bench) -> None:
     assert bench.driver.told == [Takeoff(), EmergencyStop()]
 
 
+def test_what_flies_long_after_a_take_off_was_withdrawn_is_somebody_elses(bench: Bench) -> None:
+    """For 15 s whatever rose was taken for the take-off that a person had ended: another's flight was landed."""
+    pilot = bench.pilot()
+    bench.driver.answers = False
+    pilot.command(Takeoff())
+    pilot.command(Land())
+    repeats(bench, pilot, Land(), 2.0)
+    pilot.ask(ReleaseAuthority())
+    bench.run(4.0)
+    bench.driver.told.clear()
+    bench.driver.report(state=S.FLYING)
+    bench.run(6.0)
+    assert bench.driver.told == []
+
+
 def test_nothing_is_withdrawn_from_a_vehicle_that_others_took(bench: Bench) -> None:
     pilot = pending(bench)
     bench.driver.left = "STABILIZE"

@@ -527,7 +527,9 @@ class CommandHandler:
         until_ns, self._rising_until_ns = self._rising_until_ns, None
         if until_ns is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
             return False
-        if not self._stop_instead(_LAND, now_ns) and self.flight.ours:  # once more, while that take-off may show
+        if self._stop_instead(_LAND, now_ns):
+            self.flight.call_off(now_ns)
+        elif self.flight.ours:  # once more, while that take-off may show
             self._rising_until_ns = now_ns + nanoseconds(self.ladder.settings.retry_s)
         return True
 
