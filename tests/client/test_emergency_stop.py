@@ -219,3 +219,25 @@ def test_what_is_not_shown_is_told(proxy: ScriptedProxy, drone: Drone, monkeypat
     assert told.wait(WAIT_S)
     assert time.monotonic() - begun_s >= 0.2
     assert drone.hover()
+
+
+def test_a_stop_that_finds_no_room_is_withdrawn_or_given_up_and_never_sent_later() -> None:
+    """It counted as sent: told as not sent after 2 s, it cut the motors when there was room, up to 8 s later."""
+    schedule = CommandSchedule()
+    schedule.ask(EmergencyStop(), 0)
+    for now_ns in range(0, 1_000_000_000, 40_000_000):
+        if (action := schedule.next(now_ns)) is not None:
+            schedule.not_sent(action, now_ns)
+    assert schedule.stopping
+    assert schedule.may_ask(Idle()), "it may be withdrawn"
+    for now_ns in range(1_000_000_000, 2_100_000_000, 40_000_000):
+        if (action := schedule.next(now_ns)) is not None:
+            schedule.not_sent(action, now_ns)
+    assert not schedule.stopping
+    assert schedule.next(2_200_000_000) == Idle()
+    assert schedule.owed is None
+    schedule.ask(EmergencyStop(), 3_000_000_000)
+    assert schedule.next(3_000_000_000) == EmergencyStop()
+    assert schedule.next(3_100_000_000) == EmergencyStop()
+    schedule.not_sent(EmergencyStop(), 3_100_000_000)
+    assert not schedule.may_ask(Idle()), "one that was sent is not taken back, whatever became of a repeat"

@@ -187,7 +187,10 @@ class CommandSchedule:
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
         """Note that there was no room for what :meth:`next` returned: set-points follow anyway, a landing may not."""
-        if not _is_periodic(action):
+        if isinstance(action, EmergencyStop):
+            if self._new_sent_ns == now_ns:  # its first try: it may still be withdrawn, and is given up soon
+                self._sent_intent = -1
+        elif not _is_periodic(action):
             self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Protocol
 
-from skyloop.clock import monotonic_ns, seconds
+from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.broadcast import ROW_HZ, Cancellable, PeriodicBroadcast
 from skyloop.cockpit.camera_feed import CameraFeed
 from skyloop.cockpit.discovery import Found
@@ -25,7 +25,7 @@ from skyloop.messages import EventKind, FlightState
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.pilot_connection import PilotConnection
-    from skyloop.messages import Event, Feedback
+    from skyloop.messages import Feedback
 
 TELEMETRY_HZ: Final = 18.0
 FRESH_S: Final = 0.2  #: for feedback of a vehicle's present state to come
@@ -280,20 +280,17 @@ def _wait_until_stopped(stopper: PilotConnection, from_ns: int) -> None:
     def shows(feedback: Feedback) -> bool:
         return feedback.captured_ns >= from_ns and feedback.state is FlightState.EMERGENCY
 
-    refused: list[str] = []
-
-    def hear(event: Event) -> None:
-        if event.kind is EventKind.COMMAND_REFUSED and event.app == STOPPER:
-            refused.append(event.text)
-
-    listener = stopper.on_event(hear, inline=True)
     try:
         stopper.wait(shows, SHOWN_S)
     except NoAnswerError:
         why = f"the vehicle has not shown for {SHOWN_S:g} s that its motors are stopped: stop them again, or land it"
-        raise NoAnswerError(f"{why} ({refused[-1]})" if refused else why) from None
-    finally:
-        listener.cancel()
+        since_ns = from_ns - nanoseconds(PILOT_S)  # it may have been refused before this began to wait
+        refused = (
+            event.text
+            for event in reversed(stopper.recent_events())
+            if event.kind is EventKind.COMMAND_REFUSED and event.app == STOPPER and event.at_ns >= since_ns
+        )
+        raise NoAnswerError(f"{why} ({text})" if (text := next(refused, "")) else why) from None
 
 
 def _nothing(_: Feedback) -> None:
