@@ -213,7 +213,7 @@ def test_a_flight_and_the_dead_mans_hover(rig: Rig) -> None:
     until(lambda: rig.vehicle.state is FlightState.HOVERING, "hover after half a second of silence")
     assert rig.commands.call("hover").success
     assert rig.node.call("land").success
-    assert rig.published("state").data in ("landed", "landing")
+    until(lambda: rig.published("state").data in ("landed", "landing"), "the topic tells of the landing")
     assert rig.node.call("authority/release").success
     until(lambda: rig.node.publishers["pilot"].newest.data == "", "nobody flies")
 

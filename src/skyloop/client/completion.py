@@ -95,8 +95,8 @@ class ActionWait:
         Args:
             action: The action.
             is_done: Whether feedback that is newer than the action shows it.
-            ask: Sends it under a new number, which it returns, now and where it is commanded again. The second
-                argument: the library asks by itself, and takes no vehicle from others.
+            ask: Sends it, now and where it is commanded again, under a new number, which it returns. Its second
+                argument: whether the library asks by itself, which takes no vehicle from others.
             closed: Whether the drone was closed.
             commands: Tells what became of an intent.
             state: Newest feedback.
