@@ -115,6 +115,7 @@ class ActionWait:
         self._problem: Exception | None = None
         self._why = ""  # it was not done yet, for people
         self._flew = False  # it was in the air meanwhile
+        self._refused, self._refused_ns = 0, 0  # the newest intent of ours that was not possible yet, and since when
         self._asked_ns = state.scheduler.clock()
         self._intent = ask(action, False)
 
@@ -200,7 +201,12 @@ class ActionWait:
 
     def _why_no_takeoff(self, outcome: Outcome) -> Exception | None:
         if outcome.reason in _NOT_YET or outcome.fate is Fate.TIMED_OUT:
-            if self._state.scheduler.clock() - self._asked_ns >= AGAIN_NS and self._commands.may_ask:
+            now_ns, newest = self._state.scheduler.clock(), self._state.newest
+            if self._refused != self._intent:
+                self._refused, self._refused_ns = self._intent, now_ns
+            # Its withdrawal shows as a landing at first, which would end another take-off.
+            stands = newest is not None and not newest.state.airborne
+            if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
                 self._again()
             return None
         if outcome.fate in _OUTDONE or outcome.fate in OVERRULED:
