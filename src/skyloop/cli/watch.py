@@ -6,6 +6,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
@@ -68,7 +69,12 @@ def _lines(drone: Drone, duration_s: float, state: Callable[[Drone], str], event
     """Absolute deadlines, so that there is a line for each second; the first one at once."""
     due = time.monotonic()
     end = due + duration_s
-    with drone.on_event(lambda one: typer.echo(event(one))):
+
+    def show(one: Event) -> None:
+        with suppress(BrokenPipeError):  # the reader is gone, which the next line finds, too
+            typer.echo(event(one))
+
+    with drone.on_event(show):
         typer.echo(state(drone))
         while (due := due + LINE_EVERY_S) <= end:
             time.sleep(max(0.0, due - time.monotonic()))
