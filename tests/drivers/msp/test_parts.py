@@ -375,6 +375,22 @@ def test_one_that_is_disarmed_in_its_take_off_is_not_armed_again_by_the_take_off
     assert setpoints.phase is Phase.STANDING
 
 
+def test_one_that_was_found_again_disarmed_may_be_taken_off_at_once() -> None:
+    """Its firmware was restarted in flight: what ended then is over, and no take-off goes on."""
+    setpoints = SetpointController()
+    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
+    estimate = MotionEstimate()
+    estimate.on_altitude(msp.Altitude(1.0, 0.0), 0)
+    setpoints.on_motion(estimate.at(0))
+    setpoints.on_report(Report(armed=True), 1)
+    setpoints.phase = Phase.FLYING
+    setpoints.lost()
+    setpoints.on_motion(estimate.at(2))
+    setpoints.on_report(Report(armed=False), 3)
+    assert setpoints.phase is Phase.STANDING
+    assert setpoints.ask_takeoff(4) == ""
+
+
 # Without a vehicle ---------------------------------------------------------------------------------------------------
 
 

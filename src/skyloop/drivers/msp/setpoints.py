@@ -254,7 +254,7 @@ class SetpointController:
 
     def on_report(self, report: Report, now_ns: int) -> None:
         """Handle what the flight controller reports of itself."""
-        before, self.report = self.report, report
+        before, self.report, heard = self.report, report, self.receiving
         self.receiving = True
         if self.phase is Phase.ARMING:
             self._look_at_arming(now_ns)
@@ -266,7 +266,8 @@ class SetpointController:
                 where = "in flight" if flew else "before it had taken off"
                 why = f": {explained(report.hindrances)}" if report.hindrances else ""
                 text = f"the flight controller disarmed {where}{why}"
-                self._refused = text, now_ns  # whoever did it: a take-off that goes on must not arm it again
+                if heard:  # whoever did it: a take-off that goes on must not arm it again; after a loss none goes on
+                    self._refused = text, now_ns
                 self._events.append(message(text, "disarmed", Severity.WARNING, flags=", ".join(report.hindrances)))
         elif self._override and before.overridden and not report.overridden:
             self._enter(Phase.STANDING, now_ns)
