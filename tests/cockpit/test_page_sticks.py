@@ -60,9 +60,13 @@ def stays(page: DronePage, drone: Drone, seconds: float = 1.5) -> bool:
     while speed(drone) > 0.5 * MOVES_M_S and time.monotonic() < rest_s:
         page.page.wait_for_timeout(20)
     until_s = time.monotonic() + seconds
+    seen: list[tuple[float, float]] = []
     while time.monotonic() < until_s:
         page.page.wait_for_timeout(50)
-        if speed(drone) > MOVES_M_S:
+        forward, left, _ = drone.feedback().velocity_m_s or (0.0, 0.0, 0.0)
+        seen = [*seen[-7:], (forward, left)]
+        # The mean: one sample is off by 0.05 m/s (standard deviation), and so above the limit in one of ten such tests.
+        if len(seen) == 8 and max(abs(sum(axis)) / 8 for axis in zip(*seen, strict=True)) > MOVES_M_S:
             return False
     return True
 
