@@ -18,6 +18,8 @@ export interface Flown {
   pilot: Pilot;
   hands: Hands;
   thumbs: Pick<Thumbs, "sticks" | "touches" | "release">;
+  /** Its motors are stopped, whoever stopped them: what is held all the while flies nothing after the reset. */
+  isStopped: boolean;
 }
 
 /** Which drone the keys fly, and what else they do. */
@@ -139,7 +141,7 @@ export class Flying {
     let shown: Sticks = { ...CENTRED };
     for (const flown of this.cabin.flown()) {
       const { pilot, hands, thumbs } = flown;
-      const counts = flown === selected && focused && !modal && pilot.isFlyable;
+      const counts = flown === selected && focused && !modal && pilot.isFlyable && !flown.isStopped;
       const sticks = hands.read(this.keys.sticks(), reading.sticks, thumbs.sticks, counts, STEER_MS / 1000);
       pilot.steer(scale(sticks, this.pace), this.keys.touches + reading.touches + thumbs.touches);
       if (flown === selected) shown = sticks;

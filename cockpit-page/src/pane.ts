@@ -184,6 +184,10 @@ export class Pane {
     return { name: this.name, raised, loudest: this.isRecording ? null : loudest, repeats: true };
   }
 
+  get isStopped(): boolean {
+    return this.state?.flight === "emergency";
+  }
+
   selected(selected: boolean): void {
     if (!selected) this.thumbs.release();
     setAttribute(this.element, "data-selected", String(selected));

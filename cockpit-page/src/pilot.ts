@@ -42,7 +42,8 @@ export class Pilot {
   /** How this page lost the control that it had; it stays until the person takes control or puts it away. */
   ended = "";
   private steering = false;
-  private stopping = false; // the emergency stop is not shown by the vehicle yet
+  private stopping = false; // the emergency stop is not shown by the vehicle yet, or no round of the sticks has seen it
+  private stopped = false; // it is answered: the next round ends it
   private readonly commands: CommandSender;
   private received_ms = 0; // when the authority was received
   private questioned_ms = 0; // and the questions
@@ -132,7 +133,7 @@ export class Pilot {
     this.end();
     const sent = this.send({ do: deed });
     this.going = sent && deed === "return";
-    this.stopping ||= sent && deed === "stop";
+    if (sent && deed === "stop") [this.stopping, this.stopped] = [true, false];
   }
 
   goTo(x: number, y: number, z: number): void {
@@ -182,6 +183,8 @@ export class Pilot {
 
   /** Called every STEER_MS with the sticks as they are, as velocities. `touches`: how often hands were seen to move anything. */
   steer(sticks: Sticks, touches = 0): void {
+    // A vehicle may show a stop within one round: a stick that is held all the while must be centred first all the same.
+    if (this.stopped) this.stopping = this.stopped = false;
     if (this.mine && !isCentred(sticks)) {
       this.going = this.following = false;
       this.steering = this.commands.steer({ do: "fly", ...sticks, touches } satisfies Command);
@@ -213,7 +216,7 @@ export class Pilot {
   private linked(open: boolean): void {
     if (!open && this.mine) this.ended = t.pilot.broke;
     this.connected = open;
-    this.stopping = false;
+    this.stopping = this.stopped = false;
     this.end();
     this.authority = NOBODY;
     this.questions = [];
@@ -222,7 +225,7 @@ export class Pilot {
   }
 
   private refused(command: string, why: string): void {
-    if (command === "stop") this.stopping = false;
+    if (command === "stop") this.stopped = true;
     if (["goto", "fly", "route", "return", "follow_mode"].includes(command)) this.end();
     this.listener.refused(command, why);
   }
@@ -247,7 +250,7 @@ export class Pilot {
       this.following = message.state === "flying" || message.state === "waiting";
       this.listener.follow?.(message);
     } else if (message.type === "done") {
-      if (message.do === "stop") this.stopping = false;
+      if (message.do === "stop") this.stopped = true;
       if (message.do === "goto" || message.do === "return") this.going = false;
       this.listener.done(message.do, message.name, message.value);
     }

@@ -3,6 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import type { Pad } from "../src/gamepad.js";
+import type { Sticks } from "../src/model.js";
 
 type Listener = (event: never) => void;
 
@@ -35,4 +36,28 @@ test("keys that were let go while the page was left do not keep the gamepad from
   pads.push({ id: "pad", index: 0, mapping: "standard", connected: true, axes: [0, 0, 0, 0], buttons: Array.from({ length: 17 }, (_, one) => ({ pressed: STANDARD_MAP.buttons.stop.includes(one) })) });
   context.mock.timers.tick(50);
   assert.deepEqual(held, ["one", null, "one"]);
+});
+
+test("a stick that is held while the motors are stopped flies nothing after the reset, until it was centred", async (context) => {
+  context.mock.timers.enable({ apis: ["setInterval"] });
+  const { pads } = browser();
+  const [{ Flying }, { Hands, isCentred }] = [await import("../src/flying.js"), await import("../src/sticks.js")];
+  const steered: boolean[] = [];
+  const pilot = { isFlyable: true, mine: true, rest: () => undefined, steer: (sticks: Sticks) => steered.push(!isCentred(sticks)) };
+  const flown = { pilot: pilot as never, hands: new Hands(), thumbs: { sticks: { forward: 0, left: 0, up: 0, yaw_rate: 0 }, touches: 0, release: () => undefined }, isStopped: false };
+  new Flying({ flown: () => [flown], selected: () => flown, act: () => undefined, hold: () => undefined, inputs: () => undefined });
+  const push = (forward: number): void => {
+    pads[0] = { id: "pad", index: 0, mapping: "standard", connected: true, axes: [0, 0, 0, forward], buttons: Array.from({ length: 17 }, () => ({ pressed: false })) };
+    context.mock.timers.tick(50);
+  };
+  push(0);
+  push(-0.8);
+  flown.isStopped = true; // by another page, say
+  push(-0.8);
+  flown.isStopped = false;
+  push(-0.8);
+  assert.deepEqual(steered, [false, true, false, false]);
+  push(0);
+  push(-0.8);
+  assert.equal(steered.at(-1), true);
 });

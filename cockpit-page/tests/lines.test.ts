@@ -242,6 +242,8 @@ test("until the vehicle shows an emergency stop, or it is given up, sticks that 
     assert.ok(!pilot.isFlyable, "passed on, and not shown yet");
     assert.deepEqual(doings(sent), ["fly", "stop"], "no hover either");
     receive(end);
+    assert.ok(!pilot.isFlyable, "no round of the sticks has seen the stop, which may show at once: what is held must be centred first");
+    pilot.steer(CENTRED);
     assert.ok(pilot.isFlyable);
   }
 });

@@ -55,25 +55,14 @@ def flown(deck: Deck, *names: str, **options: Any) -> Iterator[tuple[DronePage, 
 
 
 def stays(page: DronePage, drone: Drone, seconds: float = 1.5) -> bool:
-    """Whether it comes to rest, and nothing moves it across the floor afterwards.
-
-    By the mean of eight samples: one is off by 0.05 m/s (standard deviation), above the limit in one of ten such tests.
-    """
-    seen: list[tuple[float, float]] = []
-
-    def mean() -> float:
-        page.page.wait_for_timeout(50)
-        forward, left, _ = drone.feedback().velocity_m_s or (0.0, 0.0, 0.0)
-        seen.append((forward, left))
-        recent = seen[-8:]
-        return float(max(abs(sum(axis)) for axis in zip(*recent, strict=True)) / len(recent))
-
-    rest_s = time.monotonic() + 5.0
-    while (mean() > 0.5 * MOVES_M_S or len(seen) < 8) and time.monotonic() < rest_s:
-        pass
+    """Whether it comes to rest, and nothing moves it across the floor afterwards."""
+    rest_s = time.monotonic() + 3.0
+    while speed(drone) > 0.5 * MOVES_M_S and time.monotonic() < rest_s:
+        page.page.wait_for_timeout(20)
     until_s = time.monotonic() + seconds
     while time.monotonic() < until_s:
-        if mean() > MOVES_M_S:
+        page.page.wait_for_timeout(50)
+        if speed(drone) > MOVES_M_S:
             return False
     return True
 
@@ -192,9 +181,6 @@ def test_a_gamepad_that_is_unplugged_beside_another_one_hovers_and_a_waking_pres
         until_it_flies(page, drone, axis(other, -0.8), axis(other, 0))
 
 
-@pytest.mark.xfail(
-    strict=False, reason="open: in about half of the runs the drone moves after the take-off, why is unknown"
-)
 def test_a_stop_by_gamepad_with_its_stick_held_is_shown_and_nothing_flies_on_after_its_reset(deck: Deck) -> None:
     deck.proxy("stopped", BLIND)
     page = deck.page("stopped", prepare=PADS)
@@ -206,17 +192,10 @@ def test_a_stop_by_gamepad_with_its_stick_held_is_shown_and_nothing_flies_on_aft
         )
         page.page.evaluate(usual % (-0.8, ", 4, 5"))
         page.until(lambda: drone.feedback().state is FlightState.EMERGENCY, "the motors stand")
+        page.wait_for_text(".notice", "motors are stopped")
         page.page.evaluate(usual % (-0.8, ""))
-        pressed_s = 0.0
-
-        def is_reset() -> bool:  # pressed again each 2 s: while the drone still falls, a reset is refused
-            nonlocal pressed_s
-            if drone.feedback().state is not FlightState.LANDED and time.monotonic() - pressed_s > 2.0:
-                page.pane.get_by_role("button", name="Reset").click()
-                pressed_s = time.monotonic()
-            return drone.feedback().state is FlightState.LANDED
-
-        page.until(is_reset, f"it is reset; the page says {page.says('.notice')!r}", 30.0)
+        page.pane.get_by_role("button", name="Reset").click()
+        page.until(lambda: drone.feedback().state is FlightState.LANDED, "it is reset")
         page.take_off()
         assert stays(page, drone), "the stick is still held from before"
 
