@@ -5,7 +5,10 @@ BIN    := $(VENV)/bin
 ARGS   ?=
 # LOCKED=1 installs the exact versions of requirements-dev.lock instead of the newest that fit.
 LOCKED ?=
-PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(if $(LOCKED),--constraint requirements-dev.lock)
+PIP    := $(BIN)/python -m pip install --disable-pip-version-check $(if $(LOCKED),--constraint requirements-dev.lock)
+
+# Where Python is told to keep nothing that it compiled, each process of the tests compiles the tests and the package anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo test test-all explore check chaos docs fuzz format coverage package page pictures lock clean
 help:
@@ -27,10 +30,11 @@ $(VENV)/.installed: pyproject.toml
 	@echo "Installing Skyloop into $(VENV): a minute or two, once"
 	@(while sleep 2; do printf .; done) & trap "kill $$!" EXIT; $(PYTHON) -m venv $(VENV)
 	@echo
-	$(subst --quiet ,,$(PIP)) --editable '.[sim,fast,vision,cockpit]'
+	$(PIP) --editable '.[sim,fast,vision,cockpit]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.txt requirements-dev.lock
+	@echo "Installing what the tests and checks need besides: two minutes or three, once"
 	$(PIP) --editable '.[all]' --requirement requirements-dev.txt
 	@touch $@
 

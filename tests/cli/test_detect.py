@@ -17,6 +17,8 @@ from tests.vision.networks import write
 
 pytestmark = pytest.mark.process
 
+PATIENCE_S = 40.0  # a detector imports and loads much until its first result
+
 ONE_PERSON = """
 [room]
 size = [20, 20, 8]
@@ -89,9 +91,9 @@ def test_detections_are_drawn_with_the_time_of_their_frame(sockets: Path, file: 
         with skyloop.connect("delta", access="observe") as drone:
             drawn: list[Annotation] = []
             drone.on_annotation(drawn.append)
-            result = next(iter(drone.results("detections")))
+            result = next(iter(drone.results("detections", timeout_s=PATIENCE_S)))
             assert [each["class_name"] for each in result.value["detections"]] == ["car"]
-            drone.wait(lambda _: any(one.captured_ns >= result.captured_ns for one in drawn))
+            drone.wait(lambda _: any(one.captured_ns >= result.captured_ns for one in drawn), PATIENCE_S)
             assert {one.source for one in drawn} == {"detections"}
     finally:
         for process in (worker, proxy):
@@ -108,7 +110,7 @@ def test_without_a_file_the_simulators_figures_are_found(sockets: Path, tmp_path
         proxy.until("ready")
         worker = Process("-m", "skyloop", "detect", "--on", "epsilon")
         with skyloop.connect("epsilon", access="observe") as drone:
-            for result in drone.results("detections"):
+            for result in drone.results("detections", timeout_s=PATIENCE_S):
                 found = result.value["detections"]
                 if found:
                     break

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 IN_FIREFOX = pytest.mark.parametrize("open_cockpit", ["firefox"], indirect=True, scope="module")
 IN_BOTH = pytest.mark.parametrize("open_cockpit", ["chromium", "firefox"], indirect=True, scope="module")
 WATCHED = "sim://?world=empty&cameras=front&width=320&fps=15"

@@ -69,7 +69,7 @@ from tests.integration.fake_vehicle import NEXT
 OWN = "http://127.0.0.1:8123"
 SOCKETS = "ws://127.0.0.1:8123/ws"
 ORIGIN = {"origin": OWN}
-PATIENCE_S = 5.0
+PATIENCE_S = 30.0
 
 
 class Listening:

@@ -31,7 +31,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from tests.cockpit.fake import Node, Nodes, cockpit, open_socket, this_user, until
+from tests.cockpit.fake import PATIENCE_S, Node, Nodes, cockpit, open_socket, this_user, until
 from tests.cockpit.testclient import TestClient, WebSocketTestSession
 
 
@@ -72,7 +72,7 @@ class Page:
 
     def wait(self, kind: str, **values: Any) -> dict[str, Any]:
         """The next message of that kind with these values."""
-        deadline = time.monotonic() + 5
+        deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             message: dict[str, Any] = self.socket.receive_json()
             self.told.append(message)

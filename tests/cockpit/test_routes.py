@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from skyloop.cockpit import control_session
 from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.routes import MOST_CHECKED, CheckedRoutes, RouteFiles
@@ -139,7 +140,11 @@ def told(pilot: Page, kind: str) -> dict[str, Any]:
             return message
 
 
-def test_a_route_is_flown_paused_resumed_and_skipped(client: TestClient, node: Node, tmp_path: Path) -> None:
+def test_a_route_is_flown_paused_resumed_and_skipped(
+    client: TestClient, node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("SILENT_S", "GONE_S"):  # a test that is held up for half a second is no silent page
+        monkeypatch.setattr(control_session, name, getattr(control_session, name) + 30.0)
     number = checked(client)["id"]
     with page(client) as pilot:
         pilot.take().say("route", id=number)

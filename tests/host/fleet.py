@@ -76,6 +76,10 @@ class Hosting:
         self.host.close()
         for app in self._apps:
             app.end.close()
+        until_s = time.monotonic() + 1.0
+        for thread in threading.enumerate():  # of what hung: it goes on now, and its folders are removed after this
+            if thread.name == "skyloop-abandoned":
+                thread.join(max(0.0, until_s - time.monotonic()))
 
     def _make(self, address: str) -> Vehicle:
         return self.drivers[address.removeprefix("fake://")]

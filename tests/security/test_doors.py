@@ -316,11 +316,12 @@ def test_a_router_applies_the_rules_to_those_who_connect_to_it(lab: Lab) -> None
             config.insert_json5(path, json.dumps(value))
         return zenoh.open(config)
 
-    heard: list[str] = []
+    heard: list[tuple[str, bytes]] = []
     with node("hub", "router", "listen"), node("alpha", "peer", "connect") as alpha:
         for way in (layout.COMMAND, layout.ORDER, layout.ASK):  # known to the others in this order
             alpha.declare_subscriber(
-                layout.upward(way, DRONE, "*", "*"), lambda sample: heard.append(str(sample.key_expr))
+                layout.upward(way, DRONE, "*", "*"),
+                lambda sample: heard.append((str(sample.key_expr), sample.payload.to_bytes())),
             )
         passed = {}
         for who in ("kim", "olga", "bob"):
@@ -328,13 +329,15 @@ def test_a_router_applies_the_rules_to_those_who_connect_to_it(lab: Lab) -> None
             false = layout.upward(layout.COMMAND, DRONE, "jane", "0" * 16)
             with third_party(endpoint, lab.folder(who), mode="client") as session:
 
-                def asked() -> bool:
+                def asked(word: bytes) -> bool:
                     for key in (false, *keys):  # noqa: B023  called at once
-                        session.put(key, b"x")
-                    return keys[-1] in heard  # noqa: B023  put last, so the others would have come before
+                        session.put(key, word)
+                    return (keys[-1], word) in heard  # noqa: B023  put last, so the others would have come before
 
-                wait_until(asked, "a question arrives")
-            passed[who] = {key for key in heard if key in (false, *keys)}
+                wait_until(lambda: asked(b"first"), "a question arrives")
+                # By now it knows who has subscribed: before, a command may have gone nowhere, and a question not.
+                wait_until(lambda: asked(b"then"), "and another one")
+            passed[who] = {key for key, _ in heard if key in (false, *keys)}
     mine = {who: {layout.upward(way, DRONE, who, "0" * 16) for way in ("command", "order", "ask")} for who in passed}
     assert passed == {
         "kim": mine["kim"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -43,14 +44,29 @@ VIDEO, IMAGE, FRAMES = (f"/alpha/{name}" for name in ("camera/front/video", "cam
 
 @pytest.fixture
 def show() -> Iterator[Show]:
-    """Serves drones on a free port."""
+    """Serves drones on a free port; what tests show there takes turns with what the view's thread does.
+
+    Two threads at once would hold up the process for ever: the SDK tells Python's logging of a viewer whose messages
+    are dropped, with that viewer's lock held; Python may go on with another thread meanwhile, which waits for that lock
+    and holds the interpreter's.
+    """
     with ExitStack() as stack:
 
         def one(*drones: Drone, **options: Any) -> tuple[View, FoxgloveServer]:
-            server = FoxgloveServer(drones, port=0, **options)
+            server, turn = FoxgloveServer(drones, port=0, **options), threading.Lock()
+            server.show = in_turn(server.show, turn)  # type: ignore[method-assign]
+            server.wanted = in_turn(server.wanted, turn)  # type: ignore[method-assign]
             return stack.enter_context(View(drones, server)), server
 
         yield one
+
+
+def in_turn(function: Callable[..., Any], turn: threading.Lock) -> Callable[..., Any]:
+    def call(*args: Any) -> Any:
+        with turn:
+            return function(*args)
+
+    return call
 
 
 def until(done: Callable[[], object], what: str) -> None:
