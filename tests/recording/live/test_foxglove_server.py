@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import sys
 import threading
@@ -240,6 +241,25 @@ def test_a_viewer_that_stands_still_loses_messages_and_nobody_else_does(fly: Fly
         lost = set(sent) - sequences(stalled)
         assert lost
         assert max(lost) < sent[-WAITING // 8]  # the oldest ones were dropped, not the newest
+
+
+def test_the_sdk_never_asks_pythons_logging(fly: Fly, show: Show, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It did with a viewer's lock held: a thread that wanted that lock kept the interpreter, and all stood still."""
+    asked: list[str] = []
+    plain = logging.Logger.isEnabledFor
+
+    def enabled(self: logging.Logger, level: int) -> bool:
+        asked.append(self.name)
+        return plain(self, level)
+
+    _, server = show(fly())
+    monkeypatch.setattr(logging.Logger, "isEnabledFor", enabled)
+    with Viewer(server.url) as stalled:
+        stalled.subscribe(FRAMES)
+        until(lambda: server.viewers == {FRAMES: 1}, "it has subscribed")
+        for seq in range(2 * WAITING):
+            server.show(frame_item(seq, bytes(50_000)))
+    assert not [name for name in asked if name.startswith("foxglove")]
 
 
 def newest(viewer: Viewer) -> int:

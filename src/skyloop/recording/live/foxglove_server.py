@@ -90,6 +90,9 @@ class FoxgloveServer:
             )
         except RuntimeError as error:
             raise LinkError(f"can't listen on {host}:{port}: {error}; choose another --port, or 0 for any") from None
+        # It would tell Python's logging with locks of its own held, and then no thread of this process may go on: one
+        # waits for such a lock while it holds the interpreter's.
+        self._sdk._foxglove_py.disable_logging()
         self.host = host
         self.port: int = self._server.port
         self._ready.set()
