@@ -172,6 +172,7 @@ class Pairing:
 
     def __init__(self, role: Role, clock: Clock = monotonic_ns) -> None:
         self.on_used: Callable[[str], None] = lambda _: None  #: called after a code was used, with who used it
+        self.on_expired: Callable[[], None] = lambda: None  #: called once a code's time was over
         self.role = role
         self._clock = clock
         self._code = ""
@@ -182,6 +183,12 @@ class Pairing:
         self._code = secrets.token_urlsafe(24)
         self._until_ns = self._clock() + nanoseconds(PAIRING_S)
         return self._code
+
+    def expire(self) -> None:
+        """Give up a code whose time is over; call it some times a minute."""
+        if self._code != "" and self._clock() >= self._until_ns:
+            self._code = ""
+            self.on_expired()
 
     def person(self, code: str, address: str) -> Person | None:
         """Return who sent a code, and use it up; None if it is not the one that works.
@@ -244,8 +251,7 @@ class TokenGate:
 
     def wrong_token_s(self, scope: Scope) -> float:
         """Count a wrong token, and return for how long the answer to it is to wait [s]."""
-        client = scope.get("client")
-        return self.wrong.another(str(client[0]) if client else "")
+        return self.wrong.another(_address(scope))
 
     def known(self, token: str) -> Person | None:
         """Return whose token this is, None if nobody's; a nearly right token takes as long as any other."""
@@ -258,10 +264,9 @@ class TokenGate:
 
     def logged_in(self, token: str, scope: Scope) -> Person | None:
         """Return who logs in with a token, or with a code to pair with, which is used up; None if it is neither."""
-        client = scope.get("client")
         found = self.known(token)
         if found is None and self.pairing is not None:
-            found = self.pairing.person(token, str(client[0]) if client else "somewhere")
+            found = self.pairing.person(token, _address(scope))
         return found
 
     def begin(self, person: Person, token: str = "") -> str:
@@ -373,6 +378,11 @@ def _token(line: str, where: str) -> Token:
 def _hash(value: str) -> bytes:
     """Hash a cookie: looking up a hash takes a time that reveals nothing of the cookie."""
     return hashlib.sha256(value.encode()).digest()
+
+
+def _address(scope: Scope) -> str:
+    client = scope.get("client")
+    return str(client[0]) if client else "a client that is gone"
 
 
 def _header(scope: Scope, wanted: bytes) -> str | None:
