@@ -31,6 +31,7 @@ from typing import Any, Final, Protocol
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.sessions import Session, SessionFile
 from skyloop.errors import FileFormatError, UsageError
+from skyloop.files import decoded
 from skyloop.messages import Role
 
 SESSION_S: Final = 12 * 3600.0  #: how long a log-in lasts
@@ -346,7 +347,7 @@ def read_tokens(path: Path) -> list[Token]:
     """
     try:
         mode = path.stat().st_mode
-        text = path.read_text(encoding="utf-8")
+        text = decoded(path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"the file of tokens {path} can't be read: {error}") from None
     if mode & (stat.S_IRWXG | stat.S_IRWXO):

@@ -10,7 +10,7 @@ import msgspec
 from skyloop.drivers.registry import driver_class
 from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.errors import FileFormatError, ParameterError, SkyloopError, UsageError
-from skyloop.files import expand
+from skyloop.files import decoded, expand
 from skyloop.messages import Value
 from skyloop.proxy.parameters import check_presets
 from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
@@ -120,7 +120,7 @@ def read_fleet(path: Path) -> Fleet:
     if len(data) > MAX_BYTES:
         raise FileFormatError(f"{path}: the file has more than {MAX_BYTES} bytes")
     try:
-        text = data.decode()
+        text = decoded(data)
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from None
     fleet = parse_fleet(text, str(path))
