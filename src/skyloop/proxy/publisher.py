@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import NS_PER_S, Clock
-from skyloop.errors import SkyloopError, UnknownNameError, UsageError
+from skyloop.errors import SkyloopError, UnknownNameError, UsageError, shortened
 from skyloop.messages import (
     CameraInfo,
     Capabilities,
@@ -353,7 +353,7 @@ class VehiclePublisher:
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
         """The hop to the vehicle changed, from the driver. Told at once; the flight acts on it at its next step."""
-        reason, remedy = (self._scrub(text)[:MAX_LINK_TEXT] for text in (reason, remedy))
+        reason, remedy = (shortened(self._scrub(text), MAX_LINK_TEXT) for text in (reason, remedy))
         with self._publishing:
             same = (state, reason, remedy) == (self.link_state, self.link_reason, self.link_remedy)
             before, self.link_state = self.link_state, state

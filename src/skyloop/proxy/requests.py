@@ -15,7 +15,7 @@ from queue import SimpleQueue
 from typing import Any, Final, Protocol
 
 from skyloop.clock import NS_PER_S, Clock, seconds
-from skyloop.errors import ParameterError, UnknownNameError
+from skyloop.errors import ParameterError, UnknownNameError, shortened
 from skyloop.messages import (
     AnswerTakeover,
     AnyReply,
@@ -182,9 +182,9 @@ class RequestDispatcher:
         except UnknownNameError as error:
             reply = Refused(Refusal.UNKNOWN_PARAMETER, str(error))
         except ParameterError as error:
-            reply = Refused(_refusal(error.code), str(error)[:MAX_MESSAGE])
+            reply = Refused(_refusal(error.code), shortened(str(error), MAX_MESSAGE))
         except Exception as error:  # noqa: BLE001  whatever a driver's code does, the asker gets an answer
-            reply = Refused(Refusal.DRIVER_FAILED, self._on_failure(kind.__name__, error)[:MAX_MESSAGE])
+            reply = Refused(Refusal.DRIVER_FAILED, shortened(self._on_failure(kind.__name__, error), MAX_MESSAGE))
         self._finish(session, request, reply)
 
     def _finish(self, session: Session, request: Request, body: AnyReply) -> None:
