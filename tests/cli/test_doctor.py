@@ -57,7 +57,7 @@ def test_a_terminal_that_lacks_characters_gets_others(encoding: str, monkeypatch
     with pytest.raises(SystemExit):
         main(["doctor"])
     out.flush()
-    lines = out.buffer.getvalue().decode(encoding).splitlines()  # type: ignore[attr-defined]
+    lines = out.buffer.getvalue().decode(encoding).splitlines()
     mark = "✓" if encoding == "utf-8" else "ok"
     assert lines[0].startswith(f"{mark} part: 0.5 ")
     assert lines[0].endswith("Zoe at ?" if encoding == "ascii" else "Zoë at ?")

@@ -19,6 +19,7 @@ import pytest
 
 import skyloop
 from skyloop.address import shown_address
+from skyloop.cockpit.access import Person, Token
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.camera_source import source_of
 from skyloop.drivers.mavlink.options import options_of as mavlink_options
@@ -30,10 +31,10 @@ from skyloop.host.control import Add, Status
 from skyloop.host.fleet import encode_handed, parse_fleet
 from skyloop.host.host import Host
 from skyloop.host.own_process import OwnProcessVehicle
-from skyloop.messages import Capabilities, GetParameter, LinkState, Severity
-from skyloop.messages.event import EventKind
+from skyloop.messages import Capabilities, EventKind, GetParameter, LinkState, Role, Severity
 from skyloop.proxy import Proxy
 from skyloop.proxy.audit import AuditTrail
+from skyloop.transport.fabric.packets import Key
 from skyloop.transport.memory import MemoryServer
 from tests.proxy.fake import App, Bench
 
@@ -184,6 +185,11 @@ def test_a_driver_that_fails_to_open_is_quoted_without_the_secrets() -> None:
         proxy.start()
     assert SECRET not in str(failed.value)
     assert failed.value.__suppress_context__
+
+
+def test_keys_and_tokens_do_not_show_themselves() -> None:
+    token = Token(Person(Role.PILOT, "ann"), SECRET.encode())
+    assert SECRET not in f"{token!r} {Key(3, SECRET.encode())!r}"
 
 
 def test_without_secrets_nothing_is_changed() -> None:

@@ -66,11 +66,14 @@ def test_after_an_end_that_nobody_announced_another_session_is_used() -> None:
 def test_a_start_that_fails_leaves_neither_session_nor_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """The network refused a declaration: the session stayed open, and its threads with it."""
     settings = FabricSettings(listen=(f"127.0.0.1:{free_port('127.0.0.1')}",), multicast=False)
-    released: list[object] = []
-    monkeypatch.setattr(
-        fabric_server, "release", lambda session, **how: released.append(session) or release(session, **how)
-    )  # type: ignore[func-returns-value]
-    real = fabric_server.layout.join
+    released: list[Session] = []
+
+    def counted(session: Session, *, linger: bool) -> None:
+        released.append(session)
+        release(session, linger=linger)
+
+    monkeypatch.setattr(fabric_server, "release", counted)
+    real = layout.join
 
     def refuse(*where: str) -> str:
         if where[1:] == ("*", "*"):
@@ -78,7 +81,7 @@ def test_a_start_that_fails_leaves_neither_session_nor_threads(monkeypatch: pyte
         return real(*where)
 
     with monkeypatch.context() as refusing:
-        refusing.setattr(fabric_server.layout, "join", refuse)
+        refusing.setattr(layout, "join", refuse)
         server = FabricServer("leaky", settings)
         with pytest.raises(LinkError, match="no declaration"):
             server.start(ServerLog())

@@ -24,7 +24,7 @@ import struct
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -160,7 +160,7 @@ class Token:
     """One line of the file of tokens."""
 
     person: Person
-    secret: bytes
+    secret: bytes = field(repr=False)
 
 
 class Pairing:
