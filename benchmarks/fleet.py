@@ -29,6 +29,7 @@ from skyloop.bench.waypoints import fly
 from skyloop.bench.workers import Pipe, Worker, Workers
 from skyloop.client import Drone, connect
 from skyloop.client.core import Access
+from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.host import Host
@@ -214,7 +215,7 @@ def serve(pipe: Pipe, case: Case) -> None:
     recorder = _Recorder()
     vehicles: list[BenchVehicle] = []
 
-    def make(_: str) -> BenchVehicle:
+    def make(_: VehicleUri) -> BenchVehicle:
         if case.busy_s:
             vehicles.append(_BusyVehicle(recorder.received, case.busy_s))
         else:
@@ -222,9 +223,9 @@ def serve(pipe: Pipe, case: Case) -> None:
         return vehicles[-1]
 
     host = Host(lambda _: None, make)
-    plain = VehicleSettings("", "bench://")
+    plain = VehicleSettings("", VehicleUri("bench"))
     if case.network:
-        plain = VehicleSettings("", "bench://", network="multicast", multicast=False, listen=(case.network,))
+        plain = VehicleSettings("", VehicleUri("bench"), network="multicast", multicast=False, listen=(case.network,))
     settings = [msgspec.structs.replace(plain, name=name) for name in _names(case)]
     host.add(settings[0])
     one = memory_bytes(os.getpid())

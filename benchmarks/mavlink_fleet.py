@@ -22,6 +22,7 @@ from skyloop.bench.workers import Pipe, Worker, Workers
 from skyloop.client import Drone, connect
 from skyloop.client.core import Access
 from skyloop.client.swarm import Swarm
+from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.loop import Loop
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import SkyloopError
@@ -143,7 +144,10 @@ def serve(pipe: Pipe, addresses: Sequence[str]) -> None:
     host = Host(lambda _: None)
     try:
         host.add_all(
-            [VehicleSettings(_name(number), f"{each}?rate={RATE_HZ:g}") for number, each in enumerate(addresses)]
+            [
+                VehicleSettings(_name(number), parse_uri(f"{each}?rate={RATE_HZ:g}"))
+                for number, each in enumerate(addresses)
+            ]
         )
         by_s = time.monotonic() + _UP_WITHIN_S
         while len(_up(host)) < len(addresses) and time.monotonic() < by_s:

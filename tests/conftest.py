@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,15 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """A user's directory of state for the tests alone: what proxies write there is nobody's flight."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def trusted_networks() -> Iterator[None]:
+    """Load the tests' own ONNX files without a child process that tries each first; tests/security tries them."""
+    with pytest.MonkeyPatch.context() as patch:
+        if find_spec("onnxruntime"):
+            patch.setattr("skyloop.vision.onnx.try_alone", lambda path: None)
         yield
 
 

@@ -13,6 +13,7 @@ from skyloop.errors import (
     SkyloopError,
     SwarmError,
     UnknownNameError,
+    shortened,
 )
 
 
@@ -41,3 +42,13 @@ def test_a_swarms_error_arrives_with_those_of_its_drones() -> None:
     assert str(arrived) == str(error)
     assert arrived.total == 3
     assert str(arrived.errors["one"]) == "late"
+
+
+def test_a_text_that_is_too_long_keeps_its_beginning_and_its_end() -> None:
+    assert shortened("x" * 30, 30) == "x" * 30
+    text = shortened(f"RuntimeError('no answer {'.' * 5000} by the radio: it is off')", 100)
+    assert len(text) == 100
+    assert text.startswith("RuntimeError('no answer")
+    assert text.endswith("by the radio: it is off')")
+    assert " … " in text
+    assert len(shortened("y" * 99, 10)) == 10

@@ -8,8 +8,13 @@ from pathlib import Path
 
 import pytest
 
+import skyloop.sim
+from skyloop.cockpit.access import read_tokens
+from skyloop.control.route import Route, RouteWaypoint, load_route
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import expand, read_bytes, read_json, read_text, replacing, write
+from skyloop.host.fleet import read_fleet
+from skyloop.sim.world_file import load_world
 
 
 def test_a_file_is_replaced_in_one_step(tmp_path: Path) -> None:
@@ -51,6 +56,26 @@ def test_a_link_stays_and_a_device_is_written_to(tmp_path: Path) -> None:
     assert (tmp_path / "x.txt").read_bytes() == b"new"
     write(Path(os.devnull), b"gone")
     assert stat.S_ISCHR(Path(os.devnull).stat().st_mode)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_texts_are_read_with_and_without_a_byte_order_mark(encoding: str, tmp_path: Path) -> None:
+    """Editors of Windows begin a text with one, and it was taken for a part of the first word."""
+
+    def file(name: str, text: str) -> Path:
+        path = tmp_path / name
+        path.write_text(text, encoding=encoding)
+        path.chmod(0o600)
+        return path
+
+    assert read_text(file("text", "Zoë\n"), "the text", 99) == "Zoë\n"
+    assert read_json(file("list", "[1]"), list[int], "a list", 99) == [1]
+    assert read_fleet(file("fleet.toml", 'name = "lab"\n')).name == "lab"
+    assert [one.person.name for one in read_tokens(file("tokens", "pilot 0123456789abcdef ann\n"))] == ["ann"]
+    shipped = Path(skyloop.sim.__file__).parent / "worlds" / "empty.toml"
+    assert load_world(file("mine.toml", shipped.read_text(encoding="utf-8"))).name == "mine"
+    route = Route(waypoints=(RouteWaypoint(x=0.0, y=0.0, z=1.0),))
+    assert load_route(file("route.json", route.to_json().decode())) == route
 
 
 def test_reading_has_one_kind_of_error(tmp_path: Path) -> None:

@@ -36,6 +36,17 @@ def report(total: float, **modules: float) -> dict[str, Any]:
     return {"totals": {"percent_covered": total}, "files": files}
 
 
+def test_the_package_names_no_account_that_is_not_the_projects() -> None:
+    text = (ROOT / "pyproject.toml").read_text()
+    assert "github" not in text.lower()
+    assert "urls" not in tomllib.loads(text)["project"]
+    hooks = tomllib.loads(text)["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]
+    readme = (ROOT / "README.md").read_text()
+    for each in hooks["substitutions"]:
+        readme = re.sub(each["pattern"], each["replacement"], readme)
+    assert not re.findall(r"\]\((?!https?://|#)[^)]*\)", readme), "relative links lead nowhere on the package's page"
+
+
 def test_coverage_that_keeps_its_floors(floor: ModuleType) -> None:
     assert floor.failures(report(93.0, proxy__lease=90.0, cli__bench=12.0), {}) == []
 

@@ -15,12 +15,18 @@ it is first used, so that ``import skyloop`` loads nothing heavy. More is in the
 
 from __future__ import annotations
 
+import os
 import re
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+# Dependencies that report on their users: off, before any of them is imported (docs/security.md has the list). Whoever
+# wants to be reported on sets the variable.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+
 #: Where each name is imported from.
 _HOMES = {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as \2$", _STUB, re.MULTILINE)}
 #: Where names may be that are not offered here, those first that load least.

@@ -24,6 +24,8 @@ _TAIL: Final = 2000  # bytes of a child's standard error that an error shows
 _LOOK_S: Final = 0.25  # how often a child that may fall silent is looked at
 #: How long what a dead child has written is read. A grandchild that holds the pipe keeps it open for longer.
 _DRAIN_S: Final = 1.0
+#: What a child is handed in its environment, which only its own user can read, as others can its command line.
+_HANDED: Final = "SKYLOOP_HANDED_OVER"
 _log = logging.getLogger(__name__)
 
 
@@ -66,7 +68,14 @@ class ChildProcess:
         stdout: What it writes to standard output; open until :meth:`close`.
     """
 
-    def __init__(self, command: Sequence[str], *, keep_errors: bool = True, inherited: Sequence[int] = ()) -> None:
+    def __init__(
+        self,
+        command: Sequence[str],
+        *,
+        keep_errors: bool = True,
+        inherited: Sequence[int] = (),
+        handed: str | None = None,
+    ) -> None:
         """Start the child.
 
         Args:
@@ -74,6 +83,7 @@ class ChildProcess:
             keep_errors: Keep what it writes to standard error, for :attr:`last_words`; if False, that goes where this
                 process writes its own.
             inherited: Numbers of descriptors that the child has too.
+            handed: What it gets of :func:`handed_over`: what is not for a command line, which everybody can read.
         """
         self._errors: IO[bytes] | None = tempfile.TemporaryFile() if keep_errors else None  # noqa: SIM115
         self._last_words = ""
@@ -85,6 +95,7 @@ class ChildProcess:
                 stderr=self._errors,
                 start_new_session=True,
                 pass_fds=inherited,
+                env=None if handed is None else {**os.environ, _HANDED: handed},
             )
         except BaseException:
             if self._errors is not None:
@@ -180,6 +191,11 @@ class ChildProcess:
             self._errors.close()
 
 
+def handed_over() -> str | None:
+    """Return what the parent has handed to this process beside its command line, once; None for nothing."""
+    return os.environ.pop(_HANDED, None)
+
+
 class RestartingChild:
     """Keeps one child running: whenever it ends another is started, until :meth:`stop`. Any thread.
 
@@ -200,6 +216,7 @@ class RestartingChild:
         started: Callable[[ChildProcess], object] = lambda _: None,
         silent: Callable[[], bool] | None = None,
         keep_errors: bool = False,
+        handed: str | None = None,
     ) -> None:
         """Prepare; :meth:`start` starts the first child.
 
@@ -212,6 +229,7 @@ class RestartingChild:
             started: Called with each child before anything of it is read, under the lock: must be quick.
             silent: Whether the present child has hung and is to be killed; asked four times a second.
             keep_errors: See :class:`ChildProcess`.
+            handed: See :class:`ChildProcess`.
         """
         self._command = command
         self._read = read
@@ -219,6 +237,7 @@ class RestartingChild:
         self._started = started
         self._silent = silent
         self._keep_errors = keep_errors
+        self._handed = handed
         self._changed = threading.Condition(threading.RLock())
         self._stopping = False
         self._reader: threading.Thread | None = None
@@ -266,7 +285,7 @@ class RestartingChild:
         with self._changed:
             if self._stopping:
                 return None
-            child = self.child = ChildProcess(self._command, keep_errors=self._keep_errors)
+            child = self.child = ChildProcess(self._command, keep_errors=self._keep_errors, handed=self._handed)
             self._started(child)
         self._reader = threading.Thread(target=self._listen, args=(child,), name=f"{self._name}-output", daemon=True)
         self._reader.start()

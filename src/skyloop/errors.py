@@ -31,6 +31,14 @@ from functools import partial
 from typing import Final, Self
 
 
+def shortened(text: str, most: int) -> str:
+    """Return a text of at most ``most`` characters, with its beginning and its end: causes stand at either."""
+    if len(text) <= most:
+        return text
+    ending = (most - 3) // 2
+    return f"{text[: most - 3 - ending]} … {text[len(text) - ending :]}"
+
+
 class Hint(StrEnum):
     """What may be done about an error. ``str(error)`` ends with it in Python's words; the command line has its own."""
 

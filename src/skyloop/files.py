@@ -15,6 +15,7 @@ from skyloop.errors import FileFormatError, UsageError
 
 T = TypeVar("T")
 
+MAX_TEXT: Final = 1 << 20  #: bytes of a list that a person writes
 MAX_RESULTS: Final = 256 << 20  #: bytes of a file of measurements; those of an hour take some megabytes
 
 
@@ -33,10 +34,18 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
     return content
 
 
+def decoded(content: bytes) -> str:
+    """A text in UTF-8, without the byte order mark that editors of Windows begin it with.
+
+    Raises :class:`UnicodeDecodeError`.
+    """
+    return content.decode("utf-8-sig")
+
+
 def read_text(path: str | Path, what: str, most: int) -> str:
-    """The same of a text in UTF-8."""
+    """The same of a text; see :func:`decoded`."""
     try:
-        return read_bytes(path, what, most).decode()
+        return decoded(read_bytes(path, what, most))
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{what} {path} is not UTF-8 text: {error}") from None
 
@@ -45,7 +54,7 @@ def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
     """The same of JSON, as this type."""
     content = read_bytes(path, what, most)
     try:
-        return msgspec.json.decode(content, type=kind)
+        return msgspec.json.decode(decoded(content), type=kind)
     except (msgspec.MsgspecError, UsageError, UnicodeDecodeError, RecursionError) as error:
         raise FileFormatError(f"{path} is not {what}: {error}") from None
 

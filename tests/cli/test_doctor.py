@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
+import sys
 from collections.abc import Iterator
 from types import ModuleType
 
 import pytest
 
-from skyloop.cli import doctor
+from skyloop.cli import doctor, main
 from skyloop.cli.findings import Finding, Health, as_text
 from skyloop.errors import MissingExtraError
 from tests.cli.conftest import Run
@@ -43,6 +45,24 @@ def test_a_machine_that_is_well(run: Run) -> None:
     assert f"sockets in {os.environ['SKYLOOP_RUNTIME_DIR']}" in ended.out
     assert "driver sim://: skyloop.drivers.sim" in ended.out
     assert "✗" not in ended.out
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "latin-1", "ascii", "utf-8"])
+def test_a_terminal_that_lacks_characters_gets_others(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ended in UnicodeEncodeError where the terminal has no check mark."""
+    findings = [Finding("part", health, "0.5 … 1 µs × Zoë at \udcff", "try → again") for health in Health]
+    monkeypatch.setattr(doctor, "examine", lambda: iter(findings))
+    out = io.TextIOWrapper(io.BytesIO(), encoding)
+    monkeypatch.setattr(sys, "stdout", out)
+    with pytest.raises(SystemExit):
+        main(["doctor"])
+    out.flush()
+    lines = out.buffer.getvalue().decode(encoding).splitlines()
+    mark = "✓" if encoding == "utf-8" else "ok"
+    assert lines[0].startswith(f"{mark} part: 0.5 ")
+    assert lines[0].endswith("Zoe at ?" if encoding == "ascii" else "Zoë at ?")
+    assert lines[1] == ("  → try → again" if encoding == "utf-8" else "  -> try -> again")
+    assert len(lines) == 6
 
 
 def test_a_part_that_is_not_installed_is_no_fault_and_is_told_with_what_installs_it(

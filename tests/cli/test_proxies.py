@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ import pytest
 import skyloop
 from skyloop.cli.sim import address
 from skyloop.cli.text import columns
+from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from tests.cli.conftest import FAST_SIM, Run
 from tests.processes.conftest import Process, eventually, in_terminal
@@ -69,7 +71,7 @@ def test_the_list_of_none_says_how_to_start_one(
 def test_a_stopped_proxy_is_told_by_every_command(
     run: Run, alpha: Process, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["skyloop.client.connect"], "NAME_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(import_module("skyloop.client.connect"), "NAME_TIMEOUT_S", 0.1)
     (tmp_path / "mine.py").write_text("import skyloop\nclass Mine(skyloop.Controller): pass\n")
     silent = f"the proxy at local:alpha (pid {alpha.pid}) was reached but did not answer"
     with stopped(alpha):
@@ -168,7 +170,8 @@ def test_a_process_that_simulates_makes_room_for_commands(run: Run, monkeypatch:
     run("proxy", "sim://?world=gates", "--name", "beta")
     run("proxy", "video://x.mp4")
     run("sim", "--world", "windy", "--option", "cameras=none", "--name", "gamma")
-    assert done == ["gates", ("sim://?world=gates", "beta"), ("video://x.mp4", "alpha"), "windy", ["gamma"]]
+    world, video = parse_uri("sim://?world=gates"), parse_uri("video://x.mp4")
+    assert done == ["gates", (world, "beta"), (video, "alpha"), "windy", ["gamma"]]
 
 
 @pytest.mark.parametrize(("cameras", "cores"), [("front", "1"), ("none", "OpenCV is not imported")])

@@ -120,6 +120,23 @@ def test_a_code_works_once_and_not_for_ever() -> None:
     assert pairing.person(late, HERE) is None
 
 
+def test_an_expired_code_is_replaced(capsys: pytest.CaptureFixture[str]) -> None:
+    now_ns = 0
+    pairing = Pairing(Role.PILOT, lambda: now_ns)
+    Announcer(pairing, loopback=False)("http://127.0.0.1:8123/")
+    first = capsys.readouterr().out.splitlines()[1].rpartition("#pair=")[2]
+    pairing.expire()
+    assert capsys.readouterr().out == "", "it works still"
+    now_ns = round(PAIRING_S * 1e9)
+    for _ in range(2):
+        pairing.expire()
+    told, shown = capsys.readouterr().out.splitlines()
+    assert told == "the address to pair with is too old now"
+    second = shown.rpartition("#pair=")[2]
+    assert pairing.person(first, HERE) is None
+    assert pairing.person(second, HERE) is not None
+
+
 def test_a_browser_is_paired(capsys: pytest.CaptureFixture[str]) -> None:
     pairing = Pairing(Role.PILOT)
     gate = TokenGate(list[Token](), "c", pairing=pairing)

@@ -66,6 +66,18 @@ def test_the_oldest_stranger_of_an_address_gives_way_to_a_newer_one() -> None:
     assert hall.admission.counts.displaced == 1
 
 
+def test_a_guesser_at_the_same_address_does_not_end_the_handshakes_of_people() -> None:
+    """A hundred wrong tokens a second, whose answers wait, ended each connection of the address within 0.3 s."""
+    hall = Hall()
+    person = hall.open()
+    for _ in range(100):
+        guess = hall.open()
+        assert hall.admission.requested(guess, None, hall.now_ns) == ""
+    assert person not in hall.ended
+    assert hall.admission.requested(person, PILOT, hall.now_ns) == ""
+    assert hall.admission.anonymous == SMALL.anonymous_of_address - 1
+
+
 def test_a_flood_from_one_address_ends_its_own_connections_and_no_others() -> None:
     hall = Hall()
     quiet = hall.open("quiet")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from datetime import datetime
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -138,11 +140,15 @@ def test_a_vehicle_without_a_position_is_told_how_to_get_one() -> None:
             FlyRoute(drone, TRIANGLE).run(seconds=1.0)
 
 
-def test_photos_are_named_by_time_waypoint_and_camera(tmp_path: Path) -> None:
+def test_photos_are_named_by_time_waypoint_and_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with skyloop.connect("sim://?cameras=front&width=64&fps=20", access="observe") as drone:
         path = save_photo(drone, tmp_path / "new", TakePhoto(2, None))
         assert path.read_bytes()[:3] == b"\xff\xd8\xff"
         assert path.name.endswith("-waypoint2-front.jpg")
+        monkeypatch.setattr("skyloop.control.route_flight.datetime", Mock(now=Mock(return_value=datetime(2026, 1, 2))))
+        names = {save_photo(drone, tmp_path / "new", TakePhoto(2, None)).name for _ in range(3)}
+        assert len(names) == 3, "within one moment"
+        assert all(name.startswith("20260102T000000.000-") for name in names)
         with pytest.raises(UnknownNameError, match="rear"):
             save_photo(drone, tmp_path, TakePhoto(1, "rear"))
         (tmp_path / "file").touch()

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Sink
+from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.host import Host
 from skyloop.host.vehicle import SharedVehicle
@@ -81,8 +82,8 @@ class Hosting:
             if thread.name == "skyloop-abandoned":
                 thread.join(max(0.0, until_s - time.monotonic()))
 
-    def _make(self, address: str) -> Vehicle:
-        return self.drivers[address.removeprefix("fake://")]
+    def _make(self, address: VehicleUri) -> Vehicle:
+        return self.drivers[address.place]
 
     def vehicle(self, name: str) -> Vehicle:
         """A driver for a vehicle of this name, which is not served yet."""
@@ -96,7 +97,7 @@ class Hosting:
 
     @staticmethod
     def settings(name: str) -> VehicleSettings:
-        return VehicleSettings(name, f"fake://{name}", presets=PATIENT)
+        return VehicleSettings(name, parse_uri(f"fake://{name}"), presets=PATIENT)
 
     def app(self, name: str, role: Role = Role.OBSERVER) -> App:
         """An application at a vehicle."""

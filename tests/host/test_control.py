@@ -11,10 +11,11 @@ import msgspec
 import pytest
 
 from skyloop.cli import main
+from skyloop.drivers.uri import parse_uri
 from skyloop.errors import LinkError, NameTakenError, RefusedError, UnknownNameError, UsageError
 from skyloop.host import control
 from skyloop.host.control import Add, AddNamed, Answer, ControlServer, Remove, Status, ask, chosen_host, running_hosts
-from skyloop.host.fleet import Defaults, FlightLimits
+from skyloop.host.fleet import Defaults, FlightLimits, encode_handed
 from skyloop.host.serve import Answering
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from tests.host.fleet import Hosting
@@ -181,11 +182,11 @@ def test_a_large_fleet_is_added_in_one_request(served: Hosting) -> None:
     zones = "; ".join(f"keep_out: polygon {number}.0 0.5, {number}.1 0.6, {number}.2 0.7" for number in range(6))
     many = tuple(
         msgspec.structs.replace(
-            settings, name=f"drone-{number}", address="no-such://x", presets={"safety.zones": zones}
+            settings, name=f"drone-{number}", address=parse_uri("no-such://x"), presets={"safety.zones": zones}
         )
         for number in range(500)
     )
-    assert len(msgspec.json.encode(Add(many))) > 1 << 17
+    assert len(encode_handed(Add(many))) > 1 << 17
     taken: list[control.Request] = []
     server = ControlServer("large", lambda request: taken.append(request) or Answer())  # type: ignore[func-returns-value]
     server.start()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from skyloop.drivers.uri import parse_uri
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.host.fleet import VehicleSettings, parse_fleet, read_fleet
 from skyloop.messages import Value
@@ -50,11 +51,11 @@ def test_defaults_hold_for_what_says_nothing_else() -> None:
     assert fleet.name == "lab"
     assert fleet.vehicles == (
         VehicleSettings(
-            "alpha", "sim://?seed=1", network="multicast", keys="keys/lab", presets=presets, own_process=True
+            "alpha", parse_uri("sim://?seed=1"), network="multicast", keys="keys/lab", presets=presets, own_process=True
         ),
         VehicleSettings(
             "bravo",
-            "sim://?seed=1",
+            parse_uri("sim://?seed=1"),
             presets=presets | {"limits.speed": 2.0, "safety.zones": "pillar: cylinder 1 0 0.5 0 3; box 3 3 0 5 4 2"},
             autostart=False,
         ),

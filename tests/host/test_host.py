@@ -7,6 +7,7 @@ from functools import partial
 
 import pytest
 
+from skyloop.drivers.uri import parse_uri
 from skyloop.errors import NameTakenError, RefusedError, UnknownNameError
 from skyloop.host import vehicle as vehicles
 from skyloop.host.fleet import VehicleSettings
@@ -255,7 +256,7 @@ def test_presets_are_in_force_from_the_beginning(hosting: Hosting) -> None:
     driver.native = tilt(0.5)
     driver.while_setting = lambda: driver.native.__setitem__(slice(None), tilt(0.2))
     presets: dict[str, Value] = {"limits.speed": 0.5, "limits.tilt": 0.2}
-    hosting.host.add(VehicleSettings("alpha", "fake://alpha", presets=presets))
+    hosting.host.add(VehicleSettings("alpha", parse_uri("fake://alpha"), presets=presets))
     proxy = hosting.shared("alpha").proxy
     assert proxy is not None
     wait_until(
@@ -271,7 +272,7 @@ def test_presets_are_in_force_from_the_beginning(hosting: Hosting) -> None:
 
 def test_a_vehicle_that_can_not_be_made_is_listed_as_failed(hosting: Hosting) -> None:
     with pytest.raises(RefusedError, match="KeyError"):
-        hosting.host.add(VehicleSettings("nobody", "fake://nobody"))
+        hosting.host.add(VehicleSettings("nobody", parse_uri("fake://nobody")))
     assert hosting.condition("nobody") == "failed"
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.child_process import ChildProcess, RestartingChild
+from skyloop.drivers.uri import parse_uri
 from skyloop.errors import RefusedError
 from skyloop.host import own_process
 from skyloop.host.fleet import VehicleSettings
@@ -29,7 +30,7 @@ def say(**more):
 
 def vehicle(code: str, lines: list[str]) -> OwnProcessVehicle:
     """One whose process runs this code."""
-    settings = VehicleSettings("a", "sim://", own_process=True)
+    settings = VehicleSettings("a", parse_uri("sim://"), own_process=True)
     return OwnProcessVehicle(settings, lines.append, (sys.executable, "-c", SAY + code))
 
 
@@ -147,11 +148,11 @@ def test_no_process_is_left_if_it_ends_while_it_is_started_again(monkeypatch: py
     dying = vehicle("say(); sys.stdin.read(1)", [])
     real, stopping = ChildProcess, threading.Event()
 
-    def slow(command: Sequence[str], *, keep_errors: bool) -> ChildProcess:
+    def slow(command: Sequence[str], *, keep_errors: bool, handed: str | None) -> ChildProcess:
         if begun:  # the second one
             stopping.set()
             time.sleep(0.2)
-        begun.append(real(command, keep_errors=keep_errors))
+        begun.append(real(command, keep_errors=keep_errors, handed=handed))
         return begun[-1]
 
     monkeypatch.setattr("skyloop.child_process.ChildProcess", slow)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import pytest
@@ -318,3 +319,26 @@ def test_a_flight_that_others_took_is_noted_no_more(tmp_path: Path) -> None:
         bench.driver.left = "RTL"
         bench.run(0.1)
         wait_until(lambda: not path.exists(), "it is somebody else's")
+
+
+def test_the_last_word_about_a_flight_is_written(tmp_path: Path) -> None:
+    """What changed while the file was written, just before the end, was lost: a landed flight stayed noted."""
+    record = FlightRecord(tmp_path / "alpha.flight", "fake://")
+    writing, go_on = threading.Event(), threading.Event()
+    write = record._write
+
+    def slow() -> None:
+        write()
+        writing.set()
+        go_on.wait(10)
+
+    record._write = slow  # type: ignore[method-assign]
+    record.start()
+    record.set(True)
+    assert writing.wait(10)
+    assert record.path.exists()
+    record.set(False)
+    record._closing = True  # close() was called while it still wrote
+    go_on.set()
+    record.close()
+    assert not record.path.exists()

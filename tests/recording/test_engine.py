@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ import skyloop
 from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.drivers.base import Sink
-from skyloop.errors import MissingExtraError, SkyloopError, UnknownNameError, UsageError
+from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UnknownNameError, UsageError
 from skyloop.logfile import layout
 from skyloop.logfile.layout import META_END, META_RECORDING, End, FrameRecord, ResultRecord, Start
 from skyloop.messages import (
@@ -112,6 +113,18 @@ def fly() -> Iterator[Fly]:
             return drone
 
         yield one
+
+
+def test_a_recorder_that_fails_to_start_leaves_no_open_file(
+    fly: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second drone's connection was gone: the file stayed open, and the writing thread with it."""
+    drones, path = [fly("one"), fly("two")], tmp_path / "flight.mcap"
+    monkeypatch.setattr(drones[1], "on_command", Mock(side_effect=LinkError("it is gone")))
+    with pytest.raises(LinkError, match="it is gone"):
+        skyloop.record(drones, path, min_free_mb=0)
+    assert files.is_complete(path), "it was closed, and can be read"
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("skyloop-record")]
 
 
 def until_has(path: Path, topic: str, count: int = 1) -> None:

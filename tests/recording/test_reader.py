@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
+from skyloop.drivers.replay.source import ReplaySource
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.logfile.layout import Channel, image_topic
 from skyloop.logfile.pictures import Picture, decode_image
 from skyloop.logfile.reader import Item, Recording
-from skyloop.logfile.times import Course, reported_ns
+from skyloop.logfile.times import Course, reported_ns, shifted
 from skyloop.messages import Encoding, Feedback, LogEntry, Parameter, ParameterType
-from tests.recording.flights import HEIGHT, UNIX_NS, WIDTH, Plan, picture_at, write_flight
+from skyloop.recording.review.tables import tables
+from tests.recording.flights import BEGIN_NS, HEIGHT, MS, UNIX_NS, WIDTH, Plan, feedback_at, picture_at, write_flight
 
 
 def counts(path: Path) -> Counter[str]:
@@ -221,6 +225,57 @@ def test_a_course_never_goes_back_and_is_not_led_astray() -> None:
     assert [course.follow(step) // 1_000_000 for step in steps] == [1000, 1020, 1020, 1020, 1040]
     assert course.follow(LogEntry("me", "x", 2_000_000_000, number=1.0)) == 2_000_000_000
     assert course.first_ns == 1_000_000_000
+
+
+def test_a_course_goes_on_when_the_proxys_computer_starts_again() -> None:
+    """Its clock begins anew: the rest of the flight had no time, and 60 s were a point."""
+    course = Course()
+    flight = [(10**8 + 20 * step, 20 * step) for step in range(100)]
+    flight += [(30_000 + 20 * step, 62_000 + 20 * step) for step in range(100)]  # 60 s later by the recorder's clock
+    times = [course.follow(feedback(own), log * 1_000_000 + 1) // 1_000_000 - 10**8 for own, log in flight]
+    assert times[99] == 1980
+    assert times[100] == 1980, "a single time may be wrong"
+    assert times[101:] == [62_020 + 20 * step for step in range(99)]
+    late = shifted(feedback(30_000 + 20 * 100), course.shift_ns)
+    assert late.published_ns // 1_000_000 - 10**8 == 62_000 + 20 * 100
+    assert late.captured_ns == late.published_ns - 5
+
+
+def test_a_flight_whose_proxy_started_again_is_replayed_and_exported_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tests.recording.flights._events", lambda *_: iter(()))  # whose clock is the first one
+
+    def after(at_ms: int) -> Feedback | None:
+        if at_ms < 1000:
+            return None
+        sample, begun_ns = feedback_at(plan, at_ms, 1), (30_000 - 1000) * MS - BEGIN_NS
+        return msgspec.structs.replace(
+            sample, captured_ns=sample.captured_ns + begun_ns, published_ns=sample.published_ns + begun_ns
+        )
+
+    plan = Plan(seconds=2.0, frame_ms=0, command_ms=0, lossy=False, chunk_size=2048, extra=after)
+    recording = Recording.open(write_flight(tmp_path / "flight.mcap", plan))
+    times = tables(recording, "alpha", (Channel.FEEDBACK,))["feedback"]["t_s"]
+    assert times[-1] == pytest.approx(1.98, abs=0.03)
+    source = ReplaySource(recording, recording.drone())
+    assert source.seconds == pytest.approx(1.98, abs=0.03)
+    moment = source.moment(source.first_ns + 1500 * MS)
+    assert moment.state is not None
+    assert moment.state.position_m == pytest.approx(feedback_at(plan, 1500, 1).position_m, abs=0.03)
+    assert moment.state.published_ns == pytest.approx(source.first_ns + 1500 * MS, abs=25 * MS)
+    played = [one.value.published_ns for one in source.samples() if isinstance(one.value, Feedback)]
+    steps = [(after - before) / MS for before, after in pairwise(played)]
+    assert sum(abs(step - 20) > 1 for step in steps) <= 2, "but for the one sample at the change"
+
+
+def test_times_of_applications_do_not_set_the_clock_anew() -> None:
+    course = Course()
+    assert course.follow(feedback(10**6)) == 10**12
+    for _ in range(5):
+        assert course.follow(LogEntry("me", "x", 1000, number=1.0)) == 10**12
+        assert course.follow(feedback(1000)) == 10**12, "old, and the next is right again"
+        assert course.follow(feedback(10**6)) == 10**12
 
 
 def test_a_course_goes_on_after_a_long_pause() -> None:

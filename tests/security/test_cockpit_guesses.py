@@ -21,6 +21,8 @@ from skyloop.cockpit.access import (
     LONGEST_S,
     MAX_ADDRESSES,
     MOST_IN_ALL_S,
+    Token,
+    TokenGate,
     WrongTokens,
 )
 from tests.cockpit.test_server import PILOT, ask, served
@@ -67,6 +69,16 @@ def test_addresses_kept_in_mind_are_few(caplog: pytest.LogCaptureFixture) -> Non
         assert 0 < wrong.another("a") <= LONGEST_S
     assert len(wrong._of_address) == MAX_ADDRESSES
     assert sum("from a" in record.message for record in caplog.records) == 7, "1, 2, 4, … 64"
+
+
+def test_a_guesser_who_is_gone_is_named_as_that(caplog: pytest.LogCaptureFixture) -> None:
+    gate = TokenGate(list[Token](), "c", ManualClock())
+    assert gate.wrong_token_s({"client": None}) == FIRST_S
+    assert gate.wrong_token_s({"client": ("10.0.0.1", 1)}) == FIRST_S
+    assert [record.message for record in caplog.records] == [
+        "1 wrong tokens from a client that is gone",
+        "1 wrong tokens from 10.0.0.1",
+    ]
 
 
 @pytest.mark.parametrize("by", ["header", "login"])

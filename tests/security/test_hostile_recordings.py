@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import struct
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 import av
 import cv2
 import lz4.frame
+import msgspec
 import numpy as np
 import pytest
 import zstandard
@@ -23,6 +25,7 @@ from mcap.writer import CompressionType, Writer
 
 from skyloop import pyav
 from skyloop.cli import main
+from skyloop.cockpit.recordings import Recordings
 from skyloop.drivers.replay.source import ReplaySource
 from skyloop.errors import FileFormatError, SkyloopError
 from skyloop.logfile import scan
@@ -396,6 +399,23 @@ def test_a_bad_file_is_a_row_with_its_reason(tmp_path: Path, flight: Path, monke
 
     monkeypatch.setattr(Recording, "open", fail)
     assert "what nobody thought of" in describe(worse).problem
+
+
+def test_a_file_name_that_is_no_text_hides_no_other(
+    tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One name that was not UTF-8 emptied the whole list, in the cockpit and in the terminal."""
+    for name in (b"good.mcap", b"caf\xe9.mcap"):
+        (Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name))).write_bytes(flight.read_bytes())
+    with pytest.raises(SystemExit):
+        main(["log", "list", str(tmp_path), "--json"])
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in rows] == ["caf\\xe9.mcap", "good.mcap"]
+    assert [row["drones"] for row in rows] == [["alpha"], ["alpha"]]
+    recordings = Recordings(tmp_path)
+    listed = recordings._past()
+    assert {row["name"] for row in msgspec.json.decode(msgspec.json.encode(listed))} == {"caf\\xe9.mcap", "good.mcap"}
+    assert recordings._path("caf\\xe9.mcap").read_bytes() == flight.read_bytes()
 
 
 def test_the_terminals_list_tells_of_all(

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import threading
+from types import SimpleNamespace
 
+import pytest
+
+from skyloop.errors import LinkError
 from skyloop.messages import LogEntry, encode
 from skyloop.transport.base import FEEDBACK, Dialer, TransportServer
 from skyloop.transport.conformance import TransportSuite
-from skyloop.transport.fabric import FabricServer, FabricSettings, dial, layout
+from skyloop.transport.fabric import FabricServer, FabricSettings, dial, layout, packets
+from skyloop.transport.fabric import server as fabric_server
 from skyloop.transport.fabric.client import FabricClient
 from skyloop.transport.fabric.config import free_port
 from skyloop.transport.fabric.delivery import Outgoing
-from skyloop.transport.fabric.session import Session
+from skyloop.transport.fabric.publishing import Publisher
+from skyloop.transport.fabric.sealing import PLAIN
+from skyloop.transport.fabric.session import Session, release
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 
 _numbers = itertools.count(1)
@@ -53,6 +61,53 @@ def test_after_an_end_that_nobody_announced_another_session_is_used() -> None:
             server.stop()
 
     serve_once(serve_once(None))
+
+
+def test_a_start_that_fails_leaves_neither_session_nor_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The network refused a declaration: the session stayed open, and its threads with it."""
+    settings = FabricSettings(listen=(f"127.0.0.1:{free_port('127.0.0.1')}",), multicast=False)
+    released: list[Session] = []
+
+    def counted(session: Session, *, linger: bool) -> None:
+        released.append(session)
+        release(session, linger=linger)
+
+    monkeypatch.setattr(fabric_server, "release", counted)
+    real = layout.join
+
+    def refuse(*where: str) -> str:
+        if where[1:] == ("*", "*"):
+            raise LinkError("no declaration is taken")
+        return real(*where)
+
+    with monkeypatch.context() as refusing:
+        refusing.setattr(layout, "join", refuse)
+        server = FabricServer("leaky", settings)
+        with pytest.raises(LinkError, match="no declaration"):
+            server.start(ServerLog())
+    assert len(released) == 1
+    assert not [thread.name for thread in threading.enumerate() if "leaky" in thread.name]
+    assert server._session is None
+    assert server._declared == []
+    again = FabricServer("leaky", settings)  # the port is free, and so is the name
+    again.start(ServerLog())
+    again.stop()
+
+
+def test_names_of_forms_are_forgotten_with_their_last_reader() -> None:
+    """Each new size of a camera's pictures left a topic behind, for as long as the proxy ran."""
+    publisher = Publisher("alpha", "0" * 16, PLAIN)
+    publisher.video.topic_problem = lambda _: ""
+    connection = SimpleNamespace(
+        id=1, lock=threading.Lock(), ended=False, left=False, topics=dict[str, int](), paces=dict[str, object]()
+    )
+    for scale in range(100, 150):
+        topic = f"video/front?scale=0.{scale}"
+        for on in (True, False):
+            assert publisher.subscribe(connection, packets.Subscribe(topic, on))  # type: ignore[arg-type]
+    assert publisher._numbers == {}
+    assert publisher._subscribed == {}
+    publisher.video.end()
 
 
 def test_a_subscription_arrives_where_much_waits_before_it() -> None:

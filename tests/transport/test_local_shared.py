@@ -249,3 +249,15 @@ def test_a_socket_that_was_dropped_meanwhile_is_left_alone(served: Served, react
     assert served.client.send(b"goes on")
     wait_until(lambda: served.packets, "a packet")
     assert served.got(b"goes on")
+
+
+def test_a_server_stops_after_its_reactor_has_ended() -> None:
+    """It waited for ever for its connections, or raised that the reactor's epoll was closed."""
+    reactor = Reactor()
+    served = Served(reactor)
+    reactor.close()
+    served.server.stop()
+    wait_until(lambda: bool(served.heard.closings), "the client hears of the end")
+    assert served.log.left
+    assert reactor.empty
+    served.client.close()

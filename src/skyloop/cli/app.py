@@ -15,6 +15,7 @@ from skyloop.cli import wording
 from skyloop.cli.commands import COMMANDS, Entry
 from skyloop.cli.naming import with_place
 from skyloop.cli.plain_help import Command, Group, WithBehaviours, width
+from skyloop.cli.text import make_printable
 from skyloop.errors import ParameterError, SkyloopError
 
 _log = logging.getLogger(__name__)
@@ -85,6 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
     """Run a command line under its name, and exit as :func:`main` does."""
+    make_printable()
     try:
         code = app(arguments, prog_name=name, standalone_mode=False)
     except KeyboardInterrupt:

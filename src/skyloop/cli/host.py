@@ -150,13 +150,12 @@ def _prepare(fleet: Fleet) -> None:
     from skyloop.cli.network import warn_if_open
     from skyloop.cli.simulating import settle
     from skyloop.drivers.sim import options_of
-    from skyloop.drivers.uri import parse_uri
     from skyloop.host.vehicle import network_of
 
     opened = [vehicle.name for vehicle in fleet.vehicles if (net := network_of(vehicle)) and net.tls is None]
     for vehicle in fleet.vehicles:
         if opened[:1] == [vehicle.name]:
             warn_if_open(network_of(vehicle), opened)
-        uri = parse_uri(vehicle.address)
+        uri = vehicle.address
         if uri.scheme == "sim" and not vehicle.own_process:
             settle(options_of(uri))

@@ -85,7 +85,7 @@ def list_recordings(
     import msgspec
 
     from skyloop.cli import log_tables
-    from skyloop.logfile.listing import ENDING, describe
+    from skyloop.logfile.listing import ENDING, describe, shown_name
 
     try:
         paths = sorted(path for path in folder.iterdir() if path.suffix == ENDING)
@@ -93,7 +93,7 @@ def list_recordings(
         raise UsageError(f"{folder}: {error.strerror}") from None
     rows = [(path, describe(path)) for path in paths]
     if json:
-        found = [{"name": path.name, **msgspec.structs.asdict(summary)} for path, summary in rows]
+        found = [{"name": shown_name(path), **msgspec.structs.asdict(summary)} for path, summary in rows]
         typer.echo(msgspec.json.encode(found).decode())
     elif rows:
         console().print(log_tables.listing(rows))

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from skyloop.cli.text import named
 from skyloop.clock import NS_PER_S
-from skyloop.logfile.listing import Described
+from skyloop.logfile.listing import Described, shown_name
 from skyloop.logfile.reader import Recording
 from skyloop.recording.review.compare import Comparison
 from skyloop.recording.review.recover import Recovered
@@ -38,7 +38,7 @@ def listing(rows: Sequence[tuple[Path, Described]]) -> Table:
         table.add_column(title, overflow="fold")
     for path, summary in rows:
         table.add_row(
-            Text(path.name),
+            Text(shown_name(path)),
             "" if summary.started is None else time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(summary.started)),
             "" if summary.seconds is None else f"{summary.seconds:.1f} s",
             Text(", ".join(summary.drones)),

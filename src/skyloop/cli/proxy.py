@@ -43,11 +43,12 @@ def proxy(
 
     Applications are of this host, and with --network of others too.
     """
+    from skyloop.child_process import handed_over
     from skyloop.drivers.uri import parse_uri
     from skyloop.proxy.serve import serve
 
     settings = settings_of(network, listen, connect, multicast, keys)
-    vehicle = parse_uri(uri)
+    vehicle = parse_uri((handed_over() if parent_fd is not None else None) or uri)
     if vehicle.scheme == "sim":
         from skyloop.cli.simulating import settle
         from skyloop.drivers.sim import options_of
@@ -55,7 +56,7 @@ def proxy(
         settle(options_of(vehicle))
     warn_if_open(settings, [name])
     serve(
-        uri,
+        vehicle,
         name,
         make_end=server_ends(settings, group),
         parent_fd=parent_fd,

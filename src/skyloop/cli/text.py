@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
+import io
 import os
 import sys
+import unicodedata
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
@@ -12,6 +15,31 @@ if TYPE_CHECKING:
     from rich.table import Column
 
 _PIPE_COLUMNS: Final = 10_000
+_PLAIN_ERRORS: Final = "skyloop.plain"
+#: What is written for characters that a terminal's encoding lacks; others lose their accents, or become a "?".
+_PLAIN: Final = {
+    **{"✓": "ok", "✗": "x", "→": "->", "←": "<-", "↑": "^", "↓": "v", "–": "-", "−": "-", "─": "-", "│": "|", "·": "."},
+    **{"×": "x", "°": " deg", "µ": "u", "μ": "u", "±": "+-", "≤": "<=", "≥": ">=", "π": "pi", "ω": "w", "√": "sqrt"},
+}
+
+
+def make_printable() -> None:
+    """Let standard output and standard error take every text, also where their encoding lacks some characters."""
+    codecs.register_error(_PLAIN_ERRORS, _plain)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "backslashreplace"):
+            stream.reconfigure(errors=_PLAIN_ERRORS)
+
+
+def _plain(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    lacking = error.object[error.start : error.end]
+    return "".join(_PLAIN.get(one) or _unaccented(one) or "?" for one in lacking), error.end
+
+
+def _unaccented(character: str) -> str:
+    return unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
 
 
 def columns(rows: Iterable[tuple[str, ...]]) -> list[str]:

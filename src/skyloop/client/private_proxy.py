@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
+from skyloop.address import shown_address
 from skyloop.child_process import GRACE_S, ChildProcess
 from skyloop.client.connection import Scheduler
 from skyloop.errors import LinkError, NoAnswerError, UsageError
@@ -41,10 +42,10 @@ class PrivateProxy:
         scheme = re.sub(r"[^a-z0-9]", "", uri.partition("://")[0].lower()) or "vehicle"
         self.name = f"{scheme[:16]}-{os.getpid()}-{next(_numbers)}"
         self.reach = self.name
-        self.uri = uri
+        self.uri = shown_address(uri)
         self.scheduler = Scheduler()
         self._served = False  # it may have a vehicle in the air
-        self._process = ChildProcess([*command, uri, "--name", self.name, "--parent-fd", "0"])
+        self._process = ChildProcess([*command, self.uri, "--name", self.name, "--parent-fd", "0"], handed=uri)
         self.pid = self._process.pid  #: process id of the child
 
     def dialer(self, deadline_s: float) -> Dialer:

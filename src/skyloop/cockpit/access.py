@@ -24,13 +24,14 @@ import struct
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.sessions import Session, SessionFile
 from skyloop.errors import FileFormatError, UsageError
+from skyloop.files import decoded
 from skyloop.messages import Role
 
 SESSION_S: Final = 12 * 3600.0  #: how long a log-in lasts
@@ -159,7 +160,7 @@ class Token:
     """One line of the file of tokens."""
 
     person: Person
-    secret: bytes
+    secret: bytes = field(repr=False)
 
 
 class Pairing:
@@ -172,6 +173,7 @@ class Pairing:
 
     def __init__(self, role: Role, clock: Clock = monotonic_ns) -> None:
         self.on_used: Callable[[str], None] = lambda _: None  #: called after a code was used, with who used it
+        self.on_expired: Callable[[], None] = lambda: None  #: called once a code's time was over
         self.role = role
         self._clock = clock
         self._code = ""
@@ -182,6 +184,12 @@ class Pairing:
         self._code = secrets.token_urlsafe(24)
         self._until_ns = self._clock() + nanoseconds(PAIRING_S)
         return self._code
+
+    def expire(self) -> None:
+        """Give up a code whose time is over; call it some times a minute."""
+        if self._code != "" and self._clock() >= self._until_ns:
+            self._code = ""
+            self.on_expired()
 
     def person(self, code: str, address: str) -> Person | None:
         """Return who sent a code, and use it up; None if it is not the one that works.
@@ -244,8 +252,7 @@ class TokenGate:
 
     def wrong_token_s(self, scope: Scope) -> float:
         """Count a wrong token, and return for how long the answer to it is to wait [s]."""
-        client = scope.get("client")
-        return self.wrong.another(str(client[0]) if client else "")
+        return self.wrong.another(_address(scope))
 
     def known(self, token: str) -> Person | None:
         """Return whose token this is, None if nobody's; a nearly right token takes as long as any other."""
@@ -258,10 +265,9 @@ class TokenGate:
 
     def logged_in(self, token: str, scope: Scope) -> Person | None:
         """Return who logs in with a token, or with a code to pair with, which is used up; None if it is neither."""
-        client = scope.get("client")
         found = self.known(token)
         if found is None and self.pairing is not None:
-            found = self.pairing.person(token, str(client[0]) if client else "somewhere")
+            found = self.pairing.person(token, _address(scope))
         return found
 
     def begin(self, person: Person, token: str = "") -> str:
@@ -341,7 +347,7 @@ def read_tokens(path: Path) -> list[Token]:
     """
     try:
         mode = path.stat().st_mode
-        text = path.read_text(encoding="utf-8")
+        text = decoded(path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"the file of tokens {path} can't be read: {error}") from None
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
@@ -373,6 +379,11 @@ def _token(line: str, where: str) -> Token:
 def _hash(value: str) -> bytes:
     """Hash a cookie: looking up a hash takes a time that reveals nothing of the cookie."""
     return hashlib.sha256(value.encode()).digest()
+
+
+def _address(scope: Scope) -> str:
+    client = scope.get("client")
+    return str(client[0]) if client else "a client that is gone"
 
 
 def _header(scope: Scope, wanted: bytes) -> str | None:

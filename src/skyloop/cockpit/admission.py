@@ -1,9 +1,10 @@
 """How many connections may be open, and for how long one may be silent. Times are arguments.
 
 A connection is *anonymous* until a request of a person who may come in was read from it. Anonymous connections have few
-places, and the newest always has one: the oldest of the address that has most gives up its own. So a flood of strangers
-displaces itself, and somebody who sends a request at once is served in the midst of it. People who are logged in have
-places of their own, some of them for pilots alone, and nobody else's connections take those away.
+places, and the newest always has one: another of the address that has most gives up its own, one that has asked in vain
+before the oldest. So a flood of strangers displaces itself, and somebody who sends a request at once is served in the
+midst of it. People who are logged in have places of their own, some of them for pilots alone, and nobody else's
+connections take those away.
 """
 
 from __future__ import annotations
@@ -59,6 +60,7 @@ class Connection:
     end: Callable[[], None]
     person: Person | None = None
     deadline_ns: int | None = None  #: by then something must have happened
+    asked: bool = False  #: whether a request came over it of somebody who is not known
 
 
 @dataclass(slots=True)
@@ -101,7 +103,7 @@ class Admission:
         connection.deadline_ns = now_ns + nanoseconds(HEADER_S)
 
     def shed(self) -> None:
-        """End the oldest anonymous connection of the address that has most of them."""
+        """End an anonymous connection of the address that has most of them."""
         if self._anonymous:
             self._displace(max(self._anonymous, key=lambda address: len(self._anonymous[address])))
 
@@ -117,6 +119,7 @@ class Admission:
             Why it is refused; empty if it is not.
         """
         if person is None:
+            connection.asked = True
             connection.deadline_ns = now_ns + nanoseconds(ANSWER_S)
             return ""
         new = connection.person is None or connection.person.role is not person.role
@@ -169,8 +172,11 @@ class Admission:
         return ""
 
     def _displace(self, address: str) -> None:
+        # Whoever has asked and is not known, such as with a wrong token, goes before those who have not asked yet: else
+        # a guesser whose answers wait would end the handshakes of people at the same address.
         self.counts.displaced += 1
-        self._end(next(iter(self._anonymous[address])))
+        of_address = self._anonymous[address]
+        self._end(next((one for one in of_address if one.asked), next(iter(of_address))))
 
     def _end(self, connection: Connection) -> None:
         self.closed(connection)

@@ -21,7 +21,7 @@ from skyloop.cockpit.recorders import Recorder, Replay, Running, progress, start
 from skyloop.cockpit.recording_files import Mark, Notes
 from skyloop.cockpit.reports import Reports
 from skyloop.errors import FileFormatError, RefusedError, UnknownNameError, UsageError
-from skyloop.logfile.listing import ENDING, Described, describe
+from skyloop.logfile.listing import ENDING, Described, describe, shown_name
 from skyloop.messages import Refusal
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Recordings:
         self._looking = asyncio.Lock()
         self._running: dict[str, Running] = {}
         self._numbers = itertools.count(1)
-        self._known: dict[tuple[str, int, int], Described] = {}  # what is in a file, by its name, size and time
+        self._known: dict[tuple[Path, int, int], Described] = {}  # what is in a file, by its name, size and time
 
     def drones(self) -> set[str]:
         """Return the names of the drones that are being recorded."""
@@ -258,7 +258,7 @@ class Recordings:
             made = await self._timelines.make(replay.path, replay.recorded)
             self._made = {**dict(list(self._made.items())[1 - MAX_CHILDREN :]), key: made}
         notes = await asyncio.to_thread(recording_files.read_notes, replay.path)
-        return {"recording": replay.path.name, "notes": notes, "timeline": msgspec.Raw(self._made[key].encode())}
+        return {"recording": shown_name(replay.path), "notes": notes, "timeline": msgspec.Raw(self._made[key].encode())}
 
     async def end_replay(self, name: str) -> None:
         """End a replay.
@@ -300,7 +300,7 @@ class Recordings:
             return await asyncio.to_thread(write, await self.path(name))
 
     def _path(self, name: str) -> Path:
-        known = {path.name: path for path in self._files()}
+        known = {shown_name(path): path for path in self._files()}
         if name not in known:
             raise UnknownNameError("recording", name, known)
         return known[name]
@@ -321,11 +321,11 @@ class Recordings:
                 status = path.stat()
                 found.append((status.st_mtime_ns, path, status.st_size))
         newest = sorted(found, reverse=True)[:MOST_LISTED]
-        known = {(path.name, size, at_ns): path for at_ns, path, size in newest}
-        self._known = {key: self._known.get(key) or describe(path) for key, path in known.items()}
+        keys = [(path, size, at_ns) for at_ns, path, size in newest]
+        self._known = {key: self._known.get(key) or describe(key[0]) for key in keys}
         return [
-            {"name": name, "size": size, **msgspec.structs.asdict(entry), **_noted(self.folder / name)}
-            for (name, size, _), entry in self._known.items()
+            {"name": shown_name(path), "size": size, **msgspec.structs.asdict(entry), **_noted(path)}
+            for (path, size, _), entry in self._known.items()
         ]
 
     def _make_folder(self) -> None:

@@ -275,6 +275,7 @@ def _serve(
     world: WorldGeometry | None,
     metrics: str | None,
 ) -> None:
+    from skyloop.cockpit.access import TokenGate
     from skyloop.cockpit.app import create_app
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.recordings import Recordings
@@ -301,7 +302,9 @@ def _serve(
 
             endpoint = beside.enter_context(serve(lambda: fleet_sources(fleet), metrics))
             print(endpoint.announcement, file=sys.stderr, flush=True)
-        asyncio.run(_run(server, listener, lambda: on_ready(page), stop))
+        pairing = gate.pairing if isinstance(gate, TokenGate) else None
+        look = _idle if pairing is None else pairing.expire
+        asyncio.run(_run(server, listener, lambda: on_ready(page), stop, look))
 
 
 def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = monotonic_ns) -> ProtocolFactory:
@@ -330,6 +333,7 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
+            self.client = self.client or (self._connection.address, 0)  # it may be gone already
             self._connection.end = transport.abort
             tls = transport.get_extra_info("ssl_object")
             self.app_state = {
@@ -375,8 +379,16 @@ def quiet_server(app: Starlette) -> uvicorn.Server:
     return QuietServer(config)
 
 
+def _idle() -> None:
+    pass
+
+
 async def _run(
-    server: uvicorn.Server, listener: Listener, on_ready: Callable[[], None], stop: threading.Event | None
+    server: uvicorn.Server,
+    listener: Listener,
+    on_ready: Callable[[], None],
+    stop: threading.Event | None,
+    look: Callable[[], None],
 ) -> None:
     ending = asyncio.Event()
     if threading.current_thread() is threading.main_thread():
@@ -391,6 +403,7 @@ async def _run(
         on_ready()
     while not serving.done():
         await asyncio.wait([serving], timeout=_LOOK_S)
+        look()
         if ending.is_set() or listening.done() or (stop is not None and stop.is_set()):
             listening.cancel()
             server.should_exit = True

@@ -57,7 +57,7 @@ def timeline(recording: Recording, drone: str) -> dict[str, Any]:
     for item in recording.items(drone, channels):
         if isinstance(item.value, LogEntry) and course.first_ns is None:
             continue  # replays don't play logs: they begin with another sample
-        at_s = round(seconds(course.follow(item.value) - (course.first_ns or 0)), 3)
+        at_s = round(seconds(course.follow(item.value, item.entry.log_ns) - (course.first_ns or 0)), 3)
         value = item.value
         if isinstance(value, Event) and value.kind not in _LEFT_OUT:
             text = value.text[:MAX_TEXT]

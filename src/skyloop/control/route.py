@@ -164,7 +164,7 @@ def load_route(path: str | Path) -> Route:
         FileFormatError: It can't be read.
         UsageError: It is no route; the message says where and why.
     """
-    content = files.read_bytes(path, "the route", LARGEST_FILE)
+    content = files.read_text(path, "the route", LARGEST_FILE)
     try:
         return parse_route(content)
     except UsageError as error:

@@ -194,11 +194,15 @@ def save_photo(drone: Drone, folder: Path, wanted: TakePhoto) -> Path:
     done, jpeg = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     if not done:
         raise UsageError(f"frame {frame.seq} of {camera} could not be made a JPEG")
-    moment = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
-    path = folder / f"{moment}-waypoint{wanted.waypoint}-{camera}.jpg"
+    moment = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S.%f")[:-3]
+    name = f"waypoint{wanted.waypoint}-{camera}.jpg"
+    path, number = folder / f"{moment}-{name}", 1
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder} can't be made: {error.strerror or error}") from None
+    while path.exists():  # of the same moment, as after a clock was set back
+        number += 1
+        path = folder / f"{moment}-{number}-{name}"
     write(path, jpeg.tobytes())
     return path

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qsl, urlsplit
 
+from skyloop.address import without_secrets
 from skyloop.errors import UsageError
 
 DEVICE_FORMAT: Final = "v4l2"
@@ -35,7 +36,7 @@ _LISTENING: Final = frozenset({"udp", "rtp"})
 class CameraSource:
     """What FFmpeg opens, and how."""
 
-    name: str  #: address or path
+    name: str = field(repr=False)  #: address or path, with its secrets
     scheme: str  #: of the address; empty for a device
     options: Mapping[str, str] = field(default_factory=dict)  #: FFmpeg's
     sdp: str = ""  #: RFC 4566, for a session that nobody describes
@@ -73,7 +74,7 @@ def source_of(text: str, where: str) -> CameraSource:
         return CameraSource(text, "")
     if not separator or scheme not in _WAYS:
         ways = ", ".join(f"{way}://…" for way in _WAYS)
-        raise UsageError(f"{where} is {text!r} and must be one of {ways} or a device /dev/video…")
+        raise UsageError(f"{where} is {without_secrets(text)!r} and must be one of {ways} or a device /dev/video…")
     try:
         parts = urlsplit(text)
         named = parts.port != 0 and (bool(parts.hostname) or scheme in _LISTENING)
@@ -85,14 +86,6 @@ def source_of(text: str, where: str) -> CameraSource:
         return CameraSource(text, scheme, _WAYS[scheme], _sdp_of(text, where), loses=True)
     fallback = {**_RTSP, **_REORDER, "rtsp_transport": "udp"} if scheme == "rtsp" else None
     return CameraSource(text, scheme, _WAYS[scheme], fallback=fallback, loses=scheme == "udp")
-
-
-def without_secrets(source: str) -> str:
-    """Return an address without what may be a secret: user, password and query."""
-    if not is_address(source):
-        return source
-    parts = urlsplit(source)
-    return parts._replace(netloc=parts.netloc.rpartition("@")[2], query="", fragment="").geturl()
 
 
 def _sdp_of(text: str, where: str) -> str:
@@ -109,7 +102,7 @@ def _sdp_of(text: str, where: str) -> str:
         version = ipaddress.ip_address(address).version
     except ValueError:
         raise UsageError(
-            f"{where} is {text!r}, which needs an IP address of this host or a multicast group, "
+            f"{where} is {without_secrets(text)!r}, which needs an IP address of this host or a multicast group, "
             f"or none: rtp://:{RTP_PORT}"
         ) from None
     if unknown := options.keys() - _RTP_OPTIONS:

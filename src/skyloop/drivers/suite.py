@@ -185,9 +185,9 @@ class DriverSuite:
     def test_unknown_option_is_refused(self) -> None:
         """The constructor refuses an option that the driver does not know, and names it."""
         good = parse_uri(self.uri)
-        options = {**good.options, "no_such_option_at_all": "1"}
+        options = {name: good.reveal(name) or "" for name in good.options} | {"no_such_option_at_all": "1"}
         try:
-            self.make(VehicleUri(good.scheme, good.place, options))
+            self.make(VehicleUri(good.scheme, good.reveal_place(), options))
         except UsageError as error:
             reported = str(error)
         else:

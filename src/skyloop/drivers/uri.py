@@ -4,32 +4,96 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from typing import Final
 from urllib.parse import parse_qsl, unquote
 
+from skyloop.address import HIDDEN, is_broken, shown_address, shown_name, without_secrets
 from skyloop.errors import UsageError
 
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
 
-@dataclass(frozen=True, slots=True)
 class VehicleUri:
-    """A parsed vehicle address.
+    """A parsed vehicle address that shows itself without its secrets, wherever it goes.
 
-    Args:
+    ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles have neither users nor passwords nor keys (see
+    :mod:`skyloop.address`). Only what opens the vehicle asks for those, with :meth:`reveal_place` and :meth:`reveal`.
+
+    Attributes:
         scheme: The driver's name.
         place: What stands between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
         options: Names and values as they were given, percent-decoded.
-        text: The address as it was given; empty for one that was made in code.
     """
 
-    scheme: str
-    place: str = ""
-    options: dict[str, str] = field(default_factory=dict)
-    text: str = ""
+    __slots__ = ("_given", "_secrets", "options", "place", "scheme")
+
+    def __init__(self, scheme: str, place: str = "", options: Mapping[str, str] | None = None, text: str = "") -> None:
+        """Store an address.
+
+        Args:
+            scheme: The driver's name.
+            place: A host, a path, or nothing.
+            options: By name.
+            text: The address as it was given; empty for one that was made in code.
+        """
+        given = dict(options or {})
+        broken = is_broken(given)
+        self.scheme: Final = scheme
+        self.place: Final = without_secrets(place, broken=broken)
+        self.options: Final[Mapping[str, str]] = {
+            shown_name(name): without_secrets(value, name, broken=broken) if value else value
+            for name, value in given.items()
+        }
+        self._given: Final = (place, given, text)
+        pairs = {text: shown_address(text), place: self.place}
+        pairs |= {value: without_secrets(value, name, broken=broken) for name, value in given.items() if value}
+        for value in (place, *given.values()):
+            user, at, _ = value.partition("://")[2].rpartition("@")
+            password = user.partition(":")[2] or user
+            if at and password:
+                pairs[password] = HIDDEN
+        self._secrets: Final = sorted(
+            ((one, shown) for one, shown in pairs.items() if one != shown), key=lambda pair: -len(pair[0])
+        )
 
     def __str__(self) -> str:
-        return self.text or f"{self.scheme}://{self.place}"
+        return shown_address(self._given[2]) or f"{self.scheme}://{self.place}"
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self)!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, VehicleUri) and (self.scheme, self._given) == (other.scheme, other._given)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __copy__(self) -> VehicleUri:
+        return self
+
+    def __deepcopy__(self, _: object) -> VehicleUri:
+        return self
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return VehicleUri, (self.scheme, self.place, self.options, str(self))
+
+    def reveal_place(self) -> str:
+        """Return the place as it was given, with its secrets: for opening it, and for nothing that is shown or kept."""
+        return self._given[0]
+
+    def reveal(self, option: str) -> str | None:
+        """Return an option as it was given, as :meth:`reveal_place` does; None if it was not."""
+        return self._given[1].get(option)
+
+    def reveal_text(self) -> str:
+        """Return the whole address as it was given: for the process that serves it, and for nothing else."""
+        return self._given[2] or f"{self.scheme}://{self._given[0]}"
+
+    def scrub(self, text: str) -> str:
+        """Return a text, such as that of a library's error, with the secrets of this address hidden."""
+        for given, shown in self._secrets:
+            text = text.replace(given, shown)
+        return text
 
     def number(self, option: str, default: float, *, minimum: float = -math.inf, maximum: float = math.inf) -> float:
         """Return an option as a finite number within a range.
@@ -43,7 +107,7 @@ class VehicleUri:
         Raises:
             UsageError: It is not a finite number within the range.
         """
-        given = self.options.get(option)
+        given = self.reveal(option)
         if given is None:
             return default
         try:
@@ -51,8 +115,9 @@ class VehicleUri:
         except ValueError:
             value = math.nan
         if not (math.isfinite(value) and minimum <= value <= maximum):
+            shown = self.options[option]
             raise UsageError(
-                f"{self}: option {option} is {given!r} and must be a number from {minimum:g} to {maximum:g}"
+                f"{self}: option {option} is {shown!r} and must be a number from {minimum:g} to {maximum:g}"
             )
         return value
 
@@ -103,10 +168,11 @@ def parse_uri(text: str) -> VehicleUri:
     """
     scheme, separator, rest = text.partition("://")
     if not separator or not _SCHEME.match(scheme):
-        raise UsageError(f"{text!r} is not a vehicle's address: it looks like sim:// or ardrone://192.168.1.1")
+        shown = shown_address(text)
+        raise UsageError(f"{shown!r} is not a vehicle's address: it looks like sim:// or ardrone://192.168.1.1")
     place, _, query = rest.partition("?")
     pairs = parse_qsl(query, keep_blank_values=True)
     options = dict(pairs)
     if len(options) != len(pairs):
-        raise UsageError(f"{text!r} gives an option twice")
+        raise UsageError(f"{shown_address(text)!r} gives an option twice")
     return VehicleUri(scheme, unquote(place), options, text)

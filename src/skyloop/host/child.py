@@ -1,7 +1,7 @@
-"""The process of one vehicle of a host: ``python -m skyloop.host.child SETTINGS``, which a host starts.
+"""The process of one vehicle of a host: ``python -m skyloop.host.child NAME``, which a host starts.
 
-It ends with its host, at once and without landing, as a proxy of the host's own process does. Each line of its standard
-output is a status in JSON, for the host.
+The host hands over its settings. It ends with its host, at once and without landing, as a proxy of the host's own
+process does. Each line of its standard output is a status in JSON, for the host.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from typing import Final
 
 import msgspec
 
+from skyloop.child_process import handed_over
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import SkyloopError
-from skyloop.host.fleet import VehicleSettings
+from skyloop.host.fleet import VehicleSettings, decoder_of_handed
 from skyloop.host.vehicle import Condition, VehicleStatus, network_of, of_proxy, reason_of
 from skyloop.proxy import Proxy
 from skyloop.proxy.serve import run
@@ -69,7 +70,7 @@ class _Reporter:
         self._said_s = now_s
         row = VehicleStatus(
             self._settings.name,
-            self._settings.address,
+            str(self._settings.address),
             Condition.RUNNING,
             uptime_s=now_s - self._began_s,
             process="own",
@@ -84,12 +85,12 @@ def _write(status: VehicleStatus) -> None:
 
 
 def main() -> None:
-    """Serve the vehicle of the settings in the first argument, as JSON."""
-    settings = msgspec.json.decode(sys.argv[1], type=VehicleSettings)
+    """Serve the vehicle of the settings that were handed over."""
+    settings = decoder_of_handed(VehicleSettings).decode(handed_over() or "")
     try:
         serve(settings)
     except SkyloopError as error:
-        _write(VehicleStatus(settings.name, settings.address, Condition.FAILED, failed=reason_of(error)))
+        _write(VehicleStatus(settings.name, str(settings.address), Condition.FAILED, failed=reason_of(error)))
         sys.exit(FAILED)
 
 

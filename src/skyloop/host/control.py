@@ -26,7 +26,7 @@ from skyloop.errors import (
     UnknownNameError,
     UsageError,
 )
-from skyloop.host.fleet import VehicleSettings
+from skyloop.host.fleet import VehicleSettings, decoder_of_handed, encode_handed
 from skyloop.host.vehicle import VehicleStatus, reason_of
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
@@ -79,7 +79,7 @@ class Answer(msgspec.Struct, frozen=True):
     code: str = ""
 
 
-_requests: Final[msgspec.json.Decoder[Request]] = msgspec.json.Decoder(Request)
+_requests: Final[msgspec.json.Decoder[Request]] = decoder_of_handed(Request)
 _answers: Final = msgspec.json.Decoder(Answer)
 #: Carries out a request, on a thread of its own. Raises :class:`skyloop.errors.SkyloopError`.
 Answering = Callable[[Request], Answer]
@@ -239,7 +239,7 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     received = bytearray()
     try:
         with suppress(BrokenPipeError):  # who is refused is answered and hung up on before having asked
-            _send(sock, msgspec.json.encode(request))
+            _send(sock, encode_handed(request))
         while (packet := sock.recv(_CHUNK)) and len(received) < MAX_ANSWER:
             received += packet
     except BlockingIOError:

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import msgspec
 
 from skyloop.drivers.registry import driver_class
-from skyloop.drivers.uri import parse_uri
+from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.errors import FileFormatError, ParameterError, SkyloopError, UsageError
-from skyloop.files import expand
+from skyloop.files import decoded, expand
 from skyloop.messages import Value
 from skyloop.proxy.parameters import check_presets
 from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
@@ -66,7 +66,7 @@ class VehicleSettings(msgspec.Struct, frozen=True, omit_defaults=True):
     """One vehicle of a host, with all defaults filled in."""
 
     name: str
-    address: str
+    address: VehicleUri
     network: str | None = None  #: None: this host only
     listen: tuple[str, ...] = ()
     multicast: bool = True
@@ -75,6 +75,22 @@ class VehicleSettings(msgspec.Struct, frozen=True, omit_defaults=True):
     presets: dict[str, Value] = {}  #: the proxy's parameters
     autostart: bool = True
     own_process: bool = False
+
+
+def encode_handed(value: object) -> bytes:
+    """Encode settings, or what has them in it, for the process that serves the vehicle: with secrets of addresses."""
+    return msgspec.json.encode(value, enc_hook=_revealed)
+
+
+def decoder_of_handed(kind: Any) -> msgspec.json.Decoder[Any]:
+    """Return a decoder of what :func:`encode_handed` returned, of this type."""
+    return msgspec.json.Decoder(kind, dec_hook=lambda _, text: parse_uri(text))
+
+
+def _revealed(value: object) -> str:
+    if not isinstance(value, VehicleUri):
+        raise TypeError(f"{type(value).__name__} can't be encoded")
+    return value.reveal_text()
 
 
 class Fleet(msgspec.Struct, frozen=True):
@@ -104,7 +120,7 @@ def read_fleet(path: Path) -> Fleet:
     if len(data) > MAX_BYTES:
         raise FileFormatError(f"{path}: the file has more than {MAX_BYTES} bytes")
     try:
-        text = data.decode()
+        text = decoded(data)
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from None
     fleet = parse_fleet(text, str(path))
@@ -139,8 +155,8 @@ def parse_fleet(text: str, source: str) -> Fleet:
         if settings.name in seen:
             raise place.error("name", f"{settings.name!r} is the name of two vehicles, and must be one's")
         for other in vehicles:
-            if other.address == settings.address and _scheme(settings.address) not in MADE_BY_ADDRESS:
-                raise place.error("address", f"{settings.address!r} is the address of {other.name!r} too")
+            if other.address == settings.address and settings.address.scheme not in MADE_BY_ADDRESS:
+                raise place.error("address", f"{str(settings.address)!r} is the address of {other.name!r} too")
         seen[settings.name] = place
         vehicles.append(settings)
     return Fleet(found.name, tuple(vehicles), found.defaults)
@@ -178,7 +194,7 @@ def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Default
         _check_preset(place, name, own_presets)
     return VehicleSettings(
         name=vehicle.name,
-        address=vehicle.address,
+        address=uri,
         network=network,
         listen=tuple(either("listen") or ()) if network is not None else (),
         multicast=either("multicast") is not False,
@@ -219,7 +235,3 @@ def _checked(place: Place, key: str, check: Any) -> Any:
         raise
     except (UsageError, ParameterError, SkyloopError) as error:
         raise place.error(key, error.reason) from None
-
-
-def _scheme(address: str) -> str:
-    return address.partition("://")[0].lower()

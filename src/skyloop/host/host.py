@@ -12,6 +12,7 @@ import msgspec
 
 from skyloop.drivers.base import Driver, ServedLink
 from skyloop.drivers.registry import make_driver
+from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import NameTakenError, RefusedError, SkyloopError, UnknownNameError, UsageError
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.links import LinkThread
@@ -48,7 +49,7 @@ class Host:
         make: Makes the driver of an address, for vehicles of this process.
     """
 
-    def __init__(self, announce: Announce = _log.info, make: Callable[[str], Driver] = make_driver) -> None:
+    def __init__(self, announce: Announce = _log.info, make: Callable[[VehicleUri], Driver] = make_driver) -> None:
         self.announce = announce
         self._make_driver = make
         self._overview = OverviewRegistry()
@@ -212,7 +213,9 @@ class Host:
         rows = [vehicle.status() for vehicle in vehicles.values()]
         waiting = [settings for name, settings in known.items() if name not in vehicles]
         process = {True: "own", False: "shared"}
-        rows += [VehicleStatus(s.name, s.address, Condition.STOPPED, process=process[s.own_process]) for s in waiting]
+        rows += [
+            VehicleStatus(s.name, str(s.address), Condition.STOPPED, process=process[s.own_process]) for s in waiting
+        ]
         return rows
 
     def publish_keys(self, change: str) -> None:

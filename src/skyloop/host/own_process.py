@@ -13,7 +13,7 @@ import msgspec
 
 from skyloop.child_process import ChildProcess, RestartingChild
 from skyloop.errors import RefusedError
-from skyloop.host.fleet import VehicleSettings
+from skyloop.host.fleet import VehicleSettings, encode_handed
 from skyloop.host.vehicle import Condition, HostedVehicle, VehicleStatus
 
 STARTS_WITHIN_S: Final = 20.0
@@ -40,7 +40,7 @@ class OwnProcessVehicle(HostedVehicle):
     Args:
         settings: Its settings.
         announce: Called with a line for people when its process dies and is started again.
-        command: What starts the process; the settings follow.
+        command: What starts the process; the name follows, and the settings are handed over.
     """
 
     def __init__(
@@ -56,7 +56,8 @@ class OwnProcessVehicle(HostedVehicle):
         self._silent_looks = 0  # since it reported last
         self._deaths = 0  # in a row
         self._runner = RestartingChild(
-            [*command, msgspec.json.encode(settings).decode()],
+            [*command, settings.name],
+            handed=encode_handed(settings).decode(),
             name=f"skyloop-{settings.name}-process",
             read=self._read,
             ended=self._ended,

@@ -15,6 +15,7 @@ import msgspec
 
 from skyloop.drivers.base import Driver, ServedLink
 from skyloop.drivers.registry import make_driver
+from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DriverError, SkyloopError
 from skyloop.files import expand
 from skyloop.host.fleet import VehicleSettings
@@ -113,7 +114,7 @@ class HostedVehicle(ABC):
         up_s = time.monotonic() - self.started_s if self.condition is Condition.RUNNING else 0.0
         process = "own" if settings.own_process else "shared"
         return VehicleStatus(
-            settings.name, settings.address, self.condition, uptime_s=up_s, failed=self.failed, process=process
+            settings.name, str(settings.address), self.condition, uptime_s=up_s, failed=self.failed, process=process
         )
 
 
@@ -137,7 +138,7 @@ class SharedVehicle(HostedVehicle):
         reactor: Reactor,
         jobs: JobQueue,
         network: FabricSettings | None,
-        make: Callable[[str], Driver] = make_driver,
+        make: Callable[[VehicleUri], Driver] = make_driver,
         few: Callable[[], bool] = lambda: True,
         overview: OverviewRegistry | None = None,
         serve_link: Callable[[SharedVehicle, ServedLink], None] | None = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +23,11 @@ class Described(msgspec.Struct, frozen=True):
     problem: str = ""  #: why it can't be read, or why it is incomplete; empty for a complete file
 
 
+def shown_name(path: Path) -> str:
+    """Return a file's name as a text, with bytes that are not UTF-8 in hexadecimal."""
+    return os.fsencode(path.name).decode(errors="backslashreplace")
+
+
 def describe(path: Path) -> Described:
     """Describe a file without unpacking anything. Never raises because of what is in it."""
     try:
@@ -35,6 +41,6 @@ def describe(path: Path) -> Described:
             problem=recording.cut,
         )
     except SkyloopError as error:
-        return Described(problem=str(error))
+        return Described(problem=str(error).replace(path.name, shown_name(path)))
     except Exception as error:  # noqa: BLE001  one file's surprise must not hide the others
-        return Described(problem=f"{path.name} can't be read: {error!r:.300}")
+        return Described(problem=f"{shown_name(path)} can't be read: {error!r:.300}")

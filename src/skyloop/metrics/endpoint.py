@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = "/metrics"
-MAX_SCRAPES: Final = 8  #: at a time; a further connection is closed at once
+MAX_SCRAPES: Final = 8  #: at a time; for a further connection the one is closed that has taken longest without asking
+ANSWER_S: Final = 1.0  #: a scrape that takes no longer to be answered makes way for nobody
 DEADLINE_S: Final = 10.0  #: for one connection, from its first byte to its last
 _POLL_S: Final = 0.1
 _log = logging.getLogger(__name__)
@@ -175,7 +176,8 @@ class _Server(ThreadingHTTPServer):
         self.registry = registry
         self.own = ipaddress.ip_address(str(self.server_address[0])).is_loopback
         self._deadline_s = deadline_s
-        self._places = threading.BoundedSemaphore(MAX_SCRAPES)
+        self._lock = threading.Lock()
+        self._open: dict[Any, float] = {}  # connections, and until when each makes way for nobody; the oldest first
 
     def server_bind(self) -> None:
         # Not HTTPServer's, which looks up this machine's name in the network.
@@ -185,10 +187,26 @@ class _Server(ThreadingHTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        if self._places.acquire(blocking=False):
+        with self._lock:
+            now_s = time.monotonic()
+            if len(self._open) >= MAX_SCRAPES:
+                idle = next((one for one, until_s in self._open.items() if until_s <= now_s), None)
+                if idle is not None:  # its thread ends with the next that it reads or writes
+                    del self._open[idle]
+                    _hang_up(idle)
+            admitted = len(self._open) < MAX_SCRAPES
+            if admitted:
+                self._open[request] = 0.0
+        if admitted:
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
+
+    def asked(self, request: Any) -> None:
+        """Note that a whole request has come over a connection."""
+        with self._lock:
+            if request in self._open:
+                self._open[request] = time.monotonic() + ANSWER_S
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         # A limit for the whole connection, as one for each read would let a byte now and then hold it for ever.
@@ -199,7 +217,8 @@ class _Server(ThreadingHTTPServer):
             super().process_request_thread(request, client_address)
         finally:
             guard.cancel()
-            self._places.release()
+            with self._lock:
+                self._open.pop(request, None)
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002  (as it is called)
         _log.debug("a scrape by %s ended early", client_address, exc_info=True)
@@ -211,6 +230,7 @@ class _Handler(BaseHTTPRequestHandler):
     sys_version = ""
 
     def do_GET(self) -> None:
+        self.server.asked(self.connection)
         if self.server.own and not _names_loopback(self.headers.get("Host", "")):
             # A page of another site whose name leads here: its script could read the answer.
             self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"ask for this by its address\n")

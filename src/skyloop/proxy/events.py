@@ -9,6 +9,7 @@ from collections.abc import Callable, Hashable
 from typing import Final
 
 from skyloop.clock import NS_PER_S, Clock
+from skyloop.errors import shortened
 from skyloop.messages import Event, EventKind, Severity, Value, encode
 from skyloop.proxy.core.events import EventDraft, RepeatedEvents
 from skyloop.transport.base import EVENTS
@@ -44,7 +45,15 @@ class Counters:
 class EventPublisher:
     """Numbers and publishes the events of one run. Any thread; never raises."""
 
-    def __init__(self, publish: Callable[[str, bytes], int], clock: Clock, counters: Counters) -> None:
+    def __init__(
+        self,
+        publish: Callable[[str, bytes], int],
+        clock: Clock,
+        counters: Counters,
+        scrub: Callable[[str], str] = str,
+    ) -> None:
+        """Initialise; ``scrub`` takes what must not be told out of a text."""
+        self._scrub = scrub
         self._publish = publish
         self._clock = clock
         self._counts = counters.counts
@@ -95,7 +104,8 @@ class EventPublisher:
 
     def _number(self, kind: EventKind, text: str, severity: Severity, app: str | None, data: dict[str, Value]) -> None:
         self._seq += 1
-        event = Event(kind, text[:MAX_TEXT], self._clock(), severity, self._seq, app, data)
+        data = {name: self._scrub(value) if isinstance(value, str) else value for name, value in data.items()}
+        event = Event(kind, shortened(self._scrub(text), MAX_TEXT), self._clock(), severity, self._seq, app, data)
         try:
             packet = encode(event)
         except (ValueError, TypeError, OverflowError) as error:  # a driver's data may be anything

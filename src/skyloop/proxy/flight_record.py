@@ -90,9 +90,11 @@ class FlightRecord:
             thread.join(CLOSE_S)  # a file system may hang: the proxy's end does not
 
     def _run(self) -> None:
-        while not self._closing:
+        closing = False
+        while not closing:
             self._changed.wait(KEEP_S if self._ours else None)
             self._changed.clear()
+            closing = self._closing  # before the last word is read: what is set while it is written is written too
             try:
                 self._write()
             except OSError as error:

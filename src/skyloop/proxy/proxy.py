@@ -20,7 +20,7 @@ import msgspec
 from skyloop.child_process import leave_to_parent
 from skyloop.clock import Clock, clock_identity, monotonic_ns, nanoseconds, seconds, slept_ns
 from skyloop.drivers.base import Driver
-from skyloop.errors import DecodeError, UsageError
+from skyloop.errors import DecodeError, DriverError, UsageError
 from skyloop.messages import (
     Annotation,
     AnswerTakeover,
@@ -123,7 +123,7 @@ class Proxy:
         self._sessions: dict[int, Session] = {}
         self._counters = Counters()
         self._counts = self._counters.counts
-        self.events = EventPublisher(server_end.publish, clock, self._counters)
+        self.events = EventPublisher(server_end.publish, clock, self._counters, driver.uri.scrub)
         steerable = bool(self.capabilities.actions & {"attitude", "velocity"})
         flight = Flight(self.capabilities.actions, shared=driver.shared)
         autopilot = Autopilot(self.capabilities.actions, flight=flight) if steerable else None
@@ -135,6 +135,7 @@ class Proxy:
             capabilities=self.capabilities,
             state_of=flight.state,
             on_link_up=self._refresh_parameters,
+            scrub=driver.uri.scrub,
         )
         self.handler = CommandHandler(
             executor=ActionExecutor(driver, self.capabilities, flight, autopilot, self.publisher),
@@ -224,8 +225,10 @@ class Proxy:
         self.overview.begin()
         try:
             self.driver.open(self.publisher)
-        except BaseException:
+        except BaseException as error:
             self.end()
+            if self.driver.uri.scrub(str(error)) != str(error):  # of a library that tells what it could not open
+                raise DriverError(self.driver.uri.scrub(str(error))) from None
             raise
         if self._ticker is not None:
             self._ticker.start()

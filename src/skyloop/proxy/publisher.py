@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import NS_PER_S, Clock
-from skyloop.errors import SkyloopError, UnknownNameError, UsageError
+from skyloop.errors import SkyloopError, UnknownNameError, UsageError, shortened
 from skyloop.messages import (
     CameraInfo,
     Capabilities,
@@ -87,6 +87,7 @@ class VehiclePublisher:
         capabilities: what the driver reported about the vehicle: its cameras.
         state_of: the flight state, given the one that the driver reported; the software autopilot may know better.
         on_link_up: called on the driver's thread when the vehicle's link has come up.
+        scrub: takes the secrets of the vehicle's address out of a text.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class VehiclePublisher:
         capabilities: Capabilities,
         state_of: Callable[[FlightState], FlightState],
         on_link_up: Callable[[], None],
+        scrub: Callable[[str], str] = str,
     ) -> None:
         self.feedback_now: Feedback | None = None  #: the newest sample as it was published
         self.reported_state = FlightState.UNKNOWN  #: as the driver reported it, before the software autopilot
@@ -111,6 +113,7 @@ class VehiclePublisher:
         self.variants = FeedbackVariants(server, counters, clock)
         self.streams = Streams(server, counters, clock, lambda why: self._fail("stream", why))
         self._on_link_up = on_link_up
+        self._scrub = scrub
         self._owner: dict[str, Any] = {}
         self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
         self._told: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # by the newest sample
@@ -350,7 +353,7 @@ class VehiclePublisher:
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
         """The hop to the vehicle changed, from the driver. Told at once; the flight acts on it at its next step."""
-        reason, remedy = reason[:MAX_LINK_TEXT], remedy[:MAX_LINK_TEXT]
+        reason, remedy = (shortened(self._scrub(text), MAX_LINK_TEXT) for text in (reason, remedy))
         with self._publishing:
             same = (state, reason, remedy) == (self.link_state, self.link_reason, self.link_remedy)
             before, self.link_state = self.link_state, state
@@ -378,18 +381,18 @@ class VehiclePublisher:
         else:
             self._events.publish(kind, text, severity, data=data)
 
-    def driver_failed(self, where: str, error: BaseException) -> None:
-        """A call of the driver raised."""
+    def driver_failed(self, where: str, error: BaseException) -> str:
+        """A call of the driver raised. Return the text for who asked for the call."""
         self._counts["driver.errors"] += 1
         self._fail(where, f"driver failed in {where}: {error!r}")
+        return self._scrub(f"the driver failed: {error!r}")
 
     def driver_refused(self, where: str, error: BaseException) -> str:
         """A command made the driver raise. Return the text for its sender; an unexpected error is published as well."""
         if isinstance(error, SkyloopError):  # the vehicle's own reason
             self._counts["driver.errors"] += 1
-            return str(error)
-        self.driver_failed(where, error)
-        return f"the driver failed: {error!r}"
+            return self._scrub(str(error))
+        return self.driver_failed(where, error)
 
     def _fail(self, where: str, text: str) -> None:
         self._events.publish_repeated(

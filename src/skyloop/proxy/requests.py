@@ -15,7 +15,7 @@ from queue import SimpleQueue
 from typing import Any, Final, Protocol
 
 from skyloop.clock import NS_PER_S, Clock, seconds
-from skyloop.errors import ParameterError, UnknownNameError
+from skyloop.errors import ParameterError, UnknownNameError, shortened
 from skyloop.messages import (
     AnswerTakeover,
     AnyReply,
@@ -105,7 +105,8 @@ class RequestDispatcher:
         counters: the proxy's counters.
         immediate: what answers on the receiving thread, by the type of the request's body.
         deferred: what answers on the thread of requests; may raise anything, which becomes a refusal.
-        on_failure: called with the request's name and the error when ``deferred`` raises what is no refusal.
+        on_failure: called with the request's name and the error when ``deferred`` raises what is no refusal; returns
+            the text for who asked.
         jobs: does what may wait for the driver; None: a thread of its own.
     """
 
@@ -116,7 +117,7 @@ class RequestDispatcher:
         *,
         immediate: Mapping[type, Answer],
         deferred: Mapping[type, Answer],
-        on_failure: Callable[[str, BaseException], None],
+        on_failure: Callable[[str, BaseException], str],
         jobs: JobQueue | None = None,
     ) -> None:
         self._server = server
@@ -181,10 +182,9 @@ class RequestDispatcher:
         except UnknownNameError as error:
             reply = Refused(Refusal.UNKNOWN_PARAMETER, str(error))
         except ParameterError as error:
-            reply = Refused(_refusal(error.code), str(error)[:MAX_MESSAGE])
+            reply = Refused(_refusal(error.code), shortened(str(error), MAX_MESSAGE))
         except Exception as error:  # noqa: BLE001  whatever a driver's code does, the asker gets an answer
-            self._on_failure(kind.__name__, error)
-            reply = Refused(Refusal.DRIVER_FAILED, f"the driver failed: {error!r}"[:MAX_MESSAGE])
+            reply = Refused(Refusal.DRIVER_FAILED, shortened(self._on_failure(kind.__name__, error), MAX_MESSAGE))
         self._finish(session, request, reply)
 
     def _finish(self, session: Session, request: Request, body: AnyReply) -> None:

@@ -16,6 +16,7 @@ from typing import Final
 from skyloop.child_process import on_parent_end
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.drivers.registry import make_driver
+from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind, LinkState, Severity
 from skyloop.proxy.audit import AuditTrail, audit_path
@@ -87,7 +88,7 @@ class Shutdown:
 
 
 def serve(
-    uri: str,
+    uri: str | VehicleUri,
     name: str,
     *,
     group: str | None = None,

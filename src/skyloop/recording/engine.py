@@ -75,10 +75,15 @@ class Engine:
 
         Raises:
             UsageError: The file can't be written.
+            SkyloopError: A drone can't be subscribed to; the file is closed then.
         """
         self._writer.start()
-        for tap in self._taps:
-            tap.start()
+        try:
+            for tap in self._taps:
+                tap.start()
+        except BaseException:
+            self.stop()
+            raise
         leave_to_parent(self)
 
     def forked(self) -> None:

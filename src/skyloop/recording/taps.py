@@ -280,7 +280,8 @@ class Video:
         with self._lock:
             self._ended = True
         self._buffer.close()
-        self._thread.join()
+        if self._thread.ident is not None:  # a start may have failed before it
+            self._thread.join()
 
     def look(self, now_ns: int) -> None:
         """Subscribe to frames while the vehicle's encoding does not arrive: it may send another one than announced."""
@@ -388,7 +389,8 @@ class Parameters:
         """End the thread."""
         self._ended = True
         self._wake.set()
-        self._thread.join()
+        if self._thread.ident is not None:  # a start may have failed before it
+            self._thread.join()
 
     def event(self, event: Event) -> None:
         """Read again when a parameter was written, or a link came back."""

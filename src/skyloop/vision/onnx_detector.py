@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, UsageError
+from skyloop.files import MAX_TEXT, read_text
 from skyloop.vision.detection import Detection, suppress
 from skyloop.vision.detector_layouts import (
     RAW_BGR,
@@ -236,8 +237,8 @@ def _names(text: str | None, path: Path) -> dict[int, str]:
 def _given(names: Sequence[str] | Mapping[int, str] | Path | str) -> dict[int, str]:
     if isinstance(names, str | Path):
         try:
-            lines = Path(names).read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
+            lines = read_text(names, "the names", MAX_TEXT).splitlines()
+        except FileFormatError as error:
             raise UsageError(f"names is {str(names)!r}, which can't be read as a text file: {error}") from error
         names = [line.strip() for line in lines if line.strip()]
     pairs: dict[Any, Any] = dict(names) if isinstance(names, Mapping) else dict(enumerate(names))

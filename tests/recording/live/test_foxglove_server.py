@@ -23,6 +23,7 @@ from skyloop.recording import foxglove as schemas
 from skyloop.recording import taps
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.live import parameters as module
+from skyloop.recording.live.origin_door import MAX_HEAD, OriginDoor, hidden_host
 from skyloop.recording.live.parameters import ParameterDesk
 from skyloop.recording.translation import Picture
 from tests.integration.fake_vehicle import PERIOD_S, FakeVehicle
@@ -365,6 +366,48 @@ def test_a_port_that_is_taken(fly: Fly) -> None:
 def test_nobody_writes_from_beyond_this_machine(fly: Fly) -> None:
     with pytest.raises(UsageError, match="no passwords"):
         FoxgloveServer([fly()], host="0.0.0.0", port=0, priority=31)
+
+
+@pytest.mark.parametrize(
+    ("origin", "answer"),
+    [
+        (None, b"101"),
+        ("https://app.foxglove.dev", b"101"),
+        ("file://", b"101"),
+        ("http://localhost:8080", b"101"),
+        ("http://[::1]:8080", b"101"),
+        ("https://evil.example", b"403"),
+        ("https://foxglove.dev.evil.example", b"403"),
+        ("http://app.foxglove.dev", b"403"),
+        ("null", b"403"),
+        ("http://127.0.0.1.evil.example", b"403"),
+    ],
+)
+def test_no_page_of_another_origin_gives_orders(lent: Drone, show: Show, origin: str | None, answer: bytes) -> None:
+    """With ``--write`` any web page in a browser of this machine could write parameters."""
+    _, server = show(lent, priority=31)
+    head = (
+        f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n" + (f"Origin: {origin}\r\n" if origin else "") + "\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", server.port), timeout=WAIT_S) as page:
+        page.sendall(head.encode())
+        assert page.recv(12) == b"HTTP/1.1 " + answer
+
+
+def test_a_door_ends_who_says_too_much_or_nothing() -> None:
+    door = OriginDoor("127.0.0.1", 0)
+    try:
+        with socket.create_connection(("127.0.0.1", door.port), timeout=WAIT_S) as page:
+            page.sendall(b"GET / HTTP/1.1\r\nX: " + b"x" * MAX_HEAD)
+            assert page.recv(12) == b"HTTP/1.1 403"
+        with socket.create_connection(("127.0.0.1", door.port), timeout=WAIT_S) as page:
+            page.shutdown(socket.SHUT_WR)
+            assert page.recv(12) == b""
+    finally:
+        door.close()
+    assert hidden_host() != hidden_host() or sys.platform != "linux"
 
 
 def test_without_the_sdk_the_error_says_what_to_install(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,8 @@ from typing import Final
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
-from skyloop.errors import UnknownNameError, UsageError
-from skyloop.files import read_bytes
+from skyloop.errors import FileFormatError, UnknownNameError, UsageError
+from skyloop.files import expand, read_bytes
 
 Peer = tuple[str, int] | None  #: of UDP; a stream has no other
 
@@ -110,7 +110,7 @@ class Address:
 class CameraOptions:
     """A camera beside the autopilot. Size and rate are what is announced before the first picture comes."""
 
-    source: str
+    source: str = field(repr=False)  # with its secrets
     name: str
     width: int
     height: int
@@ -130,7 +130,7 @@ class MavlinkOptions:
     rate_hz: float = 50.0  #: of attitude, position and velocity
     limits: Mapping[str, float] = field(default_factory=lambda: dict(USUAL))  #: by the names of their parameters
     parameters: bool = True  #: whether they are read
-    key: bytes | None = None
+    key: bytes | None = field(default=None, repr=False)
     origin: tuple[float, float, float] | None = None  #: latitude and longitude [degrees], altitude [m]
     world_origin: tuple[float, float, float] | None = None  #: the same
     pose: PoseMessage = PoseMessage.ODOMETRY
@@ -203,9 +203,11 @@ def _peer(uri: VehicleUri) -> tuple[str, int] | None:
 
 
 def _key(uri: VehicleUri) -> bytes | None:
-    given = uri.options.get("signing_key")
+    given = uri.reveal("signing_key")
     if given is None:
         return None
+    if not expand(given).exists():  # perhaps the key itself: it is not repeated
+        raise FileFormatError(f"{uri}: signing_key can't be read: it must be the path of a file that holds the key")
     held = read_bytes(given, f"{uri}: the signing key's file", 1024)
     if len(held) == KEY_BYTES:
         return held
@@ -236,7 +238,7 @@ def _pose(uri: VehicleUri) -> PoseMessage:
 
 
 def _camera(uri: VehicleUri) -> CameraOptions | None:
-    source = uri.options.get("camera")
+    source = uri.reveal("camera")
     if source is None:
         given = sorted(name for name in uri.options if name.startswith("camera_"))
         if given:

@@ -14,12 +14,13 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.logfile.layout import Channel, DroneRecord
 from skyloop.logfile.pictures import Picture
 from skyloop.logfile.reader import Item, Recording
-from skyloop.logfile.times import Course
+from skyloop.logfile.times import Course, shifted
 from skyloop.messages import Applied, CameraInfo, Capabilities, Encoding, Event, Feedback, Parameter
 
 #: What is replayed. Annotations and logs are an application's own: it makes new ones.
 CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)
 
+_SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: two clocks that go on by the same time, to this, were not set anew
 Sample = Feedback | Picture | Event | Applied | Parameter
 
 
@@ -130,10 +131,34 @@ class ReplaySource:
 
     def _timed(self, log_ns: int) -> Iterator[TimedSample]:
         """Yield what was received at a log time or later."""
-        course = Course()
+        resets = self._resets if log_ns else []  # from the beginning on they are found on the way
+        earlier = bisect_right(resets, log_ns, key=lambda reset: reset[0])
+        course = Course(resets[earlier - 1][1] if earlier else 0)
         for found in self._recording.items_and_pictures(self._drone.name, CHANNELS, from_ns=log_ns):
-            value = found.value if isinstance(found, Item) else found
-            yield TimedSample(course.follow(value), value)
+            value, at_log_ns = (found.value, found.entry.log_ns) if isinstance(found, Item) else (found, found.log_ns)
+            at_ns = course.follow(value, at_log_ns)
+            yield TimedSample(at_ns, shifted(value, course.shift_ns) if course.shift_ns else value)
+
+    @cached_property
+    def _resets(self) -> list[tuple[int, int]]:
+        """Log times at which the proxy's clock began anew, each with what is added to its times from there on."""
+        last_part = self._log_ns(len(self._recording.found.pieces) - 1)
+        first, last = (
+            next(self._recording.items(self._drone.name, (Channel.FEEDBACK,), from_ns=at_ns), None)
+            for at_ns in (0, last_part)
+        )
+        if first is None or last is None:
+            return []
+        passed_ns = last.value.published_ns - first.value.published_ns
+        if abs(passed_ns - (last.entry.log_ns - first.entry.log_ns)) < _SAME_CLOCK_NS:
+            return []  # without reading all of it
+        found, course = [], Course()
+        for item in self._recording.items(self._drone.name, (Channel.FEEDBACK,)):
+            before_ns = course.shift_ns
+            course.follow(item.value, item.entry.log_ns)
+            if course.shift_ns != before_ns:
+                found.append((item.entry.log_ns, course.shift_ns))
+        return found
 
     def _log_ns(self, part: int) -> int:
         """Return the log time at which a part of the file begins: where to read from."""

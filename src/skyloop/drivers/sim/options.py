@@ -103,7 +103,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
 def firmware_options(uri: VehicleUri) -> str:
     """Return the options that are those of the driver that speaks to the firmware, as a query."""
     own = KNOWN - {"rate"}
-    return urlencode({name: value for name, value in uri.options.items() if name not in own}, safe="/,:")
+    return urlencode({name: uri.reveal(name) for name in uri.options if name not in own}, safe="/,:")
 
 
 def _autopilot(uri: VehicleUri) -> AutopilotKind | None:

@@ -110,9 +110,10 @@ def options_of(uri: VehicleUri) -> VideoOptions:
 
 
 def _place(uri: VehicleUri) -> tuple[Path, CameraSource | None]:
-    if is_address(uri.place):
-        return Path(), source_of(uri.place, f"{uri.scheme}://")
-    path = expand(uri.place)
+    place = uri.reveal_place()
+    if is_address(place):
+        return Path(), source_of(place, f"{uri.scheme}://")
+    path = expand(place)
     return path, CameraSource(str(path), "") if is_device(path) else None
 
 

@@ -22,6 +22,7 @@ from skyloop.messages import Value
 from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Item
 from skyloop.recording.foxglove import CompressedVideo
+from skyloop.recording.live.origin_door import OriginDoor, hidden_host
 from skyloop.recording.live.parameters import ParameterDesk, Written
 from skyloop.recording.live.topics import ViewTopic, topics
 from skyloop.recording.live.view import Source, check_names
@@ -78,23 +79,31 @@ class FoxgloveServer:
         self._context = self._sdk.Context()
         self._channels = {name: self._channel(topic) for name, (topic, _) in self._known.items() if topic.at_once}
         self._desk = ParameterDesk(drones, priority, self._parameter_changed)
+        self._door: OriginDoor | None = None  # before a server that takes orders: anybody's page could give them
+        hidden = hidden_host()
         try:
+            if priority is not None:
+                self._door = OriginDoor(host, port)
             self._server = self._sdk.start_server(
                 name=f"skyloop: {', '.join(drone.name for drone in drones)}",
-                host=host,
-                port=port,
+                host=host if self._door is None else hidden,
+                port=port if self._door is None else 0,
                 capabilities=[self._sdk.Capability.Parameters],
                 server_listener=_Listener(self),
                 context=self._context,
                 message_backlog_size=WAITING,
             )
-        except RuntimeError as error:
+        except (RuntimeError, OSError) as error:
+            if self._door is not None:
+                self._door.close()
             raise LinkError(f"can't listen on {host}:{port}: {error}; choose another --port, or 0 for any") from None
         # It would tell Python's logging with locks of its own held, and then no thread of this process may go on: one
         # waits for such a lock while it holds the interpreter's.
         self._sdk._foxglove_py.disable_logging()
         self.host = host
         self.port: int = self._server.port
+        if self._door is not None:
+            self._door.behind, self.port = (hidden, self._server.port), self._door.port
         self._ready.set()
 
     @property
@@ -132,6 +141,8 @@ class FoxgloveServer:
 
     def close(self) -> None:
         """Stop listening, and disconnect the viewers."""
+        if self._door is not None:
+            self._door.close()
         self._server.stop()
         self._desk.close()
         for channel in self._channels.values():

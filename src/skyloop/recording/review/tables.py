@@ -144,7 +144,7 @@ def timed(
     first_ns = begin_ns(recording, drone)
     course = Course()
     for item in recording.items(drone, channels, progress=progress):
-        yield item, max(first_ns, course.follow(item.value)), first_ns
+        yield item, max(first_ns, course.follow(item.value, item.entry.log_ns)), first_ns
 
 
 def begin_ns(recording: Recording, drone: str) -> int:

@@ -68,6 +68,9 @@ class Key(NamedTuple):
     generation: int
     key: bytes  #: 32 bytes
 
+    def __repr__(self) -> str:
+        return f"Key(generation={self.generation})"
+
 
 Message = Subscribe | Taken | Seen | Bye | Key
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Final
 
 from skyloop.messages import FrameHeader, encode
-from skyloop.transport.base import FEEDBACK, MAX_SUBSCRIPTIONS, Pixels, results, stream, too_many_topics, video
+from skyloop.transport.base import MAX_SUBSCRIPTIONS, Pixels, results, stream, too_many_topics, video
 from skyloop.transport.fabric import layout, packets
 from skyloop.transport.fabric.connection import ServerConnection
 from skyloop.transport.fabric.delivery import Pace
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 _VIDEO: Final = video("")
 _STREAMS: Final = stream("")
 _RESULTS: Final = results("")
-#: How topics begin that applications name: nothing is kept for them once they have no subscriber.
-_NAMED: Final = (_RESULTS, _STREAMS, f"{FEEDBACK}?")
 
 
 class Publisher:
@@ -169,7 +167,7 @@ class Publisher:
             self._subscribed[topic] = remaining
         else:
             self._subscribed.pop(topic, None)
-            if topic.startswith(_NAMED):
+            if topic.startswith((_RESULTS, _STREAMS)) or "?" in topic:  # an application named it: nothing of it stays
                 self._numbers.pop(topic, None)
                 self._publishers.pop(topic, None)  # ends with whoever is using it
 

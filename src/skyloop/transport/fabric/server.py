@@ -101,11 +101,15 @@ class FabricServer(TransportServer):
         self._thread = threading.Thread(
             target=self._serve, args=(handler,), name=f"skyloop-{self._name}-fabric", daemon=True
         )
-        self._publisher.open(session, handler.topic_problem)
-        self._registry.open()
-        self._thread.start()
-        self._sender.start()
-        self._declare(session)
+        try:
+            self._publisher.open(session, handler.topic_problem)
+            self._registry.open()
+            self._thread.start()
+            self._sender.start()
+            self._declare(session)
+        except BaseException:
+            self.stop()
+            raise
 
     def _check_free(self) -> None:
         for taken in discovery.ask(self._settings, self._name):
@@ -116,9 +120,8 @@ class FabricServer(TransportServer):
 
     def _declare(self, session: Session) -> None:
         z, name, call = session.zenoh, self._name, session.callback
-        self._declared = [
-            z.declare_subscriber(layout.upward(way, name, "*", "*"), call(self._on_packet)) for way in _UPWARD
-        ]
+        for way in _UPWARD:
+            self._declared.append(z.declare_subscriber(layout.upward(way, name, "*", "*"), call(self._on_packet)))
         self._declared.append(z.declare_queryable(layout.info(name), call(self._answer_info)))
         self._declared.append(z.declare_queryable(layout.join(name, "*", "*"), call(self._registry.on_join)))
         tokens = layout.app(name, "*", "*")
@@ -137,7 +140,7 @@ class FabricServer(TransportServer):
         for connection in self._registry.connections:
             self._registry.end(connection, "the proxy stopped")
         self._queue.close()
-        if thread is not threading.current_thread():
+        if thread.is_alive() and thread is not threading.current_thread():
             thread.join()
         self._sender.end()
         self._publisher.close()

@@ -119,8 +119,19 @@ class Reactor:
             if self._sources.get(source.fileno) is not source:
                 return False
             del self._sources[source.fileno]
-            self._epoll.unregister(source.fileno)
+            if not self._epoll.closed:
+                self._epoll.unregister(source.fileno)
             return True
+
+    @property
+    def over(self) -> bool:
+        """Whether its thread has ended, so that nobody receives for its servers any more."""
+        return not self._thread.is_alive()
+
+    def left_of(self, server: Receiver) -> list[Source]:
+        """Return the sockets of a server that were left when the thread ended; none while it runs. Any thread."""
+        with self._lock:
+            return [source for source in self._sources.values() if source.server is server] if self.over else []
 
     @property
     def empty(self) -> bool:

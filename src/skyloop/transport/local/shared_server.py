@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from typing import Final
 
 from skyloop.transport.backlog import Lane
 from skyloop.transport.base import MAX_PACKET, ServerHandler
@@ -14,6 +15,7 @@ from skyloop.transport.local.server import HELLO_S, LocalServer
 from skyloop.transport.local.sockets import RECEIVE_FLAGS, Socket
 from skyloop.transport.priority_lock import is_command
 
+_LOOK_S: Final = 0.1  # how often a wait for connections looks whether their thread has ended
 _log = logging.getLogger(__name__)
 
 
@@ -57,7 +59,12 @@ class SharedLocalServer(LocalServer):
             connection.hang_up("the proxy stopped")
         if not receiving():  # a handler that stops its own server does not wait for itself
             with self._left:
-                self._left.wait_for(lambda: not self._served)
+                while self._served and not self.reactor.over:
+                    self._left.wait(_LOOK_S)
+            with self._lock:
+                for left in self.reactor.left_of(self):  # its thread ended first: nobody else gives them back
+                    assert left.connection is not None
+                    self._finish_connection(left, left.connection, "the proxy stopped")
 
     def _drop(self, source: Source) -> None:
         """Let no reactor wait for a socket any more."""

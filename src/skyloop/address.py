@@ -1,0 +1,80 @@
+"""What may be shown of an address: never a user, a password or a key in it. Pure.
+
+People also write passwords unquoted, with the characters that separate an address's parts; where it can't be told
+where such a password ends, the rest is hidden with it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Final
+from urllib.parse import quote, unquote, unquote_plus
+
+HIDDEN: Final = "***"
+_SECRET: Final = "password|passwd|passphrase|pass|pwd|pw|token|secret|key|apikey|auth|credential|credentials"
+_SECRET_NAME: Final = re.compile(rf"(?i)(?:.*[_.-])?(?:{_SECRET})\Z")
+_NAME: Final = re.compile(r"[A-Za-z0-9_.-]*\Z")
+#: In a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``: where it ends is not known.
+_IN_PATH: Final = re.compile(rf"(?i)(?<![a-z])((?:{_SECRET})=)[^/?#]*")
+_HOST: Final = re.compile(r"(?:\[[^\]]*\]|[^:\[\]]*)(?::\d*)?\Z")
+_KEEP: Final = "/:@*,;=()[]~!$'+"  # as people write them in an address
+
+
+def without_secrets(text: str, option: str = "", *, broken: bool = False) -> str:
+    """Return a part of an address as it may be shown, without what may be a secret: user, password, query and keys.
+
+    Args:
+        text: The address of a stream, or another place or value of an option, percent-decoded.
+        option: The option whose value it is.
+        broken: Whether a password in it may have been cut where the address was split.
+    """
+    if _SECRET_NAME.match(option):
+        return HIDDEN
+    scheme, separator, rest = text.partition("://")
+    if not separator:
+        user, at, host = text.rpartition("@")
+        return _hide(host if at and ":" in user and not text.startswith(("/", "~")) else text)
+    place = re.split(r"[?#]", rest.rpartition("@")[2], maxsplit=1)[0]
+    if broken or not _HOST.match(place.partition("/")[0]):
+        place = HIDDEN
+    return f"{scheme}://{_hide(place)}"
+
+
+def _hide(path: str) -> str:
+    return _IN_PATH.sub(rf"\1{HIDDEN}", path)
+
+
+def shown_name(option: str) -> str:
+    """Return the name of an option as it may be shown: what is no name may be the end of a password."""
+    return option if _NAME.match(option) else HIDDEN
+
+
+def is_broken(options: Iterable[str]) -> bool:
+    """Return whether names of options show that an address was split within its password."""
+    return any("@" in option for option in options)
+
+
+def shown_address(text: str) -> str:
+    """Return a vehicle's address as it may be shown.
+
+    Args:
+        text: The address as it was given, ``scheme://place?option=value``, or what was given in place of one.
+    """
+    scheme, separator, rest = text.partition("://")
+    place, mark, query = rest.partition("?")
+    if not separator:
+        return without_secrets(text)
+    pairs = [pair.partition("=") for pair in query.split("&")] if mark else []
+    broken = is_broken(unquote_plus(name) for name, _, _ in pairs)
+    options = []
+    for name, equals, value in pairs:
+        decoded = unquote_plus(name)
+        given = unquote_plus(value)
+        shown = without_secrets(given, decoded, broken=broken) if given else given
+        kept = name if shown_name(decoded) == decoded else HIDDEN
+        options.append(f"{kept}{equals}{value if shown == given else quote(shown, safe=_KEEP)}")
+    decoded = unquote(place)
+    shown = without_secrets(decoded, broken=broken)
+    kept = place if shown == decoded else quote(shown, safe=f"{_KEEP}&")
+    return f"{scheme}://{kept}{mark}{'&'.join(options)}"
