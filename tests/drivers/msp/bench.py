@@ -33,7 +33,10 @@ def options(text: str = "msp://tcp:127.0.0.1:5761") -> MspOptions:
 
 
 class Bench:
-    """A drone on the ground, seen by cameras if ``poses``; ``cut``: nothing passes; ``deaf``: no reply passes."""
+    """A drone on the ground, seen by cameras if ``poses``; ``cut``: nothing passes; ``deaf``: no reply passes.
+
+    ``world_speed``: of the simulated world, beside the clock of board and driver.
+    """
 
     def __init__(
         self, settings: BoardSettings | None = None, text: str = "msp://tcp:127.0.0.1:5761", *, poses: bool = True
@@ -45,6 +48,8 @@ class Bench:
         self.sink = RecordingSink()
         self.poses = poses
         self.cut = self.deaf = False
+        self.world_speed = 1.0
+        self._behind_s = 0.0
         self.sent: list[Frame] = []
         self._parser = Parser()
         self._ticks = 0
@@ -77,7 +82,11 @@ class Bench:
 
     def tick(self) -> None:
         self.clock.advance(TICK_S)
-        self.simulation.step(round(TICK_S / STEP_S))
+        self._behind_s += TICK_S * self.world_speed
+        steps = int(self._behind_s / STEP_S + 1e-9)
+        self._behind_s -= steps * STEP_S
+        if steps:
+            self.simulation.step(steps)
         self._ticks += 1
         self._look()
         now_ns = self.clock.now_ns

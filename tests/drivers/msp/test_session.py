@@ -102,6 +102,22 @@ def test_a_descent_from_height_is_not_taken_for_the_ground() -> None:
     assert bench.climb_m_s == pytest.approx(-0.6, abs=0.1)
 
 
+@pytest.mark.parametrize("world_speed", [1.0, 0.6, 0.45, 0.3])
+def test_what_still_rises_when_it_should_sink_does_not_stand(world_speed: float) -> None:
+    """A real one rose past its height, in a simulation slower than its clock: it was disarmed at 1.6 m, and fell."""
+    bench = Bench()
+    bench.take_off()
+    bench.world_speed = world_speed
+    for climb in (1.0, -0.5):
+        bench.fly(climb=climb)
+        bench.run(2.0)
+        assert bench.board.armed
+    bench.fly()
+    bench.run(2.0)
+    assert bench.board.armed
+    assert bench.height_m > 0.7
+
+
 def test_an_interrupted_take_off_disarms() -> None:
     bench = Bench()
     bench.ready()

@@ -52,6 +52,7 @@ LATE_S: Final = 0.15  #: so long after the throttle carried it a lift-off shows
 OTHER: Final = 0.15  #: share by which the throttle that was learnt may differ from the one that lifted it
 GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: without headway a descent met something
 HEADWAY: Final = 0.4  #: of the descent that is asked for
+STILL: Final = {True: 0.1, False: 0.4}  #: what moves faster up or down [m/s] does not stand, precise or not
 SINK_PER_S: Final = 0.5  #: how fast the throttle is taken away then
 OFF_BELOW: Final = 0.6  #: of the throttle that carries it: it stands
 BLIND: Final = 0.93  #: of it while the climb is not known: it sinks
@@ -431,7 +432,8 @@ class SetpointController:
 
     def _stands(self, climb: float, step_s: float, now_ns: int) -> bool:
         """Return whether a descent meets the ground; takes the throttle away while it seems to."""
-        if self._wanted.climb >= -0.05 or climb < HEADWAY * self._wanted.climb:
+        still = STILL[self._motion.precise]
+        if self._wanted.climb >= -0.05 or climb > still or climb < max(HEADWAY * self._wanted.climb, -still):
             self._still_ns = None
             self._sink = min(1.0, self._sink + 2 * SINK_PER_S * step_s)
             return False
