@@ -281,7 +281,9 @@ class CommandHandler:
         with self._lock:
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
-            self._call_off(now_ns)
+            if self.flight.ours and self.flight.may_begin(now_ns):
+                self._rising_until_ns = now_ns  # again and again: nobody withdraws it later
+            self._withdraw_takeoff(now_ns)
             return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
@@ -289,16 +291,10 @@ class CommandHandler:
         with self._lock:
             self.ladder.order_landing()
             self._observe_flight(now_ns)
-            self._call_off(now_ns)
-            executor = self._executor
-            if self.flight.ours and executor.airborne and executor.state is not FlightState.LANDING:
+            executor, withdrew = self._executor, self._withdraw_takeoff(now_ns)
+            lands = executor.state is FlightState.LANDING and (Land in executor.native or not withdrew)
+            if self.flight.ours and executor.airborne and not lands:
                 executor.leave(now_ns)
-
-    def _call_off(self, now_ns: int) -> None:
-        """Land what was told to take off and does not show it yet."""
-        if self.flight.ours and self.flight.may_begin(now_ns) and self._executor.state is FlightState.LANDED:
-            self._executor.failsafe(Land(), now_ns)
-            self.flight.call_off(now_ns)
 
     @property
     def airborne(self) -> bool:
