@@ -119,7 +119,12 @@ class CommandHandler:
         self.ladder = FailsafeLadder()
         self.flight = executor.flight
         self.checks = CommandChecks(
-            self.authority, self.ladder, self.flight, supported=executor.supported, why_not=executor.why_not
+            self.authority,
+            self.ladder,
+            self.flight,
+            supported=executor.supported,
+            why_not=executor.why_not,
+            native=executor.native,
         )
         self._back = ReturnSupervisor(self.checks, self.ladder, executor, publisher)
         self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
@@ -388,7 +393,12 @@ class CommandHandler:
             checks.back = None
         self._tell(session, intent)
         applied_ns = self._count_applied(command)
-        if not (self.ladder.idle or (command.automatic and self.ladder.step is Failsafe.LAND)):
+        ladder = self.ladder
+        if command.automatic:
+            goes_on = ladder.step is Failsafe.LAND
+        else:
+            goes_on = ladder.step is Failsafe.HOVER and kind is Hover and not vehicle.link_up
+        if not (goes_on or ladder.idle):
             self._apply_failsafe(self.ladder.fresh_command(), now_ns)
         return applied, applied_ns
 
@@ -632,13 +642,18 @@ class CommandHandler:
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
-            holder = self.authority.holder
-            session = self._sessions.get(holder.app_id) if holder is not None else None
-            lands = session is not None and session.intents.lands  # wherever it is
+            lands = self._lands  # wherever it is
             self._events.publish_draft(position_jumped_event(airspace.jumped_m, lands=lands))
             if not lands:
                 self._start_over(Fate.JUMPED, now_ns)
         airspace.jumped_m = 0.0
+
+    @property
+    def _lands(self) -> bool:
+        """Whether its pilot's landing, where the vehicle is, is under way."""
+        holder = self.authority.holder
+        session = self._sessions.get(holder.app_id) if holder is not None else None
+        return session is not None and session.intents.lands
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""
@@ -675,9 +690,12 @@ class CommandHandler:
         self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
         state = self._executor.state
+        airborne = self.flight.flies(state)
+        if airborne and not self._vehicle.link_up and self._lands:
+            state = FlightState.LANDING  # as far as anybody can tell: no hover takes its pilot's landing back
         inputs = FailsafeInputs(
             state=state,
-            airborne=self.flight.flies(state),
+            airborne=airborne,
             last_command_ns=self.authority.last_command_ns,
             pilot=self._pilot,
             link_up=self._vehicle.link_up,
