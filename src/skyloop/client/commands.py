@@ -117,7 +117,7 @@ class CommandSender:
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
         self.barred = False  #: the end of the flight has begun: only the library's own commands and a stop pass
-        self._told: Outcome | None = None  # the newest outcome of ours
+        self.told: Outcome | None = None  #: the newest that the proxy told of this application's intents
         self._first_set_point = 0  # number of the first in the present row of set-points; 0: the newest is none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
         self.sends = ChannelCounter()  #: commands sent; ``dropped``: not handed to the transport
@@ -204,7 +204,7 @@ class CommandSender:
         if not isinstance(action, SET_POINTS):
             self._first_set_point = 0
             return sent
-        told = self._told
+        told = self.told
         self._first_set_point = self._first_set_point or intent
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
 
@@ -366,7 +366,7 @@ class CommandSender:
         """Clear the set-point and the authority: nothing old is sent on the next connection."""
         with self._lock:
             self._schedule.clear(Fate.LINK)
-            self._told = None
+            self.told = None
             changed = self._authority.disconnected()
         if changed:
             self._notify()
@@ -378,7 +378,7 @@ class CommandSender:
             changed = self._authority.feedback(sample, now_ns)
             self._schedule.observe(sample, now_ns, self.app_id)
             if sample.outcome is not None and sample.outcome.app_id == self.app_id:
-                self._told = sample.outcome
+                self.told = sample.outcome
         if changed:
             self._moved(before, now_ns)
 

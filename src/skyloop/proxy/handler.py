@@ -383,7 +383,7 @@ class CommandHandler:
                 why = vehicle.driver_refused("apply", error)
                 self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.DRIVER_FAILED, why, now_ns), now_ns
-            intent.begun = True
+            intent.begun, intent.reason, intent.text = True, None, ""
             if decision.takes_off:
                 flight.claim(now_ns)
                 self._rising_until_ns = intent.asked_ns + TAKEOFF_NS
