@@ -133,6 +133,13 @@ class ScriptedProxy:
         self.until(lambda: action in self.actions()[after:], f"{action!r}")
         return next(command for command in self.commands[after:] if command.action == action)
 
+    def from_now_on(self, action: AnyAction, times: int = 4) -> list[Command]:
+        """Wait for so many such commands, and return all from the first on: those before it were sent before it."""
+        after = len(self.commands)
+        self.until(lambda: self.actions()[after:].count(action) >= times, f"{action!r}, again and again")
+        later = self.commands[after:]
+        return later[[command.action for command in later].index(action) :]
+
     # What a test makes happen ----------------------------------------------------------------------------------
 
     def publish(self, sample: Feedback | Event | Applied, topic: str) -> None:

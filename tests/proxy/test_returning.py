@@ -342,6 +342,20 @@ def test_a_pilots_return() -> None:
         assert pilot.refusals() == [Refusal.WRONG_STATE], "a new one is"
 
 
+def test_feedback_never_tells_of_a_return_beside_the_arrival_of_the_one_before() -> None:
+    """A sample between the command and the next tick did: return_to_start() was over before the vehicle landed."""
+    with Bench() as bench:
+        pilot = away(bench)
+        pilot.command(ReturnToStart(land=False))
+        fly_back(bench, lambda: pilot.command(ReturnToStart(land=False), repeat=True))
+        assert pilot.last_feedback().return_phase is ReturnPhase.ARRIVED
+        pilot.command(ReturnToStart())
+        bench.driver.report()
+        pilot.sync()
+        first = next(sample for sample in pilot.feedback if sample.outcome and sample.outcome.intent == pilot.intent)
+        assert first.return_phase is ReturnPhase.FLYING
+
+
 @pytest.mark.parametrize("action", [Hover(), Velocity(0.5), Land(), EmergencyStop(), Position(5.0, 1.0, 1.0)])
 def test_any_command_ends_it(action: Hover | Velocity | Land | EmergencyStop | Position) -> None:
     with Bench() as bench:

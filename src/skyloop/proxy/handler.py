@@ -391,6 +391,9 @@ class CommandHandler:
                 self._take_vehicle(session, applied, new)
         if kind is not ReturnToStart and decision.action is not None:
             checks.back = None
+        # Before feedback tells of this intent: beside it, "arrived" would be of the return before this one.
+        if fresh and self._back.observe():
+            self._stamp()
         self._tell(session, intent)
         applied_ns = self._count_applied(command)
         ladder = self.ladder

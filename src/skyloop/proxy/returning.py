@@ -54,9 +54,13 @@ class ReturnSupervisor:
             self._fly(now_ns)
         if not ours:
             checks.back = None
+        return self.observe()
+
+    def observe(self) -> bool:
+        """Observe how far the way back is; return whether feedback has something else to show."""
         before = self.start, self.phase
-        back = checks.back if checks.back is not None and executor.airborne else None
-        self.start = checks.start.position
+        back = self._checks.back if self._checks.back is not None and self._executor.airborne else None
+        self.start = self._checks.start.position
         self.phase = ReturnPhase.NONE if back is None else back.phase
         return (self.start, self.phase) != before
 
