@@ -197,6 +197,24 @@ def test_nothing_is_flown_while_the_end_waits_for_a_slow_request() -> None:
             done.set()
 
 
+def test_an_end_that_lands_nothing_bars_everything_first_as_well(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(1.0))
+    barred: list[str] = []
+
+    def end() -> None:
+        pilot.command(Velocity(1.0))
+        pilot.command(Hover())
+        barred.extend(pilot.refusals())
+
+    monkeypatch.setattr(bench.proxy.overview, "end", end)
+    bench.proxy.end()
+    assert set(barred) == {Refusal.WRONG_STATE}
+    assert bench.driver.told == [Velocity(1.0), Hover()]
+
+
 def assert_set(event: threading.Event) -> None:
     assert event.wait(LONG_S)
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Callable, Coroutine
-from contextlib import suppress
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -233,11 +233,22 @@ class ControlSession:
 
     def _send_now(self, pilot: PilotConnection, act: Callable[[PilotConnection], bool], command: AnyCommand) -> None:
         """End what the page flew before, and send a command; :class:`LinkError` if it was not sent."""
-        self._end_flight(f"{command.do} was commanded")
-        if not act(pilot):
+        with self._in_place_of(pilot, f"{command.do} was commanded"):
+            sent = act(pilot)
+        if not sent:
             with suppress(SkyloopError):
                 pilot.idle()  # or it would be done after all when the link is back soon
             raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
+
+    @contextmanager
+    def _in_place_of(self, pilot: PilotConnection, why: str) -> Iterator[None]:
+        """End what the page flew before; hover if what takes its place is refused: nobody watches the former any more."""
+        self._end_flight(why)
+        try:
+            yield
+        except SkyloopError:
+            pilot.let_go("what was to take its place was refused")
+            raise
 
     def _hover_here(self, command: HoverHere) -> None:
         """Hover: as the person decided, or because the page finds that nothing is held any more."""
@@ -278,10 +289,10 @@ class ControlSession:
         if problem := problem or untimely(command, seconds(self._clock())):
             raise RefusedError(f"the route can't be flown: {problem}")
         pilot = held()
-        self._end_flight()
-        self._end_route()
-        self._route = RouteSession(route, pilot, self._station.drone, self._photos, self._send, self._aim)
-        self._route.begin()
+        with self._in_place_of(pilot, "another route was begun"):
+            self._end_route()
+            self._route = RouteSession(route, pilot, self._station.drone, self._photos, self._send, self._aim)
+            self._route.begin()
         self._acknowledge(command)
         self._restart_silence_timer()
 
@@ -404,8 +415,7 @@ class ControlSession:
         pilot = self._pilot
         if pilot is None or pilot.authority.state == "none":
             raise AuthorityError("take control first", code="no_authority")
-        if self._station.is_stopping:
-            raise RefusedError("an emergency stop is under way: nothing else is commanded before it shows")
+        self._station.check_stop()
         if pilot.authority.state != "held":
             raise AuthorityError(f"{pilot.authority.holder or 'another application'} has control", code="no_authority")
         return pilot

@@ -559,6 +559,8 @@ class CommandHandler:
         for effect in effects:
             if isinstance(effect, Lost):
                 self._pilot = effect.reason
+                if self.flight.ours and (session := self._sessions.get(effect.app_id)) and session.intents.lands:
+                    self.ladder.land_on(now_ns)
             elif isinstance(effect, Granted):
                 self._pilot = "held"
                 self.ladder.hand_over(now_ns)
@@ -646,7 +648,8 @@ class CommandHandler:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
             lands = self._lands  # wherever it is
-            self._events.publish_draft(position_jumped_event(airspace.jumped_m, lands=lands))
+            event = position_jumped_event(airspace.jumped_m, lands=lands)
+            self._events.publish_repeated((0, "jumped"), lambda: event)
             if not lands:
                 self._start_over(Fate.JUMPED, now_ns)
         airspace.jumped_m = 0.0

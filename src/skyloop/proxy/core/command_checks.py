@@ -172,7 +172,7 @@ class CommandChecks:
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
-        if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND:
+        if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND and not automatic:
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
@@ -246,7 +246,7 @@ class CommandChecks:
                 return Refusal.WRONG_STATE, f"{others}, and {what} does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
-        if self._ladder.lands_for_battery and (kind in SET_POINTS or automatic):
+        if self._ladder.lands_for_battery and (kind in SET_POINTS or (automatic and kind is not Land)):
             what = "returns to its start" if self._ladder.returning else "lands"
             return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
         if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:
