@@ -62,6 +62,7 @@ def test_a_landing_that_does_not_show_yet_goes_on_without_its_pilot(bench: Bench
     pilot.command(Land())
     if leaves == "killed":
         pilot.end.close()
+        wait_until(lambda: bench.proxy.handler.authority.holder is None, "its end is noticed")
     else:
         pilot.ask(ReleaseAuthority())
     bench.run(4.0)
@@ -79,7 +80,7 @@ def test_the_next_pilot_takes_such_a_landing_over(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.answers = False
     pilot.command(Land())
-    pilot.end.close()
+    pilot.ask(ReleaseAuthority())
     bench.run(0.1)
     other = bench.pilot("other")
     other.command(Hover())

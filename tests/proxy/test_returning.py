@@ -20,6 +20,7 @@ from skyloop.messages import (
     LinkState,
     Position,
     Refusal,
+    ReleaseAuthority,
     ReturnPhase,
     ReturnToStart,
     SetParameter,
@@ -451,7 +452,7 @@ def test_a_landing_that_a_waiting_call_asks_for_again_is_not_refused_meanwhile()
         bench.run(0.2, lambda: pilot.command(Land(), automatic=True, repeat=True))
         assert {type(action) for action in bench.driver.told} == {Position}
         assert pilot.refusals() == []
-        pilot.end.close()
+        pilot.ask(ReleaseAuthority())
         bench.run(0.2)
         assert {type(action) for action in bench.driver.told} == {Position}, "it still lands at its start"
 
