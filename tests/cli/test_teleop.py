@@ -319,7 +319,7 @@ def test_an_emergency_stop_is_heard_while_control_is_asked_for_or_given_back(
         monkeypatch.setattr(drone, "request_authority", lambda: answered.wait(WAIT_S))
         monkeypatch.setattr(drone._core.connection, "call", lambda *_: pytest.fail("R waits for an answer"))
         for order in ("take", "take", "stop"):
-            pilot.obey(order)  # type: ignore[arg-type]
+            pilot.obey(order)
         proxy.until_commanded(EmergencyStop())
         assert not answered.is_set()
         answered.set()

@@ -177,6 +177,9 @@ class ActionWait:
         status = self._commands.status
         if status.state in ("queued", "preempted"):
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
+        told = self._commands.told
+        if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
+            self._why = told.text  # nothing any more, once a repeat is carried out
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
             return None

@@ -14,7 +14,7 @@ from typing import Final, Literal, Self, TypeVar, get_args
 import numpy as np
 
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import above_zero, cancelled, checked, number, position_action, return_action
+from skyloop.client.commands import above_zero, by_name, cancelled, checked, number, position_action, return_action
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
@@ -216,6 +216,7 @@ class Swarm:
         """Ask for nothing: keep the authority and leave the vehicles as they are."""
         return self.command(Idle())
 
+    @by_name
     def velocity(
         self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
@@ -231,6 +232,7 @@ class Swarm:
             Velocity(number("forward", forward), number("left", left), number("up", up), number("yaw_rate", yaw_rate))
         )
 
+    @by_name
     def attitude(
         self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:

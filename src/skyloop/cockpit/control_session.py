@@ -242,7 +242,7 @@ class ControlSession:
 
     @contextmanager
     def _in_place_of(self, pilot: PilotConnection, why: str) -> Iterator[None]:
-        """End what the page flew before; hover if what takes its place is refused: nobody watches the former any more."""
+        """End what the page flew before; hover if what takes its place is refused: nobody watches the former then."""
         self._end_flight(why)
         try:
             yield

@@ -147,8 +147,8 @@ class SetpointController:
         Args:
             action: One of the driver's ``ACTIONS``.
             now_ns: The present time.
-            new: Whether an application newly asked for it. What nobody decided, but a landing, leaves a drone alone that
-                is :attr:`left_alone`.
+            new: Whether an application newly asked for it. What nobody decided, but a landing, does nothing to a drone
+                that is :attr:`left_alone`.
 
         Returns:
             What is applied: a set-point within the limits, or hover after an emergency stop.
