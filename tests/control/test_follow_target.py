@@ -389,7 +389,9 @@ def test_the_behaviour_sends_attitudes_where_there_is_no_velocity() -> None:
 
 
 @pytest.mark.usefixtures("_no_age")
-def test_the_behaviour_takes_the_results_of_a_processor() -> None:
+@pytest.mark.parametrize(("camera", "phase"), [("front", TargetPhase.FOLLOWING), ("bottom", TargetPhase.LOOKING)])
+def test_the_behaviour_takes_the_results_of_a_processor(camera: str, phase: TargetPhase) -> None:
+    """Those of its own camera: a box of another one's frames is somewhere else."""
     drone = Recorder()
     pilot = FollowTarget(drone, class_name="person", detector="detect")  # type: ignore[arg-type]
     one = {"box": list(the_box()), "score": 0.9, "class_id": 0, "class_name": "person"}
@@ -397,9 +399,9 @@ def test_the_behaviour_takes_the_results_of_a_processor() -> None:
         at_s = 1.0 + n * PERIOD_S
         given(pilot, PERIOD_S, start=at_s)
         value: Any = {"detections": [one]}
-        pilot.on_result(SimpleNamespace(value=value, captured_ns=nanoseconds(at_s)))  # type: ignore[arg-type]
+        pilot.on_result(SimpleNamespace(camera=camera, value=value, captured_ns=nanoseconds(at_s)))  # type: ignore[arg-type]
     given(pilot, 0.2, start=1.4)
-    assert pilot.phase is TargetPhase.FOLLOWING
+    assert pilot.phase is phase
     assert pilot.status.class_name == "person"
 
 

@@ -122,8 +122,9 @@ class FollowTarget(Behaviour):
             self.finish("gave up: the target was lost for too long")
 
     def on_result(self, result: Result) -> None:
-        """Use the detections of a processor."""
-        self.follower.detected(detections_of(result.value), result.captured_ns)
+        """Use the detections of a processor in frames of this behaviour's camera; it may see others' too."""
+        if result.camera == self._mounting.name:
+            self.follower.detected(detections_of(result.value), result.captured_ns)
 
 
 def _box(box: Sequence[float]) -> Box:
