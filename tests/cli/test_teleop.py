@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import termios
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -154,6 +155,19 @@ def test_repeats_that_were_held_up_stop_no_motors() -> None:
     assert Fingers().press(*["esc"] * 9) == ["hover", "held"]
 
 
+@pytest.mark.parametrize("key", ["w", "esc"])
+def test_esc_held_just_past_its_first_repeat_is_one_press_once_the_keyboard_is_known(key: str) -> None:
+    """It was let go after one repeat, which is as late as a slow second press, and the motors were cut."""
+    fingers = Fingers()
+    fingers.hold(key, 0.3)
+    fingers.wait(3.0)
+    assert fingers.press("esc") == ["hover"]
+    fingers.wait(0.5)
+    assert fingers.press("esc", after_s=0.02) + fingers.wait(1.0) == ["held"]
+    assert fingers.press("esc") == ["hover"]
+    assert fingers.press("esc", after_s=0.3) + fingers.wait(0.2) == ["stop"], "a second press at another time"
+
+
 @pytest.mark.parametrize("between", ["w", "alt", "h", "up", "x"])
 def test_esc_with_another_key_between_is_no_second_press(between: str) -> None:
     fingers = Fingers()
@@ -294,6 +308,24 @@ def test_a_hover_ends_a_take_off_that_does_not_show_yet(proxy: ScriptedProxy) ->
         assert Hover() not in proxy.actions(), "nothing was to be ended"
         pilot.obey("hover")
         assert not proxy.until_commanded(Hover()).automatic
+
+
+def test_an_emergency_stop_is_heard_while_control_is_asked_for_or_given_back(
+    proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """C waited for the proxy's answer for up to 7 s, R for 2 s, and no key was read meanwhile."""
+    with flown(proxy) as drone:
+        pilot, answered = Teleop(drone, 0.5, 0.8), threading.Event()
+        monkeypatch.setattr(drone, "request_authority", lambda: answered.wait(WAIT_S))
+        monkeypatch.setattr(drone._core.connection, "call", lambda *_: pytest.fail("R waits for an answer"))
+        for order in ("take", "take", "stop"):
+            pilot.obey(order)
+        proxy.until_commanded(EmergencyStop())
+        assert not answered.is_set()
+        answered.set()
+        pilot._taking.join(WAIT_S)
+        pilot.obey("release")
+        assert pilot._message == "release"
 
 
 def test_what_the_hands_ask_for_is_flown(proxy: ScriptedProxy) -> None:

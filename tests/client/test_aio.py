@@ -144,6 +144,21 @@ def test_frames(proxy: ScriptedProxy) -> None:
     run(look())
 
 
+def test_frames_that_are_too_old_do_not_begin_the_time_anew(proxy: ScriptedProxy) -> None:
+    async def look() -> None:
+        async with aio.connect("me") as drone:
+            sending = background(lambda: _send(proxy, 200))
+            begun_s = time.monotonic()
+            with pytest.raises(NoAnswerError, match="no frame of front"):
+                async for _ in drone.frames(timeout_s=0.3, max_age_s=0.0):
+                    pass
+            assert sending.is_alive(), "they still came"
+            assert time.monotonic() - begun_s < WAIT_S
+            sending.join(WAIT_S)
+
+    run(look())
+
+
 def test_what_is_waited_for_ends_when_the_drone_is_closed(proxy: ScriptedProxy) -> None:
     async def look() -> None:
         async with aio.connect("me") as drone:

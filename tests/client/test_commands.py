@@ -97,6 +97,12 @@ def test_idle_keeps_the_authority_before_the_first_command(proxy: ScriptedProxy,
         (lambda drone: drone.request_authority(32), "from 0"),
         (lambda drone: drone.go_to(x=math.nan, y=0.0, z=1.0), "x is nan and must be finite"),
         (lambda drone: drone.go_to(x=0.0, y="1", z=1.0), "y is '1' and must be a number"),
+        (lambda drone: drone.velocity(forward=10**400), "forward is too large"),
+        (lambda drone: drone.velocity(up=10**5000), "up is too large"),
+        (lambda drone: drone.command(Velocity(10**400)), "velocity has a number that is too large"),
+        (lambda drone: drone.velocity(yawrate=0.1), "argument of velocity .*'yawrate'.*did you mean 'yaw_rate'"),
+        (lambda drone: drone.velocity(0.3), "by their names, as in velocity.forward=0.3"),
+        (lambda drone: drone.attitude(0.1, 0.2), "roll, pitch, climb, yaw_rate by their names"),
         (lambda drone: drone.go_to(x=0.0, y=0.0, z=True), "z is True"),
         (lambda drone: drone.go_to(x=0.0, y=2e5, z=1.0), "y is 200000 m and must be within"),
         (lambda drone: drone.go_to(x=0.0, y=0.0, z=1.0, yaw=math.inf), "yaw is inf"),
@@ -221,6 +227,22 @@ def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, dron
         drone.land(timeout_s=0.5)
     changing.join(WAIT_S)
     assert len({command.intent for command in proxy.commands if command.action == Land()}) == 1
+
+
+def test_a_reason_is_no_older_than_the_last_change_of_what_it_speaks_of(proxy: ScriptedProxy, drone: Drone) -> None:
+    """The link was up for 4 s, and the error still said that it was connecting."""
+
+    def vehicle() -> None:
+        command = proxy.until_commanded(Takeoff())
+        refuse(proxy, command, Refusal.VEHICLE_LINK_LOST, "me: the link is connecting")
+        proxy.until(lambda: proxy.commands[-1].intent > command.intent)
+        assert proxy.owner is not None
+        proxy.more["outcome"] = Outcome(proxy.owner[0], proxy.commands[-1].intent)
+
+    thread = background(vehicle)
+    with pytest.raises(NoAnswerError, match=r"the vehicle is landed$"):
+        drone.takeoff(timeout_s=2.0)
+    thread.join(WAIT_S)
 
 
 def test_a_take_off_that_a_failsafe_ended_is_not_asked_for_anew(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from skyloop.client import Drone, Frame, LinkStatus, Listener
 from skyloop.client.core import DroneCore
+from skyloop.client.telemetry import IDLE_KEPT
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import (
     Annotation,
@@ -20,6 +21,7 @@ from skyloop.messages import (
     Event,
     EventKind,
     Feedback,
+    FeedbackRequest,
     FlightState,
     GetStatistics,
     Hover,
@@ -27,6 +29,7 @@ from skyloop.messages import (
     LinkState,
     Polyline,
     ReleaseAuthority,
+    RequestAuthority,
     Statistics,
     Takeoff,
     Text,
@@ -486,3 +489,68 @@ def test_a_landed_drone_is_just_left(proxy: ScriptedProxy) -> None:
 def test_unusable_options(proxy: ScriptedProxy, options: dict[str, str]) -> None:
     with pytest.raises(UsageError):
         DroneCore(proxy.server.dial, **{"app": "me", **options})  # type: ignore[arg-type]
+
+
+def test_closing_waits_for_all_listeners_together_and_wakes_who_asks_for_the_authority(
+    proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """2 s for each listener in turn; and 8 s, with another error, for a request of the authority."""
+    monkeypatch.setattr("skyloop.client.core.JOIN_S", 0.4)
+    go_on, asked = threading.Event(), threading.Event()
+    errors: list[Exception] = []
+    core = DroneCore(proxy.server.dial, app="closing")
+    core.open(acquire=False)
+    drone = Drone(core)
+    listeners = [drone.on_feedback(lambda _: go_on.wait(WAIT_S)) for _ in range(4)]
+    proxy.answers[RequestAuthority] = None
+
+    def ask() -> None:
+        asked.set()
+        try:
+            drone.request_authority(wait_s=WAIT_S)
+        except ClosedError as error:
+            errors.append(error)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    assert asked.wait(WAIT_S)
+    proxy.until(lambda: all(listener.delivered for listener in listeners))
+    begun_s = time.monotonic()
+    drone.close()
+    asking.join(WAIT_S)
+    assert time.monotonic() - begun_s < 1.5
+    assert "closed while" in str(errors[0])
+    go_on.set()
+
+
+def test_channels_that_nobody_reads_are_forgotten(proxy: ScriptedProxy, drone: Drone) -> None:
+    """Each rate and size that was ever asked for was kept for good."""
+    state = drone._core.state
+    watched = drone._core.channel(scale=0.5)
+    with drone.on_frame(lambda _: None, scale=0.5), drone.on_feedback(lambda _: None, max_hz=7.0):
+        for number in range(1, 100):
+            drone._core.channel(max_fps=float(number))
+            drone._core.stream(max_fps=float(number))
+            state.feedback_channel(FeedbackRequest(max_hz=1.0 + number / 10))
+        assert drone._core.channel(scale=0.5) is watched
+        assert {id(channel) for channel in state.channels.values()} <= {id(one) for one in state.variants.values()}
+        assert 1.0 < len(state.selected) <= IDLE_KEPT
+        assert any(channel.subscribed for channel in state.selected)
+    assert len(state.variants) <= IDLE_KEPT
+    assert len(state.streams) <= IDLE_KEPT
+
+
+def test_two_threads_that_ask_for_the_same_channel_get_the_same(drone: Drone) -> None:
+    start, found = threading.Barrier(8), set()
+
+    def ask() -> None:
+        start.wait(WAIT_S)
+        for number in range(1, 20):
+            found.add((number, id(drone._core.channel(max_fps=float(number)))))
+
+    threads = [threading.Thread(target=ask) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(WAIT_S)
+    assert len(found) == 19

@@ -175,6 +175,8 @@ def test_nothing_is_written_again_where_another_flew_since_the_restart(proxy: Sc
         ("text", "text"),
         ([1, 2.5], (1.0, 2.5)),
         (np.array([1.0, 2.0]), (1.0, 2.0)),
+        (np.array(0.5), 0.5),
+        (np.array(True), True),
     ],
 )
 def test_plain_values(given: object, expected: Value) -> None:
@@ -183,7 +185,9 @@ def test_plain_values(given: object, expected: Value) -> None:
     assert type(value) is type(expected)
 
 
-@pytest.mark.parametrize("given", [None, {}, object(), ["a"], 2**63, "x" * 5000, [0.0] * 300, np.zeros((2, 2)), 1j])
+@pytest.mark.parametrize(
+    "given", [None, {}, object(), ["a"], 2**63, "x" * 5000, [0.0] * 300, np.zeros((2, 2)), np.array(1j)]
+)
 def test_values_that_cannot_travel(given: object) -> None:
     with pytest.raises(UsageError, match="x can't be"):
         plain_value("x", given)

@@ -16,9 +16,10 @@ from skyloop.client import AuthorityStatus, Drone
 from skyloop.cockpit.commands import decode_command
 from skyloop.cockpit.control_session import SILENT_S
 from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.control import Controller
 from skyloop.control.follow import FollowMarker
-from skyloop.errors import DecodeError
+from skyloop.errors import DecodeError, RefusedError
 from skyloop.messages import (
     AnyAction,
     EmergencyStop,
@@ -333,6 +334,25 @@ def test_a_place_that_the_proxy_refuses_is_told_with_its_reason(client: TestClie
         pilot.say("goto", x=0.5, y=0, z=0.3)
         with pilot.staying():
             pilot.wait("done", do="goto")
+
+
+def test_what_takes_the_place_of_a_flight_and_is_refused_leaves_it_hovering(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its place stayed in force, and nobody watched the flight there any more."""
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("goto", x=50, y=0, z=1)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+
+        def refuse(self: PilotConnection) -> bool:
+            raise RefusedError("not now")
+
+        monkeypatch.setattr(PilotConnection, "reset_emergency", refuse)
+        with pilot.staying():
+            pilot.say("reset")
+            assert pilot.wait("refused", do="reset")["why"] == "not now"
+            until(lambda: node.flyer.state is FlightState.HOVERING)
 
 
 def test_a_way_that_something_else_ended_is_told(client: TestClient, node: Node) -> None:

@@ -77,6 +77,17 @@ def test_each_drone_that_is_not_landed_is_told_with_its_reason(nodes: tuple[Node
         pilot.wait("each", drone="beta", state="done")
 
 
+def test_a_drone_whose_motors_are_being_stopped_is_not_landed(nodes: tuple[Node, Node]) -> None:
+    """The landing took the authority in the middle of it, and was obeyed by a vehicle that had not heard the stop."""
+    fleet = Fleet(Nodes(*nodes), look_s=0.05)
+    with cockpit(fleet) as client, everybody(client) as pilot:
+        until(lambda: len(fleet.stations) == 2)
+        fleet.stations["alpha"]._stops = 1
+        pilot.say("land_all")
+        assert "emergency stop" in pilot.wait("each", drone="alpha", state="refused")["why"]
+        pilot.wait("each", drone="beta", state="done")
+
+
 def test_a_landing_of_all_goes_on_without_the_page(nodes: tuple[Node, Node]) -> None:
     with cockpit(Fleet(Nodes(*nodes), look_s=0.05)) as client, nodes[0].connect("demo", on_exit="hover") as demo:
         demo.takeoff()

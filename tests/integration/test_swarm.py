@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import sys
@@ -29,7 +30,7 @@ from skyloop.errors import (
     UnsupportedError,
     UsageError,
 )
-from skyloop.messages import AnyAction, FlightState, Land, LinkState, Velocity
+from skyloop.messages import AnyAction, FlightState, Hover, Land, LinkState, Velocity
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.memory import MemoryServer
 from skyloop.transport.testing import wait_until
@@ -400,6 +401,25 @@ def test_a_beat_with_absolute_deadlines(field: Field) -> None:
             if tick.number == 2:
                 break
         assert tick.elapsed_s > 0.019
+
+
+@pytest.mark.parametrize("end", [None, KeyboardInterrupt, ValueError, SystemExit])
+def test_when_a_loop_ends_what_it_flew_hovers_at_once(field: Field, end: type[BaseException] | None) -> None:
+    """Its last velocity went on for ``stall_s``: set-points that nobody stood behind any more."""
+    with Swarm({name: field.connect(name, stall_s=math.inf) for name in NAMES}) as drones:
+        drones.takeoff()
+        drones["bravo"].land(wait=False)
+        with contextlib.suppress(KeyboardInterrupt, ValueError, SystemExit):
+            for tick in drones.ticks(100.0):
+                drones.send({name: Velocity(0.5) for name in ("alpha", "charlie")})
+                if tick.number == 5:
+                    if end is None:
+                        break
+                    raise end
+        commands = {name: drone._core.commands for name, drone in drones.items()}
+        assert type(commands["alpha"].newest) is type(commands["charlie"].newest) is Hover
+        assert type(commands["bravo"].newest) is not Hover, "it was not flown by the loop"
+        wait_until(lambda: type(field.vehicles["alpha"].applied[-1]) is Hover, "it hovers")
 
 
 def test_a_function_for_each_on_threads_of_their_own(field: Field) -> None:

@@ -105,6 +105,20 @@ def test_a_flight_of_an_earlier_run_is_ours_if_it_is_found_in_the_air_and_no_lat
     assert seen(landed_meanwhile, FLYING, T0 + 9 * S) is Whose.OTHERS
 
 
+def test_time_that_a_computer_slept_counts_for_what_is_believed_however_often_it_did() -> None:
+    """Belief in an earlier run's flight ended after 60 s by the clock that stands still meanwhile, or by one sleep."""
+    flight = Flight()
+    flight.began_before(T0 + BELIEF_NS)
+    for _ in range(2):
+        flight.slept(40 * S)
+        assert seen(flight, UNKNOWN) is Whose.NOBODYS
+    assert seen(flight, FLYING, T0 + S) is Whose.OTHERS
+    claimed = Flight()
+    claimed.claim(T0)
+    claimed.slept(20 * S)
+    assert not claimed.may_begin(T0)
+
+
 steps = st.tuples(
     st.sampled_from(list(FlightState)), st.sampled_from(["", "", "LAND"]), st.sampled_from(["", "", "claim", "take"])
 )

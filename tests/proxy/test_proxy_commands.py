@@ -192,6 +192,47 @@ def test_a_driver_that_raises_is_told_and_the_flight_goes_on(bench: Bench) -> No
     assert bench.driver.told == [Velocity(0.5), EmergencyStop()]
 
 
+@pytest.mark.parametrize("state", [FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN])
+@pytest.mark.parametrize("action", [Hover(), Land()])
+def test_a_pilots_hover_and_landing_go_to_a_vehicle_that_is_not_heard(
+    bench: Bench, action: AnyAction, state: FlightState
+) -> None:
+    """It may hear us all the same. Only the emergency stop went out, which is no way to bring a drone down."""
+    pilot = bench.airborne()
+    bench.tick()
+    bench.driver.answers = False
+    bench.driver.report(state=state)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.tick()
+    bench.driver.told.clear()
+    pilot.command(action)
+    assert bench.driver.told == [action]
+    bench.run(1.0, lambda: pilot.command(action, repeat=True))
+    assert set(bench.driver.told) == {action}, "its failsafe's hover does not take a landing back"
+    assert pilot.refusals() == []
+    steps = [event.data["step"] for event in pilot.told(EventKind.FAILSAFE)]
+    assert steps == (["hover"] if action == Hover() else ["hover", "none"])
+    for other in (Velocity(0.5), Takeoff(), ResetEmergency()):
+        pilot.command(other)
+    pilot.command(action, automatic=True)
+    assert set(bench.driver.told) <= {action, Hover()}, "nothing else, and nothing that nobody decided"
+    bench.run(1.1)
+    assert set(pilot.refusals()) == {Refusal.VEHICLE_LINK_LOST}
+    bench.driver.link(LinkState.UP)
+    bench.driver.told.clear()
+    pilot.command(action, repeat=True)
+    assert bench.driver.told == [Hover()], "what was asked for in between is not done later"
+
+
+def test_a_hover_in_software_is_refused_while_the_vehicle_is_not_heard() -> None:
+    with Bench({"velocity"}) as bench:
+        bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)
+        pilot = bench.pilot()
+        bench.driver.link(LinkState.LOST)
+        pilot.command(Land())
+        assert pilot.refusals() == [Refusal.VEHICLE_LINK_LOST], "nothing shows how it moves"
+
+
 def test_a_lost_vehicle_link_refuses_commands_until_fresh_ones_come(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))

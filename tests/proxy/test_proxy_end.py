@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
@@ -82,6 +82,28 @@ def test_what_stands_is_not_taken_off_while_another_one_lands() -> None:
             flying.driver.report(state=FlightState.LANDED)
         assert standing.driver.told == []
         assert standing.driver.closed
+
+
+def test_all_are_told_to_land_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight drones of one simulated world were told so 0.2 s apart, one after the other."""
+    with ExitStack() as stack:
+        benches = [stack.enter_context(Bench()) for _ in range(4)]
+        together = threading.Barrier(len(benches), timeout=LONG_S)
+        for bench in benches:
+            bench.airborne()
+            apply = bench.driver._apply
+
+            def meet(action: AnyAction, apply: Callable[[AnyAction], AnyAction] = apply) -> AnyAction:
+                if isinstance(action, Land):
+                    together.wait()  # broken, and none lands, unless all of them are told
+                return apply(action)
+
+            monkeypatch.setattr(bench.driver, "_apply", meet)
+        proxies = [bench.proxy for bench in benches]
+        with ending(lambda: end_all(proxies, LONG_S, reason="it is late", hurry=lambda: False)):
+            for bench in benches:
+                land_told(bench)
+                bench.driver.report(state=FlightState.LANDED)
 
 
 def test_one_that_fails_to_close_keeps_no_other_one_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,6 +217,22 @@ def test_nothing_is_flown_while_the_end_waits_for_a_slow_request() -> None:
             wait_until(lambda: len(refused(pilot)) == 1, "they are refused")
             assert bench.driver.told == [Velocity(1.0), Hover()]
             done.set()
+
+
+def test_an_end_that_lands_nothing_bars_everything_first_as_well(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(1.0))
+    barred: list[str] = []
+
+    def end() -> None:
+        pilot.command(Velocity(1.0))
+        pilot.command(Hover())
+        barred.extend(pilot.refusals())
+
+    monkeypatch.setattr(bench.proxy.overview, "end", end)
+    bench.proxy.end()
+    assert set(barred) == {Refusal.WRONG_STATE}
+    assert bench.driver.told == [Velocity(1.0), Hover()]
 
 
 def assert_set(event: threading.Event) -> None:

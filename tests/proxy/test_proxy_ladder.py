@@ -54,6 +54,54 @@ def test_a_silent_pilot(bench: Bench) -> None:
     assert witness.last_feedback().failsafe is Failsafe.NONE
 
 
+@pytest.mark.parametrize("leaves", ["killed", "releases"])
+def test_a_landing_that_does_not_show_yet_goes_on_without_its_pilot(bench: Bench, leaves: str) -> None:
+    """``land()`` as the last line of a program: it hovered first, and landed 5 s later."""
+    pilot, witness = bench.airborne(), bench.join("witness")
+    bench.driver.answers = False
+    pilot.command(Land())
+    if leaves == "killed":
+        pilot.end.close()
+        wait_until(lambda: bench.proxy.handler.authority.holder is None, "its end is noticed")
+    else:
+        pilot.ask(ReleaseAuthority())
+    bench.run(4.0)
+    witness.sync()
+    assert set(bench.driver.told) == {Land()}
+    bench.driver.report(state=FlightState.LANDED)
+    bench.run(0.1)
+    bench.driver.told.clear()
+    bench.driver.report(state=FlightState.LANDED)
+    bench.run(6.0)
+    assert bench.driver.told == [], "it is over"
+
+
+def test_the_next_pilot_takes_such_a_landing_over(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.answers = False
+    pilot.command(Land())
+    pilot.ask(ReleaseAuthority())
+    bench.run(0.1)
+    other = bench.pilot("other")
+    other.command(Hover())
+    bench.driver.told.clear()
+    bench.run(0.4)
+    assert Land() not in bench.driver.told
+
+
+def test_a_set_point_of_the_librarys_own_does_not_break_off_the_ladders_landing(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.run(5.1)
+    assert bench.driver.told[-1] == Land()
+    bench.driver.told.clear()
+    pilot.take_authority()
+    pilot.command(Velocity(0.5), automatic=True)
+    bench.run(0.2)
+    assert bench.driver.told == []
+    pilot.command(Velocity(0.5))
+    assert bench.driver.told == [Hover()], "a pilot who is back does"
+
+
 def test_a_killed_pilot(bench: Bench) -> None:
     pilot, witness = bench.airborne(), bench.join("witness")
     pilot.command(Velocity(0.5))

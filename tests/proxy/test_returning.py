@@ -20,6 +20,7 @@ from skyloop.messages import (
     LinkState,
     Position,
     Refusal,
+    ReleaseAuthority,
     ReturnPhase,
     ReturnToStart,
     SetParameter,
@@ -440,6 +441,20 @@ def test_no_hover_or_landing_of_the_librarys_own_ends_a_return_for_a_low_battery
         assert steps(pilot) == [("land", "battery_return", True)]
         pilot.command(Hover())
         assert bench.driver.told[-1] == Hover()
+
+
+def test_a_landing_that_a_waiting_call_asks_for_again_is_not_refused_meanwhile() -> None:
+    """After a lost link ``land()`` raised, while the vehicle was on its way to land."""
+    with Bench() as bench:
+        pilot = away(bench)
+        fall_below_the_charge_to_return_at(bench, pilot)
+        pilot.command(Land(), automatic=True)
+        bench.run(0.2, lambda: pilot.command(Land(), automatic=True, repeat=True))
+        assert {type(action) for action in bench.driver.told} == {Position}
+        assert pilot.refusals() == []
+        pilot.ask(ReleaseAuthority())
+        bench.run(0.2)
+        assert {type(action) for action in bench.driver.told} == {Position}, "it still lands at its start"
 
 
 def test_the_pilot_takes_it_over_by_a_new_hover_until_it_was_charged() -> None:

@@ -13,6 +13,7 @@ from skyloop import client
 from skyloop.aio.bridge import Callback, LoopNotifier, Opening, in_thread, on_loop, reject_in_step
 from skyloop.client.authority import TakeoverAnswer, TakeoverWay
 from skyloop.client.channels import VideoOptions
+from skyloop.client.commands import by_name
 from skyloop.client.connect import ConnectOptions
 from skyloop.client.frame import Arrival
 from skyloop.client.logbook import Logbook
@@ -203,6 +204,7 @@ class Drone:
         """Ask for nothing: keep the authority and leave the vehicle as it is."""
         return self.sync.idle()
 
+    @by_name
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Fly with a velocity in the levelled body axes.
 
@@ -259,6 +261,7 @@ class Drone:
         """Fly back to where it took off, and land there or hover; see :meth:`skyloop.Drone.return_to_start`."""
         await in_thread(lambda: self.sync.return_to_start(height_m, land=land, wait=wait, timeout_s=timeout_s))
 
+    @by_name
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Hold an attitude with a climb rate.
 
@@ -381,10 +384,11 @@ class Drone:
         came = notifier.came
         max_age_s = how.get("max_age_s")
         mailbox: Mailbox[Arrival] = Mailbox(notifier=notifier)
+        deadline = notifier.loop.time() + timeout_s
         with self.sync._core.closing(mailbox), channel.into(mailbox):
             while not self.sync.closed:
                 try:
-                    await asyncio.wait_for(came.wait(), timeout_s)
+                    await asyncio.wait_for(came.wait(), deadline - notifier.loop.time())
                 except TimeoutError:
                     raise self.sync._core.no_frame(channel.camera.name, timeout_s) from None
                 came.clear()
@@ -397,6 +401,7 @@ class Drone:
                     frame = channel.picture(arrival, max_age_s)
                 if frame is not None:
                     yield frame
+                    deadline = notifier.loop.time() + timeout_s
 
     def result(self, processor: str, *, max_age_s: float | None = None) -> client.Result | None:
         """Return a processor's newest result without waiting; see :meth:`skyloop.Drone.result`."""

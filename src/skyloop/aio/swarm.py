@@ -11,6 +11,7 @@ from skyloop import client
 from skyloop.aio.bridge import Opening, in_thread, reject_in_step
 from skyloop.aio.drone import Drone
 from skyloop.client.authority import TakeoverWay
+from skyloop.client.commands import by_name
 from skyloop.client.connect import ConnectOptions, Missing, Target
 from skyloop.client.statistics import Distribution
 from skyloop.client.swarm import OnError, Tick
@@ -166,6 +167,7 @@ class Swarm:
         """Ask for nothing: keep the authority and leave the vehicles as they are."""
         return await in_thread(self.sync.idle)
 
+    @by_name
     async def velocity(
         self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
@@ -179,6 +181,7 @@ class Swarm:
         """
         return await in_thread(lambda: self.sync.velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate))
 
+    @by_name
     async def attitude(
         self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:

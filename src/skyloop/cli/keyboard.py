@@ -23,6 +23,7 @@ HOLD_S: Final = 0.6  #: how long a press moves its stick
 TWICE_S: Final = 1.0  #: two presses of Esc within this cut the motors
 REPEAT_S: Final = 0.12  #: a key that is held repeats sooner than this, and no finger does
 DELAY_S: Final = 0.2  #: before that no keyboard begins to repeat
+SAME_S: Final = 0.04  #: a second Esc that is so near to the keyboard's own delay may be a repeat of the first
 LANDING_S: Final = 3.0  #: so long after L no stick is moved, as the vehicle may not show yet that it lands
 STOPPING_S: Final = 2.0  #: so long after a stop nothing else is asked for, unless it shows
 _ESC_ALONE_S: Final = 0.03  #: an arrow's other bytes come within this after its Esc
@@ -107,6 +108,8 @@ class Hands:
         self._escaped_s = -math.inf  # the last press of Esc, with no other key since
         self._second: tuple[float, float] | None = None  # a second one: when, and how long after the first
         self._repeats = False  # Esc is held
+        self._delay_s = math.inf  # the keyboard's, before it repeats a key that is held; not known yet
+        self._newest = "", -math.inf, math.inf  # the last key, when, and how long after the same one before it
 
     def step(self, keys: Sequence[str], now_s: float, state: FlightState) -> list[Order | Deflection]:
         """Return what is to be done, in this order; last where the sticks are, if one is moved.
@@ -123,6 +126,7 @@ class Hands:
         if self._second is not None and now_s - self._second[0] >= REPEAT_S and not repeats:
             wanted.append(self._stop(now_s))
         for key in keys:
+            self._learn(key, now_s, stalled=stalled)
             order = self._escape(now_s) if key == "esc" else self._press(key, now_s, state)
             if order in ("hover", "land", "takeoff", "stop"):
                 self._pressed.clear()
@@ -138,6 +142,14 @@ class Hands:
             self._moving = False
             wanted.append("centre")
         return wanted
+
+    def _learn(self, key: str, now_s: float, *, stalled: bool) -> None:
+        """Learn the keyboard's delay from a key that is held: one press, a pause, and then many in a row."""
+        before, at_s, gap_s = self._newest
+        since_s = now_s - at_s if key == before else math.inf
+        if since_s < REPEAT_S and DELAY_S <= gap_s <= TWICE_S and not stalled:
+            self._delay_s = gap_s
+        self._newest = key, now_s, since_s
 
     def _press(self, key: str, now_s: float, state: FlightState) -> Order | None:
         second, self._second, self._escaped_s = self._second, None, -math.inf
@@ -172,6 +184,9 @@ class Hands:
             return "hover"
         if REPEAT_S <= gap_s < DELAY_S:
             return self._stop(now_s)
+        if abs(gap_s - self._delay_s) < SAME_S:
+            self._repeats = True
+            return "held"
         self._second = now_s, gap_s
         return None
 

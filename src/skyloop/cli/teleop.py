@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -70,6 +71,7 @@ class Teleop:
         self._hands = Hands()
         self._gain = 1.0
         self._message = ""
+        self._taking = threading.Thread()
 
     def run(self, keyboard: Keyboard) -> None:
         """Fly until Q is pressed.
@@ -87,7 +89,17 @@ class Teleop:
                     self.obey(order)
 
     def obey(self, order: Order | Deflection) -> None:
-        """Carry out what the hands ask for; what is not possible is reported and changes nothing."""
+        """Carry out what the hands ask for; what is not possible is reported and changes nothing.
+
+        Only to take control waits for an answer, on a thread of its own: an emergency stop is heard meanwhile.
+        """
+        if order != "take":
+            self._carry_out(order)
+        elif not self._taking.is_alive():
+            self._taking = threading.Thread(target=self._carry_out, args=(order,), name="skyloop-take", daemon=True)
+            self._taking.start()
+
+    def _carry_out(self, order: Order | Deflection) -> None:
         try:
             if isinstance(order, Deflection):
                 self._steer(order)
@@ -124,7 +136,7 @@ class Teleop:
         elif order == "take":
             drone.request_authority()
         elif order == "release":
-            drone.release_authority()
+            drone._core.commands.release(wait=False)
         return order
 
     def _steer(self, sticks: Deflection) -> None:

@@ -310,9 +310,14 @@ class Listener(Generic[T]):
         self._mailbox.close()
         if self._on_cancel is not None:
             self._on_cancel(self)
+        if wait:
+            self.join(JOIN_S)
+
+    def join(self, within_s: float) -> None:
+        """Wait for a call that is under way; not if called from the function itself."""
         thread = self._thread
-        if wait and thread is not None and thread is not threading.current_thread():
-            thread.join(JOIN_S)
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(within_s)
 
     def __enter__(self) -> Self:
         return self

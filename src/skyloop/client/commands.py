@@ -7,14 +7,24 @@ import numbers
 import threading
 from collections.abc import Callable
 from contextvars import ContextVar
-from typing import Final
+from functools import wraps
+from typing import Final, ParamSpec, TypeVar
 
 from skyloop.client.authority import AuthorityStatus, AuthorityTracker
 from skyloop.client.channels import Emit
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.statistics import ChannelCounter
-from skyloop.errors import AuthorityError, ClosedError, Hint, LinkError, NoAnswerError, RefusedError, UsageError
+from skyloop.errors import (
+    AuthorityError,
+    ClosedError,
+    Hint,
+    LinkError,
+    NoAnswerError,
+    RefusedError,
+    UnknownNameError,
+    UsageError,
+)
 from skyloop.messages import (
     ACTION_NAMES,
     AnswerTakeover,
@@ -50,6 +60,8 @@ from skyloop.messages.config import MAX_REASON
 from skyloop.messages.earth import is_on_earth
 from skyloop.messages.intent import ENDINGS
 
+P = ParamSpec("P")
+R = TypeVar("R")
 _OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
 ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
 #: How long to wait at most for the proxy to notice that an earlier session of this process has ended: more than the
@@ -117,7 +129,8 @@ class CommandSender:
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
         self.barred = False  #: the end of the flight has begun: only the library's own commands and a stop pass
-        self._told: Outcome | None = None  # the newest outcome of ours
+        self._closed = False
+        self.told: Outcome | None = None  #: the newest that the proxy told of this application's intents
         self._first_set_point = 0  # number of the first in the present row of set-points; 0: the newest is none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
         self.sends = ChannelCounter()  #: commands sent; ``dropped``: not handed to the transport
@@ -156,6 +169,11 @@ class CommandSender:
         """Let no more commands of the application pass but an emergency stop: when this returns, none is on its way."""
         with self._lock:
             self.barred = True
+
+    def close(self) -> None:
+        """Wake who waits for the authority: nobody gets it any more."""
+        self._closed = True
+        self.notifier.notify()
 
     @property
     def stopping(self) -> bool:
@@ -204,7 +222,7 @@ class CommandSender:
         if not isinstance(action, SET_POINTS):
             self._first_set_point = 0
             return sent
-        told = self._told
+        told = self.told
         self._first_set_point = self._first_set_point or intent
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
 
@@ -293,6 +311,7 @@ class CommandSender:
         Raises:
             AuthorityError: If it is not held after ``wait_s``, if it is refused, or if this application only observes.
             NoAnswerError: If the proxy does not answer the request, or the link is lost and not back in time.
+            ClosedError: If the drone is closed meanwhile.
         """
         if self._role is Role.OBSERVER:
             raise AuthorityError("this application observes", code="observer").with_hint(Hint.FLY)
@@ -302,11 +321,15 @@ class CommandSender:
             self._refusal = None
             self._ask_now = True
         self._connection.poke()
-        if not self.notifier.wait_for(lambda: authority.answered, ANSWER_S + max(0.0, wait_s)):
+        answered = self._wait(lambda: authority.answered, ANSWER_S + max(0.0, wait_s))
+        if answered:
+            self._wait(lambda: authority.held or not authority.wanted, max(0.0, wait_s))
+            self._wait(lambda: authority.settled, OWN_S)
+        if self._closed:
+            raise ClosedError("this drone was closed while it asked for the authority")
+        if not answered:
             self.release(wait=False)
             raise NoAnswerError(f"the proxy did not answer the request for the authority within {ANSWER_S:g} s")
-        self.notifier.wait_for(lambda: authority.held or not authority.wanted, max(0.0, wait_s))
-        self.notifier.wait_for(lambda: authority.settled, OWN_S)
         status, refusal = self.status, self._refusal
         if status.state == "held" or (stay and status.state in ("queued", "preempted")):
             return status
@@ -316,6 +339,9 @@ class CommandSender:
         if status.state == "none":
             raise NoAnswerError("the link was lost, or the authority given back, while the proxy was asked for it")
         raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy").with_hint(Hint.OBSERVE)
+
+    def _wait(self, ready: Callable[[], bool], timeout_s: float) -> bool:
+        return self.notifier.wait_for(lambda: self._closed or ready(), timeout_s)
 
     def answer(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
         """Answer an application that asks for the authority. Does not wait; an answer that is too late changes nothing.
@@ -366,7 +392,7 @@ class CommandSender:
         """Clear the set-point and the authority: nothing old is sent on the next connection."""
         with self._lock:
             self._schedule.clear(Fate.LINK)
-            self._told = None
+            self.told = None
             changed = self._authority.disconnected()
         if changed:
             self._notify()
@@ -378,7 +404,7 @@ class CommandSender:
             changed = self._authority.feedback(sample, now_ns)
             self._schedule.observe(sample, now_ns, self.app_id)
             if sample.outcome is not None and sample.outcome.app_id == self.app_id:
-                self._told = sample.outcome
+                self.told = sample.outcome
         if changed:
             self._moved(before, now_ns)
 
@@ -543,6 +569,8 @@ def checked(action: AnyAction) -> AnyAction:
         raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
     try:
         finite, problem = action.finite, action.problem
+    except OverflowError:
+        raise UsageError(f"{action.name} has a number that is too large") from None
     except TypeError as error:
         raise UsageError(f"{action!r} has something that is no number: {error}") from None
     if not finite:
@@ -651,6 +679,25 @@ def above_zero(name: str, value: object) -> float:
     return found
 
 
+def by_name(function: Callable[P, R]) -> Callable[P, R]:
+    """Let a call of a function with keyword-only numbers that it does not take say what was meant."""
+    known = list(function.__kwdefaults__ or {})
+
+    @wraps(function)
+    def call(*args: P.args, **given: P.kwargs) -> R:
+        try:
+            return function(*args, **given)
+        except TypeError as error:
+            if error.__traceback__ is None or error.__traceback__.tb_next is not None:
+                raise  # not by the call itself
+            for unknown in given.keys() - known:
+                raise UnknownNameError(f"argument of {function.__name__}", unknown, known) from None
+            first = f"{function.__name__}({known[0]}={args[1]!r:.20})" if len(args) > 1 else "its own"
+            raise UsageError(f"{function.__name__} takes {', '.join(known)} by their names, as in {first}") from None
+
+    return call
+
+
 def all_finite(a: object, b: object, c: object, d: object) -> bool:
     """Return whether four values are floats that can be commanded as they are: :func:`number` need not look at each.
 
@@ -672,7 +719,10 @@ def number(name: str, value: object) -> float:
     """
     if type(value) is not float and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
         raise UsageError(f"{name} is {value!r:.60} and must be a number")
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        raise UsageError(f"{name} is too large for a number") from None
     if not math.isfinite(number):
         raise UsageError(f"{name} is {number} and must be finite")
     return number

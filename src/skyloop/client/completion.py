@@ -37,12 +37,10 @@ AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has
 #: Where the proxy does not tell: feedback received sooner after a command may be older than it.
 _STALE_NS: Final = 100_000_000
 _TO_PLACES: Final = (Position, ReturnToStart)
-#: Refusals of one packet, not of what was asked for: the next repeat is younger, and newer.
-OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
 AGAIN_NS: Final = 500_000_000  #: between a take-off that is not possible yet and the next attempt
 _NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
 OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refused: it may be asked for again
-_OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
+OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
 
 
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
@@ -179,17 +177,20 @@ class ActionWait:
         status = self._commands.status
         if status.state in ("queued", "preempted"):
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
+        told = self._commands.told
+        if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
+            self._why = told.text  # nothing any more, once a repeat is carried out
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
             return None
         if outcome.reason is Refusal.UNSUPPORTED:
             return UnsupportedError(outcome.text)
-        self._why = self._why if outcome.fate in _OUTDONE else outcome.text
+        self._why = self._why if outcome.fate in OUTDONE else outcome.text
         if type(self._action) is Takeoff:
             return self._why_no_takeoff(outcome)
         if type(self._action) is Land:
             return self._why_no_landing(outcome)
-        if outcome.fate in _OUTDONE:
+        if outcome.fate in OUTDONE:
             return RefusedError(f"{name} was ended on the way: another command took its place", code="replaced")
         if outcome.fate in OVERRULED:
             if not self._commands.may_ask:
@@ -209,7 +210,7 @@ class ActionWait:
             if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
                 self._again()
             return None
-        if outcome.fate in _OUTDONE or outcome.fate in OVERRULED:
+        if outcome.fate in OUTDONE or outcome.fate in OVERRULED:
             return None  # what has begun ends by itself
         return _refused(outcome)
 
@@ -219,7 +220,7 @@ class ActionWait:
             if self._commands.may_ask:  # a pilot may have taken it by hand while a link was lost
                 self._again(automatic=outcome.fate is not Fate.FAILSAFE)
             return None
-        return None if outcome.fate in _OUTDONE else _refused(outcome)
+        return None if outcome.fate in OUTDONE else _refused(outcome)
 
     def _again(self, *, automatic: bool = True) -> None:
         self._asked_ns = self._state.scheduler.clock()

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, Protocol, TypedDict
 
 from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
-from skyloop.client.channels import Listener, VideoChannel
+from skyloop.client.channels import JOIN_S, Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import LANDING, CommandSender, GivenUpError
 from skyloop.client.completion import ActionWait
@@ -241,6 +241,7 @@ class DroneCore:
             return
         self._finish_stop()
         self.closed = True
+        self.commands.close()
         try:
             if self.connection.connected:
                 self.commands.release(wait=not self.connection.receiving)
@@ -248,8 +249,12 @@ class DroneCore:
             pass  # the link is lost already, and the authority with it
         finally:
             self.supervisor.close()
-            for listener in list(self.listeners):
-                listener.cancel()
+            listeners = list(self.listeners)
+            for listener in listeners:
+                listener.cancel(wait=False)
+            deadline_s = time.monotonic() + JOIN_S  # for all of them
+            for listener in listeners:
+                listener.join(max(0.0, deadline_s - time.monotonic()))
             for one in list(self._to_close):
                 one.close()
             self.state.wake_all()

@@ -27,6 +27,7 @@ from skyloop.client.channels import Channel, Listener, VideoOptions
 from skyloop.client.commands import (
     above_zero,
     all_finite,
+    by_name,
     checked,
     in_world_axes,
     number,
@@ -344,6 +345,7 @@ class Drone:
         """Ask for nothing: keep the authority and leave the vehicle as it is."""
         return self._core.command(Idle())
 
+    @by_name
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Fly with a velocity in the levelled body axes, which turn with the yaw but not with roll and pitch.
 
@@ -361,6 +363,7 @@ class Drone:
             up, yaw_rate = number("up", up), number("yaw_rate", yaw_rate)
         return self._core.command(Velocity(forward, left, up, yaw_rate))
 
+    @by_name
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Hold an attitude with a climb rate.
 

@@ -206,6 +206,8 @@ def plain_value(name: str, value: object) -> Value:
     Raises:
         UsageError: If it is anything else.
     """
+    if isinstance(value, np.ndarray) and not value.ndim:
+        value = value.item()
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, str) and len(value) <= MAX_TEXT:

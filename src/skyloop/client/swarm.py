@@ -14,7 +14,7 @@ from typing import Final, Literal, Self, TypeVar, get_args
 import numpy as np
 
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import above_zero, cancelled, checked, number, position_action, return_action
+from skyloop.client.commands import above_zero, by_name, cancelled, checked, number, position_action, return_action
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
@@ -216,6 +216,7 @@ class Swarm:
         """Ask for nothing: keep the authority and leave the vehicles as they are."""
         return self.command(Idle())
 
+    @by_name
     def velocity(
         self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
@@ -231,6 +232,7 @@ class Swarm:
             Velocity(number("forward", forward), number("left", left), number("up", up), number("yaw_rate", yaw_rate))
         )
 
+    @by_name
     def attitude(
         self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
@@ -491,7 +493,9 @@ class Swarm:
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> Iterator[Tick]:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
 
-        Ends with the swarm. After an iteration that takes longer than a period the deadlines restart from there.
+        Ends with the swarm. After an iteration that takes longer than a period the deadlines restart from there. When
+        the loop ends, by its time, a ``break``, an exception or Ctrl-C, drones that fly by a velocity or an attitude of
+        it hover at once: nobody gives them a newer one.
 
         Args:
             rate_hz: Ticks a second, 0.1 to 200.
@@ -505,12 +509,17 @@ class Swarm:
         period_s = 1.0 / rate_hz
         begun_s = due_s = time.monotonic()
         count = 0
-        while not self._closed and (seconds is None or due_s - begun_s < seconds - _ROUNDING_S):
-            time.sleep(max(0.0, due_s - time.monotonic()))
-            late_s = max(0.0, time.monotonic() - due_s)
-            yield Tick(count, due_s - begun_s, late_s)
-            count += 1
-            due_s = max(due_s + period_s, time.monotonic())
+        try:
+            while not self._closed and (seconds is None or due_s - begun_s < seconds - _ROUNDING_S):
+                time.sleep(max(0.0, due_s - time.monotonic()))
+                late_s = max(0.0, time.monotonic() - due_s)
+                yield Tick(count, due_s - begun_s, late_s)
+                count += 1
+                due_s = max(due_s + period_s, time.monotonic())
+        finally:  # at a break or an exception in the loop as soon as it drops this generator, which is at once
+            for drone in self:
+                if isinstance(drone._core.commands.newest, Velocity | Attitude):
+                    drone._core.let_go("the loop that flew it has ended")
 
     @property
     def spread(self) -> Distribution | None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self, TypeVar
 
 from skyloop.client.channels import Channel, VideoChannel, usual
 from skyloop.client.commands import CommandSender
@@ -47,9 +48,11 @@ from skyloop.messages.overview import OverviewPages
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW, Pixels, stream
 
 RECENT_EVENTS: Final = 256
+IDLE_KEPT: Final = 32  #: so many channels of each kind are kept; beyond that those that nobody reads are forgotten
 #: What can be waited for: a flight state (or its name), one of several, or a predicate on feedback.
 Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
-_LATER_NS: Final = 1_000_000_000
+K = TypeVar("K")
+C = TypeVar("C", bound=Channel[Any])
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +170,7 @@ class ClientState:
         self._name = name
         self._clock = scheduler.clock
         self._connection = connection
+        self._making = threading.RLock()  # a channel: two threads that ask for the same one get the same
 
     def video(self, camera: CameraInfo, request: VideoRequest | None = None) -> VideoChannel:
         """Return the channel of a camera's frames as requested, made on the first call.
@@ -176,13 +180,15 @@ class ClientState:
             request: How frames are wanted; None: see :func:`skyloop.client.channels.usual`.
         """
         topic = (request or usual(camera.name)).topic
-        channel = self.variants.get(topic)
-        if channel is None:
-            channel = VideoChannel(camera, self._connection, self.scheduler, self.history, request)
-            self.variants[topic] = channel
-            if channel.request.encoding == "h264":
-                encoded, deliver = self.stream(channel.request), partial(channel.receive, as_asked=True)
-                encoded.decoder = StreamDecoder(encoded, deliver, self._clock, f"skyloop-decode-{camera.name}")
+        with self._making:
+            channel = self.variants.get(topic)
+            if channel is None:
+                _forget_idle(self.variants, keep=self.channels.values())
+                channel = VideoChannel(camera, self._connection, self.scheduler, self.history, request)
+                if channel.request.encoding == "h264":
+                    encoded, deliver = self.stream(channel.request), partial(channel.receive, as_asked=True)
+                    encoded.decoder = StreamDecoder(encoded, deliver, self._clock, f"skyloop-decode-{camera.name}")
+                self.variants[topic] = channel
         return channel
 
     def stream(self, request: VideoRequest) -> StreamChannel:
@@ -192,21 +198,25 @@ class ClientState:
             request: With ``encoding="h264"``.
         """
         topic = request.stream_topic
-        channel = self.streams.get(topic)
-        if channel is None:
-            channel = self.streams[topic] = StreamChannel(topic, self._connection, self._clock)
+        with self._making:
+            channel = self.streams.get(topic)
+            if channel is None:
+                decoded = [one.request for one in self.variants.values() if one.request.encoding == "h264"]
+                _forget_idle(self.streams, keep={self.streams.get(one.stream_topic) for one in decoded})
+                channel = self.streams[topic] = StreamChannel(topic, self._connection, self._clock)
         return channel
 
     def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
         """Return the channel of feedback as requested, made on the first call."""
         if request.is_plain:
             return self.on_feedback
-        for channel in self.selected:
-            if channel.request == request:
-                return channel
-        channel = FeedbackChannel(request, self.demand)
-        self.selected = (*self.selected, channel)
-        return channel
+        with self._making:
+            known = {channel.request: channel for channel in self.selected}
+            if request not in known:
+                _forget_idle(known)
+                known[request] = FeedbackChannel(request, self.demand)
+                self.selected = tuple(known.values())
+        return known[request]
 
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None:
         """Emit an event of the client's own (number 0).
@@ -425,6 +435,15 @@ class Receiver:
             self._state.overview = whole
             self._state.on_overview.publish(whole)
             self._state.notifier.notify()
+
+
+def _forget_idle(channels: dict[K, C], keep: Collection[C | None] = ()) -> None:
+    """Forget the oldest channels that nobody reads, where there are too many for one more."""
+    for name, channel in list(channels.items()):
+        if len(channels) < IDLE_KEPT:
+            return
+        if not channel.subscribed and channel not in keep:
+            del channels[name]
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:

@@ -13,15 +13,14 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Callable, Coroutine
-from contextlib import suppress
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from starlette.websockets import WebSocket
 
-from skyloop.client.completion import OF_ONE_PACKET
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.authority_report import AuthorityReport
 from skyloop.cockpit.broadcast import call_soon
@@ -64,7 +63,7 @@ from skyloop.cockpit.takeover import TakeoverDialog
 from skyloop.control.route_flight import check_for
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
-from skyloop.messages import EventKind, FlightState, Land, Refusal, Takeoff
+from skyloop.messages import Fate, FlightState, Land, Takeoff
 
 if TYPE_CHECKING:
     from skyloop.cockpit.pilot_connection import PilotConnection
@@ -126,13 +125,10 @@ class ControlSession:
         self._silence: asyncio.TimerHandle | None = None
         self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
-        self._last_command = ""  # what the page commanded last
-        self._commands = 0  # how many there were
+        self._last_command, self._first = "", 0  # what the page commanded last, and the number of its first intent
         self._decisions = 0  # grows with whatever flies, or ends a flight: what waits for answers compares it
         self._hands = HandWatch()
-        self._refused_command = 0  # the one whose refusal was sent
         self._awaited: tuple[str, frozenset[FlightState], int] | None = None  # what is done in which states, from when
-        self._refused_ns: int | None = None  # what was under way was refused then, on the proxy's clock
         self._repeated = False  # for as long as a take-off may be
         self._last_refusal = ("", -_REFUSE_AGAIN_S)  # about sticks: why, and when [s]
         self._handlers: dict[type[AnyCommand], Callable[[Any], None]] = {
@@ -195,11 +191,10 @@ class ControlSession:
         try:
             if problem:
                 raise RefusedError(problem)
-            if not isinstance(command, Answer):
-                self._last_command = command.do
-                self._commands += 1
             if _decides(command):
                 self._decisions += 1
+                if command.do != self._last_command:
+                    self._last_command, self._first = command.do, 1 + (self._pilot.intent if self._pilot else 0)
             self._handlers[type(command)](command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
@@ -238,11 +233,22 @@ class ControlSession:
 
     def _send_now(self, pilot: PilotConnection, act: Callable[[PilotConnection], bool], command: AnyCommand) -> None:
         """End what the page flew before, and send a command; :class:`LinkError` if it was not sent."""
-        self._end_flight(f"{command.do} was commanded")
-        if not act(pilot):
+        with self._in_place_of(pilot, f"{command.do} was commanded"):
+            sent = act(pilot)
+        if not sent:
             with suppress(SkyloopError):
                 pilot.idle()  # or it would be done after all when the link is back soon
             raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
+
+    @contextmanager
+    def _in_place_of(self, pilot: PilotConnection, why: str) -> Iterator[None]:
+        """End what the page flew before; hover if what takes its place is refused: nobody watches the former then."""
+        self._end_flight(why)
+        try:
+            yield
+        except SkyloopError:
+            pilot.let_go("what was to take its place was refused")
+            raise
 
     def _hover_here(self, command: HoverHere) -> None:
         """Hover: as the person decided, or because the page finds that nothing is held any more."""
@@ -283,10 +289,10 @@ class ControlSession:
         if problem := problem or untimely(command, seconds(self._clock())):
             raise RefusedError(f"the route can't be flown: {problem}")
         pilot = held()
-        self._end_flight()
-        self._end_route()
-        self._route = RouteSession(route, pilot, self._station.drone, self._photos, self._send, self._aim)
-        self._route.begin()
+        with self._in_place_of(pilot, "another route was begun"):
+            self._end_route()
+            self._route = RouteSession(route, pilot, self._station.drone, self._photos, self._send, self._aim)
+            self._route.begin()
         self._acknowledge(command)
         self._restart_silence_timer()
 
@@ -347,7 +353,8 @@ class ControlSession:
     async def _take(self, command: Take) -> None:
         pilot = self._pilot
         if pilot is None:
-            pilot = self._pilot = await self._station.open_pilot(self.app)
+            pilot, self._first = await self._station.open_pilot(self.app), 0
+            self._pilot = pilot
             pilot.set_flown_by_person()
             loop = asyncio.get_running_loop()
             pilot.on_event(lambda event: call_soon(loop, self._on_event, event), inline=True)
@@ -408,8 +415,7 @@ class ControlSession:
         pilot = self._pilot
         if pilot is None or pilot.authority.state == "none":
             raise AuthorityError("take control first", code="no_authority")
-        if self._station.is_stopping:
-            raise RefusedError("an emergency stop is under way: nothing else is commanded before it shows")
+        self._station.check_stop()
         if pilot.authority.state != "held":
             raise AuthorityError(f"{pilot.authority.holder or 'another application'} has control", code="no_authority")
         return pilot
@@ -458,7 +464,7 @@ class ControlSession:
         self._follow.interrupt(why)
         if self._route is not None:
             self._route.pause(why, hover=False)
-        self._awaited = self._refused_ns = None
+        self._awaited = None
         self._place.cancel()
 
     def let_go(self, why: str) -> None:
@@ -504,8 +510,8 @@ class ControlSession:
             if not message["mine"]:
                 self._end_flight(NO_CONTROL)
             self._send(message)
-        if self._refused_ns is not None and pilot is not None and pilot.knows_since(self._refused_ns):
-            self.let_go("what it flew was refused")
+        if pilot is not None:
+            self._observe_refusal(pilot)
         if self._awaited is not None and pilot is not None:
             do, states, from_ns = self._awaited
             if do == TakeOff().do and not self._repeated:
@@ -521,35 +527,26 @@ class ControlSession:
                     self._done(do)
 
     def _on_event(self, event: Event) -> None:
-        """Handle the proxy's refusal of a command of this page, and takeovers by asking."""
-        pilot = self._pilot
-        if pilot is None:
+        """Handle takeovers by asking."""
+        if self._pilot is not None:
+            self._takeover.on_event(event, self._pilot)
+
+    def _observe_refusal(self, pilot: PilotConnection) -> None:
+        """End what this page flies, and tell it, where the proxy has refused or ended it."""
+        outcome = pilot.refusal(self._first)
+        if outcome is None:
             return
-        self._takeover.on_event(event, pilot)
-        ours = event.kind is EventKind.COMMAND_REFUSED and event.app == self.app
-        if ours and self._route is not None and self._route.is_under_way:
-            if event.data.get("reason") not in OF_ONE_PACKET:
-                self._stop_when_known(event)
-            return
-        if ours and self._follow.is_under_way:
-            if event.data.get("reason") not in (*OF_ONE_PACKET, Refusal.FOREIGN_LEASE, Refusal.NO_AUTHORITY):
-                self._stop_when_known(event)  # of who has control the authority tells
-            return
-        if not ours or self._refused_command == self._commands or event.data.get("reason") in OF_ONE_PACKET:
-            return  # its repeats are refused too: nothing new
-        self._refused_command = self._commands
-        self._awaited = None
-        self._refuse(self._last_command, event.text)
-        if self._place.is_under_way:
-            self._stop_when_known(event)
-        if self._last_command == TakeOff().do:
+        self._first = outcome.intent + 1
+        watched = self._follow.is_under_way or (self._route is not None and self._route.is_under_way)
+        refused = outcome.fate in (Fate.UNDER_WAY, Fate.REFUSED, Fate.OTHERS)
+        if not watched and (refused or self._awaited or self._is_under_way):
+            self._refuse(self._last_command, outcome.text)
+        if watched or self._place.is_under_way:
+            self.let_go(outcome.text)  # the same feedback tells whether others have the vehicle
+        elif self._last_command == TakeOff().do:
             with suppress(SkyloopError):
                 pilot.idle()  # or it would take off, to everybody's surprise, once it can
-
-    def _stop_when_known(self, refusal: Event) -> None:
-        """Fly on no more, and hover as soon as the feedback is newer than the refusal: others may have the vehicle."""
-        self.stand_down(refusal.text)
-        self._refused_ns = refusal.at_ns
+        self._awaited = None
 
     def _refuse(self, do: str, why: str) -> None:
         self._send({"type": "refused", "do": do, "n": 0, "why": why})

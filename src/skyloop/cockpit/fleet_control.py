@@ -90,6 +90,7 @@ class FleetSession:
         """Take control with the highest priority, land, and give control back."""
         if station.drone.link.application in (LinkState.LOST, LinkState.CLOSED):
             raise LinkError("the link to the proxy is lost")
+        station.check_stop()
         with suppress(LinkError):
             if (await asyncio.to_thread(station.fresh_feedback)).state is FlightState.LANDED:
                 self._send({"type": "each", **subject, "state": "done", "why": "landed already"})
@@ -100,6 +101,7 @@ class FleetSession:
             if seconds(monotonic_ns() - begun_ns) > BEGIN_S:
                 raise LinkError(f"there was no connection within {BEGIN_S:g} s")
             await asyncio.to_thread(pilot.acquire, HIGHEST_PRIORITY)
+            station.check_stop()
             from_ns = pilot.proxy_now_ns + SETTLED_NS
             if not pilot.command(Land()):
                 raise LinkError(f"the link to the proxy is {pilot.link.application}")

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Self
 
 from skyloop.client import AuthorityStatus, Drone
 from skyloop.client.commands import ANSWER_S
-from skyloop.client.completion import OVERRULED
+from skyloop.client.completion import OUTDONE, OVERRULED
 from skyloop.client.core import DroneCore
 from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError, RefusedError
-from skyloop.messages import AnswerTakeover, AnyAction, FlightState, Idle, LinkState, Refused
+from skyloop.messages import AnswerTakeover, AnyAction, FlightState, Idle, LinkState, Outcome, Refused
 from skyloop.transport.base import Dialer
 
 
@@ -104,6 +103,18 @@ class PilotConnection(Drone):
         return outcome is not None and outcome.fate in OVERRULED and self._core.commands.may_ask
 
     @property
+    def intent(self) -> int:
+        """Number of the newest command."""
+        return self._core.commands.intent
+
+    def refusal(self, first: int) -> Outcome | None:
+        """What the proxy refused, or ended, of the commands from this number on; None but for :meth:`has_ended`."""
+        told = self._core.commands.told
+        if told is None or told.reason is None or told.intent < first or told.fate in (*OUTDONE, *OVERRULED):
+            return None
+        return told
+
+    @property
     def is_told(self) -> bool:
         """Whether the proxy tells what becomes of the newest command: it has arrived there."""
         newest, (_, intent) = self._state.newest, self._newest
@@ -124,12 +135,6 @@ class PilotConnection(Drone):
             Whether something was sent.
         """
         return self._core.let_go(reason, land=land)
-
-    def knows_since(self, at_ns: int) -> bool:
-        """Whether there is feedback from after a time on the proxy's clock."""
-        with suppress(LinkError):
-            return self.feedback().published_ns > at_ns
-        return False
 
     @property
     def is_flying(self) -> bool:

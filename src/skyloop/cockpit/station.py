@@ -19,7 +19,7 @@ from skyloop.cockpit.small_feed import SmallFeed
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.cockpit.thresholds import ThresholdReader
 from skyloop.control.waypoint import Waypoint
-from skyloop.errors import LinkError, NoAnswerError, SkyloopError
+from skyloop.errors import LinkError, NoAnswerError, RefusedError, SkyloopError
 from skyloop.messages import EventKind, FlightState
 
 if TYPE_CHECKING:
@@ -232,10 +232,10 @@ class Station:
         finally:
             self._stops -= 1
 
-    @property
-    def is_stopping(self) -> bool:
-        """Whether an emergency stop is under way, which the vehicle does not show yet."""
-        return self._stops > 0
+    def check_stop(self) -> None:
+        """Raise :class:`RefusedError` while an emergency stop is under way that the vehicle does not show yet."""
+        if self._stops:
+            raise RefusedError("an emergency stop is under way: nothing else is commanded before it shows")
 
     async def _send_stop(self, until_ns: int) -> PilotConnection:
         why = "the proxy does not answer"

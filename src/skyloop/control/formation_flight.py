@@ -126,11 +126,10 @@ class Formation:
             self._steer(now, goal, drift, others)
             if along >= 1.0 and all(reached(goal[name], now[name], self._settings) for name in now):
                 break
-        self.drones.hover()
         return self._arrived({name: way[1] for name, way in ways.items()}, yaw, elapsed_s)
 
     def hold(self, seconds: float) -> FormationReport:
-        """Keep each drone at its present position.
+        """Keep each drone at its present position; they hover at the end.
 
         Args:
             seconds: How long.
@@ -189,7 +188,6 @@ class Formation:
             goals = {name: _waypoint(slot, first.yaw_rad if turn else None) for name, slot in slots.items()}
             drift = dict.fromkeys(goals, _world_velocity(first))
             self._steer(now, goals, drift, {leader: first, **others}, also={} if lead is None else {leader: lead(tick)})
-        self.drones.hover()
         return self._report(slots, seconds)
 
     # Inside ----------------------------------------------------------------------------------------------------

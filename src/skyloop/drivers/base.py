@@ -349,7 +349,7 @@ class Driver(ABC):
         """
         sink = self._sink
         try:
-            self._apply(action)
+            self._alone(action)
         except Exception as error:  # noqa: BLE001  a failsafe must come back whatever the driver's code does
             if sink is not None:
                 sink.event(EventKind.DRIVER_ERROR, f"failsafe {action.name} failed: {error!r}", Severity.ERROR)
@@ -393,6 +393,10 @@ class Driver(ABC):
 
     def _repeat(self, action: AnyAction) -> AnyAction:
         """Apply a repeat; see :meth:`apply`. Override it where somebody else may fly the vehicle too."""
+        return self._apply(action)
+
+    def _alone(self, action: Hover | Land) -> AnyAction:
+        """Apply what a failsafe asks for; see :meth:`failsafe`. Override it where that differs from a pilot's wish."""
         return self._apply(action)
 
 

@@ -11,7 +11,7 @@ from typing import ClassVar, Final, TypeAlias
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import Sink
 from skyloop.drivers.link_reasons import LinkTrouble, trouble_of
-from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
+from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severity, Value
 
 REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: least time between two reasons that are reported while nothing is received
 
@@ -100,6 +100,11 @@ class RestartWatch:
         return step + self._wrap if step < 0 else step - self._wrap
 
 
+#: What is asked for while nothing is received is kept, or sent, for so long after somebody asked for it last: whoever
+#: still wants it asks again, and later it may be somebody else's flight.
+KEPT_NS: Final = nanoseconds(3.0)
+
+
 class VehicleSession(ABC):
     """The protocol of one opened driver with its vehicle. Not thread-safe.
 
@@ -123,6 +128,7 @@ class VehicleSession(ABC):
         self._remedy = ""  # of what is unreachable
         self._reported_reason = ""
         self._reported_ns = now_ns
+        self._landing_ns: int | None = None  # when a landing was asked for last, or the vehicle was still heard since
 
     @property
     def is_receiving(self) -> bool:
@@ -207,7 +213,31 @@ class VehicleSession(ABC):
     def _lose(self, reason: str, now_ns: int, /) -> None:
         """Drop all state of the lost vehicle: everything starts over with its next packet."""
 
+    def _keep(self, action: AnyAction, now_ns: int) -> None:
+        """Note what was accepted: a landing is kept while nothing is received, but not for ever."""
+        if not isinstance(action, Idle):
+            self._landing_ns = now_ns if isinstance(action, Land) else None
+
+    def _forget_landing(self) -> bool:
+        """Land the vehicle no longer; return whether that was wanted."""
+        return False
+
+    def _check_landing(self, now_ns: int) -> None:
+        if self._landing_ns is None:
+            return
+        if self._received_ns is not None:
+            self._landing_ns = now_ns
+        elif now_ns - self._landing_ns >= KEPT_NS:
+            self._landing_ns = None
+            if self._forget_landing():
+                text = (
+                    f"the landing is given up: the vehicle was not heard for {seconds(KEPT_NS):g} s since it was asked "
+                    "for last: land it again when it is heard"
+                )
+                self._publish_event(message(text, "landing_given_up", Severity.ERROR))
+
     def _check_silence(self, now_ns: int) -> None:
+        self._check_landing(now_ns)
         patience = self.TIMEOUTS
         if self._received_ns is None:
             if self.link_state is LinkState.CONNECTING and now_ns - self._opened_ns >= patience.first_word_ns:

@@ -119,7 +119,12 @@ class CommandHandler:
         self.ladder = FailsafeLadder()
         self.flight = executor.flight
         self.checks = CommandChecks(
-            self.authority, self.ladder, self.flight, supported=executor.supported, why_not=executor.why_not
+            self.authority,
+            self.ladder,
+            self.flight,
+            supported=executor.supported,
+            why_not=executor.why_not,
+            native=executor.native,
         )
         self._back = ReturnSupervisor(self.checks, self.ladder, executor, publisher)
         self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
@@ -281,7 +286,9 @@ class CommandHandler:
         with self._lock:
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
-            self._call_off(now_ns)
+            if self.flight.ours and self.flight.may_begin(now_ns):
+                self._rising_until_ns = now_ns  # again and again: nobody withdraws it later
+            self._withdraw_takeoff(now_ns)
             return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
@@ -289,16 +296,10 @@ class CommandHandler:
         with self._lock:
             self.ladder.order_landing()
             self._observe_flight(now_ns)
-            self._call_off(now_ns)
-            executor = self._executor
-            if self.flight.ours and executor.airborne and executor.state is not FlightState.LANDING:
+            executor, withdrew = self._executor, self._withdraw_takeoff(now_ns)
+            lands = executor.state is FlightState.LANDING and (Land in executor.native or not withdrew)
+            if self.flight.ours and executor.airborne and not lands:
                 executor.leave(now_ns)
-
-    def _call_off(self, now_ns: int) -> None:
-        """Land what was told to take off and does not show it yet."""
-        if self.flight.ours and self.flight.may_begin(now_ns) and self._executor.state is FlightState.LANDED:
-            self._executor.failsafe(Land(), now_ns)
-            self.flight.call_off(now_ns)
 
     @property
     def airborne(self) -> bool:
@@ -382,7 +383,7 @@ class CommandHandler:
                 why = vehicle.driver_refused("apply", error)
                 self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.DRIVER_FAILED, why, now_ns), now_ns
-            intent.begun = True
+            intent.begun, intent.reason, intent.text = True, None, ""
             if decision.takes_off:
                 flight.claim(now_ns)
                 self._rising_until_ns = intent.asked_ns + TAKEOFF_NS
@@ -395,7 +396,12 @@ class CommandHandler:
             self._stamp()
         self._tell(session, intent)
         applied_ns = self._count_applied(command)
-        if not (self.ladder.idle or (command.automatic and self.ladder.step is Failsafe.LAND)):
+        ladder = self.ladder
+        if command.automatic:
+            goes_on = ladder.step is Failsafe.LAND
+        else:
+            goes_on = ladder.step is Failsafe.HOVER and kind is Hover and not vehicle.link_up
+        if not (goes_on or ladder.idle):
             self._apply_failsafe(self.ladder.fresh_command(), now_ns)
         return applied, applied_ns
 
@@ -553,6 +559,8 @@ class CommandHandler:
         for effect in effects:
             if isinstance(effect, Lost):
                 self._pilot = effect.reason
+                if self.flight.ours and (session := self._sessions.get(effect.app_id)) and session.intents.lands:
+                    self.ladder.land_on(now_ns)
             elif isinstance(effect, Granted):
                 self._pilot = "held"
                 self.ladder.hand_over(now_ns)
@@ -639,13 +647,19 @@ class CommandHandler:
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
-            holder = self.authority.holder
-            session = self._sessions.get(holder.app_id) if holder is not None else None
-            lands = session is not None and session.intents.lands  # wherever it is
-            self._events.publish_draft(position_jumped_event(airspace.jumped_m, lands=lands))
+            lands = self._lands  # wherever it is
+            event = position_jumped_event(airspace.jumped_m, lands=lands)
+            self._events.publish_repeated((0, "jumped"), lambda: event)
             if not lands:
                 self._start_over(Fate.JUMPED, now_ns)
         airspace.jumped_m = 0.0
+
+    @property
+    def _lands(self) -> bool:
+        """Whether its pilot's landing, where the vehicle is, is under way."""
+        holder = self.authority.holder
+        session = self._sessions.get(holder.app_id) if holder is not None else None
+        return session is not None and session.intents.lands
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""
@@ -682,9 +696,12 @@ class CommandHandler:
         self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
         state = self._executor.state
+        airborne = self.flight.flies(state)
+        if airborne and not self._vehicle.link_up and self._lands:
+            state = FlightState.LANDING  # as far as anybody can tell: no hover takes its pilot's landing back
         inputs = FailsafeInputs(
             state=state,
-            airborne=self.flight.flies(state),
+            airborne=airborne,
             last_command_ns=self.authority.last_command_ns,
             pilot=self._pilot,
             link_up=self._vehicle.link_up,

@@ -269,9 +269,13 @@ class Proxy:
             if self.ended:
                 return landed
             self.ended = True
+        self._stopping.set()
+        if not hangs:  # first of all: nothing is obeyed any more, nor steered
+            if self._ticker is not None and self._ticker.is_alive():
+                self._ticker.join()
+            self.handler.leave_hovering(self.clock())
         severity = Severity.ERROR if hangs else Severity.WARNING
         self.events.publish(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", severity)
-        self._stopping.set()
         self.overview.end()
         try:
             if hangs:
@@ -296,10 +300,7 @@ class Proxy:
         return not handler.airborne
 
     def _close(self) -> None:
-        if self._ticker is not None and self._ticker.is_alive():
-            self._ticker.join()
         self.keep_warm(0.0)
-        self.handler.leave_hovering(self.clock())
         self._requests.stop()
         try:
             self.driver.close()

@@ -472,3 +472,17 @@ def test_the_recorded_datagram_goes_through() -> None:
     assert feedback is not None
     assert (feedback.state, feedback.battery) == (FlightState.LANDED, 0.5)
     assert not rig.sink.events, "it is in good health"
+
+
+def test_a_landing_of_a_drone_that_is_not_heard_is_not_kept_for_ever() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.session.command(Land(), rig.clock.now_ns)
+    rig.on = False
+    rig.until(lambda: newest_link(rig)[0] is LinkState.LOST, 5.0)
+    rig.run(3.1)
+    assert [event.data.get("reason") for event in rig.sink.events].count("landing_given_up") == 1
+    rig.sent.clear()
+    rig.run(5.0)
+    assert rig.sent
+    assert not [datagram for datagram in rig.sent if b"AT*REF" in datagram]

@@ -716,6 +716,36 @@ def test_a_vehicle_that_is_not_heard_gets_no_heartbeats_that_keep_its_failsafe_f
     assert bench.heard_of("HEARTBEAT")
 
 
+def test_a_landing_of_a_vehicle_that_is_not_heard_is_not_kept_for_ever() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.go_on(3.0, silent=True)
+    bench.apply(Land(), alone=True)
+    bench.go_on(3.1, silent=True)
+    assert [event.data["reason"] for event in bench.sink.events][-1] == "landing_given_up"
+    bench.go_on(600.0, silent=True)
+    bench.said.clear()
+    bench.go_on(2.0)
+    assert not modes_set(bench), "it may be another flight"
+
+
+def test_an_emergency_stop_outlives_what_is_known_of_the_vehicle() -> None:
+    """It was pressed while nothing was heard, and dropped when another serial number answered."""
+    bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
+    bench.flying("OFFBOARD")
+    bench.go_on(3.0, silent=True)
+    bench.apply(EmergencyStop())
+    bench.go_on(1.0, silent=True)
+    bench.hear(bench.vehicle.heartbeat())
+    bench.hear(version_of(8))
+    assert any("another vehicle" in text for text in bench.texts)
+    bench.said.clear()
+    bench.go_on(1.0)
+    cuts = [each for each in bench.heard_of("COMMAND_LONG") if each.command == m.MAV_CMD_COMPONENT_ARM_DISARM]
+    assert len(cuts) >= 5
+    bench.go_on(10.0)
+    assert "stop_given_up" in [event.data.get("reason") for event in bench.sink.events]
+
+
 def test_a_vehicle_on_the_ground_that_is_not_heard_is_called_each_second() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     bench.go_on(3.0, silent=True)

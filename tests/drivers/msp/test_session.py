@@ -10,7 +10,7 @@ import pytest
 
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.msp.setpoints import Phase
+from skyloop.drivers.msp.setpoints import Phase, Report, SetpointController
 from skyloop.emulators.msp.board import bit
 from skyloop.emulators.msp.settings import BoardSettings
 from skyloop.errors import DriverError
@@ -402,6 +402,25 @@ def test_a_stop_of_what_is_just_being_found_in_flight_is_not_undone_by_taking_it
     assert not bench.board.armed
     assert bench.session.setpoints.phase is Phase.STANDING
     assert bench.feedback.state is FlightState.EMERGENCY
+
+
+def test_what_does_not_disarm_by_a_stop_is_not_told_to_have_landed() -> None:
+    """Neither while it is stopped, nor when that is given up: nobody would look at it, or land it, any more."""
+    setpoints, now_ns = SetpointController(), 10**9
+    setpoints.on_report(Report(True), now_ns)
+    setpoints.adopt(0.3, now_ns)
+    assert setpoints.flight_state() is FlightState.FLYING
+    setpoints.apply(EmergencyStop(), now_ns)
+    told = set()
+    for _ in range(120):
+        now_ns += 10**8
+        setpoints.on_report(Report(True), now_ns)
+        setpoints.step_stop(now_ns)
+        told.add(setpoints.flight_state())
+    assert [event.data["reason"] for event in setpoints.pop_events()] == ["stop_given_up"]
+    assert told == {FlightState.UNKNOWN}
+    setpoints.on_report(Report(False), now_ns)
+    assert setpoints.flight_state() is FlightState.LANDED
 
 
 def test_a_stop_pressed_in_a_long_loss_does_not_disarm_what_flies_when_the_link_is_back() -> None:

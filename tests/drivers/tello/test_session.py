@@ -347,11 +347,53 @@ def test_a_landing_goes_on_while_the_drone_is_not_heard() -> None:
     rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
     rig.do(Land())
     rig.take_said()
-    rig.run(3.2)
+    rig.run(2.9)
     assert rig.said.count("land") in (2, 3)
     rig.on = True
     rig.until(lambda: rig.bench.flight is FlightState.LANDED, 12.0)
     rig.until(lambda: rig.state is FlightState.LANDED, 4.0)
+
+
+def test_a_landing_of_a_drone_that_is_not_heard_is_not_kept_for_ever() -> None:
+    """It was sent to whoever flew the drone by then, minutes or hours later."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.on = False
+    rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
+    for _ in range(8):  # whoever still wants it asks again
+        rig.do(Land())
+        rig.run(1.0)
+    assert rig.take_said().count("land") >= 5
+    rig.run(3.0)
+    assert rig.reasons.count("landing_given_up") == 1
+    rig.take_said()
+    rig.run(60.0)
+    assert not [text for text in rig.take_said() if text.startswith(("land", "rc"))], "it lands by itself when alone"
+    rig.on = True
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
+    rig.run(0.5)
+    assert "land" not in rig.said
+
+
+def test_a_hover_that_nobody_decided_leaves_a_drone_alone_whose_stop_was_given_up() -> None:
+    """The library's own hover kept it awake, and so from landing by itself."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.deaf = True
+    rig.do(EmergencyStop())
+    rig.run(11.0)
+    rig.deaf = False
+    rig.take_said()
+    for _ in range(10):
+        rig.session.command(Hover(), rig.now_ns, new=False)
+        rig.run(0.5)
+    assert not [text for text in rig.said if text.startswith(("rc", "wifi?"))]
+    rig.session.command(Land(), rig.now_ns, new=False)
+    rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
 
 
 def test_a_drone_that_was_started_again_is_set_up_again() -> None:

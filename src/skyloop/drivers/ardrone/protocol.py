@@ -129,6 +129,7 @@ class ArdroneSession(VehicleSession):
         """
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
+        self._keep(action, now_ns)
         if isinstance(action, EmergencyStop):
             self._once.clear()
             self.due_ns = now_ns
@@ -150,6 +151,9 @@ class ArdroneSession(VehicleSession):
 
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events()
+
+    def _forget_landing(self) -> bool:
+        return self.setpoints.forget_landing()
 
     def close(self) -> None:
         """End the session: exchanges that are not done fail."""

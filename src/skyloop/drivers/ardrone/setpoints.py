@@ -218,6 +218,13 @@ class SetpointController:
         self._events.append(given_up)
         self._decision, self._steering = Decision.STAY, False
 
+    def forget_landing(self) -> bool:
+        """Land no longer; return whether it was to."""
+        if not self._landing_is_ours or self._decision is not Decision.LAND:
+            return False
+        self._decision = Decision.STAY
+        return True
+
     def _release_motors(self, now_ns: int) -> None:
         if self.condition is None:
             raise DriverError("no data from the drone: whether there is an emergency to reset is not known")

@@ -26,12 +26,10 @@ from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import (
     AnyAction,
     Capabilities,
-    EventKind,
     Hover,
     Land,
     Parameter,
     Refusal,
-    Severity,
     Value,
 )
 from skyloop.messages.checkup import Diagnostic
@@ -99,16 +97,9 @@ class MavlinkDriver(Driver):
         setpoints = link.session.setpoints if link is not None else None
         return "" if setpoints is None else setpoints.ownership.others
 
-    def failsafe(self, action: Hover | Land) -> bool:
+    def _alone(self, action: Hover | Land) -> AnyAction:
         """Hold the position, or land, by the autopilot's own mode and without a stream of set-points."""
-        sink = self._sink
-        try:
-            self._opened().command(action, alone=True)
-        except Exception as error:  # noqa: BLE001  a failsafe must come back whatever happens
-            if sink is not None:
-                sink.event(EventKind.DRIVER_ERROR, f"failsafe {action.name} failed: {error!r}", Severity.ERROR)
-            return False
-        return True
+        return self._opened().command(action, alone=True)
 
     def external_pose(self, pose: ExternalPose) -> None:
         """Send the pose as ``ODOMETRY``, or as what ``?pose=`` says."""

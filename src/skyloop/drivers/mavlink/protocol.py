@@ -23,6 +23,7 @@ from skyloop.drivers.mavlink.parameters import ParameterExchange
 from skyloop.drivers.mavlink.setpoints import SetpointController
 from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
 from skyloop.drivers.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
+from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, VehicleEvent, VehicleSession
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Severity, Value
@@ -118,6 +119,8 @@ class MavlinkSession(VehicleSession):
         self._heard_by_it = True  # False: nothing shows yet that it reads what is sent
         self._said: tuple[int | None, bool, int] | None = None  # mode, whether it is armed, MAV_STATE, when last looked
         self._unsupported_reason = "no data from it"
+        #: Pressed for whatever answers: it outlives what is known of the vehicle.
+        self._stop = MotorStop(lambda event: self._publish_event(event))
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
 
     @property
@@ -158,6 +161,7 @@ class MavlinkSession(VehicleSession):
         if isinstance(action, Idle):
             return action  # nothing comes of it; pilots on the ground send it all the time
         applied = self.setpoints.apply(action, self.vehicle_state(now_ns), now_ns, alone=alone, new=new)
+        self._keep(action, now_ns)
         due_ns = self.setpoints.due_ns(now_ns)
         self.due_ns = min(self.due_ns, now_ns if due_ns is None else max(now_ns, due_ns))
         return applied
@@ -169,6 +173,9 @@ class MavlinkSession(VehicleSession):
 
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events() if self.setpoints is not None else []
+
+    def _forget_landing(self) -> bool:
+        return self.setpoints is not None and self.setpoints.forget_landing()
 
     def close(self) -> None:
         """End the session: parameter writes under way fail."""
@@ -443,7 +450,7 @@ class MavlinkSession(VehicleSession):
         if not self._unsupported_reason:
             height_m = takeoff_height(self.limits)
             self.setpoints = SetpointController(
-                found, self.commands, height_m, lambda: found.thrust_model(self.parameters.values)
+                found, self.commands, height_m, lambda: found.thrust_model(self.parameters.values), self._stop
             )
             self._publish_event(
                 VehicleEvent(EventKind.VEHICLE_MESSAGE, limits_text(self.limits), data={"reason": "limits"})

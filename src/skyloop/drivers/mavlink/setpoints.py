@@ -28,7 +28,7 @@ from skyloop.drivers.mavlink.microservices import CommandSender, VehicleCommand
 from skyloop.drivers.mavlink.ownership import FlightOwnership
 from skyloop.drivers.mavlink.telemetry import VehicleState
 from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.vehicle_session import VehicleEvent
+from skyloop.drivers.vehicle_session import KEPT_NS, VehicleEvent
 from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,
@@ -55,7 +55,6 @@ DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
 STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
-BLIND_NS: Final = nanoseconds(3.0)  #: what is asked for while nothing is received is sent for so long
 HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
 
 
@@ -77,6 +76,7 @@ class SetpointController:
         commands: Where commands to the vehicle go.
         takeoff_m: Height of a take-off above its start.
         make_thrust: Makes the thrust model for a flight by attitude.
+        stop: One that may be in force already; None: another one.
     """
 
     def __init__(
@@ -85,10 +85,11 @@ class SetpointController:
         commands: CommandSender,
         takeoff_m: float,
         make_thrust: Callable[[], ThrustModel],
+        stop: MotorStop | None = None,
     ) -> None:
         self.takeoff_m = takeoff_m
         self.goal = Goal.NOTHING
-        self.stop = MotorStop(lambda event: self._events.append(event))
+        self.stop = stop or MotorStop(lambda event: self._events.append(event))
         self.ownership = FlightOwnership(autopilot)
         self._autopilot = autopilot
         self._commands = commands
@@ -157,7 +158,7 @@ class SetpointController:
             assert not isinstance(action, ReturnToStart)  # the proxy makes places of it
             action = self._steer(action, vehicle, now_ns)
         if vehicle is None and new and not alone and isinstance(action, Hover | Land):
-            self._blind_until_ns = now_ns + BLIND_NS
+            self._blind_until_ns = now_ns + KEPT_NS
         if self.goal is not Goal.NOTHING and not isinstance(action, Idle):
             self.ownership.take(action, vehicle, alone=alone, new=new)
         return action
@@ -264,6 +265,13 @@ class SetpointController:
             self._end()
             self.goal = Goal.HOLD if started else Goal.NOTHING
         self.ownership.on_link_lost()
+
+    def forget_landing(self) -> bool:
+        """Land no longer; return whether it was to."""
+        lands = self.goal is Goal.LAND
+        if lands:
+            self._end()
+        return lands
 
     def on_prearm_reason(self, reason: str) -> None:
         """Keep the vehicle's own reason why it can't be armed."""

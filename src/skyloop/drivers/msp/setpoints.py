@@ -116,6 +116,7 @@ class SetpointController:
         self.stop = MotorStop(lambda event: self._events.append(event))
         self.throttle = 0.0
         self.receiving = False
+        self._cut = False  # its motors were stopped, and it has not shown that: nobody knows whether it flies
         self._override = override
         self._setup = Setup()
         self._tilt: tuple[Curve, Curve] = self._setup.tilt_curves()
@@ -144,7 +145,7 @@ class SetpointController:
         """Return the flight state for feedback."""
         if self.stop.shown:
             return FlightState.EMERGENCY
-        if self.report.armed is None:
+        if self.report.armed is None or (self._cut and self.report.armed):
             return FlightState.UNKNOWN
         return FlightState.FLYING if self.phase is Phase.FLYING and self.report.armed else FlightState.LANDED
 
@@ -175,10 +176,11 @@ class SetpointController:
         """
         if isinstance(action, EmergencyStop):
             self.stop.press(now_ns)
-            self._wanted = LEVEL
+            self._wanted, self._cut = LEVEL, True
             self._enter(Phase.STANDING, now_ns)
         elif isinstance(action, ResetEmergency):
             self.stop.reset()
+            self._cut = False
         elif isinstance(action, Attitude):
             return self._follow(action, now_ns)
         else:
@@ -246,6 +248,7 @@ class SetpointController:
         self.phase, self._since_ns = phase, now_ns
         self._abort_ns = self._still_ns = self._blind_ns = None
         self._sink, self._asked_ns = 1.0, None
+        self._cut = self._cut and phase is Phase.STANDING
         if phase is Phase.SPOOLING:
             self.throttle = IDLE if self.hover is None else SPOOL_FROM * self.hover
         elif phase is not Phase.FLYING:
@@ -257,6 +260,7 @@ class SetpointController:
         """Handle what the flight controller reports of itself."""
         before, self.report, heard = self.report, report, self.receiving
         self.receiving = True
+        self._cut = self._cut and report.armed is not False
         if self.phase is Phase.ARMING:
             self._look_at_arming(now_ns)
         elif self.phase in (Phase.SPOOLING, Phase.FLYING) and report.armed is False:

@@ -17,7 +17,7 @@ from skyloop.drivers.tello.video import TelloVideo, VideoStream, cameras_of, int
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
-from skyloop.messages import AnyAction, Capabilities, Intrinsics, Parameter, Refusal, Value
+from skyloop.messages import AnyAction, Capabilities, Hover, Intrinsics, Land, Parameter, Refusal, Value
 from skyloop.messages.checkup import Diagnostic
 from skyloop.wire.h264 import Unit
 from skyloop.wire.tello.video import AccessUnit
@@ -82,10 +82,16 @@ class TelloDriver(Driver):
 
     # Flying ----------------------------------------------------------------------------------------------------
 
-    def _apply(self, action: AnyAction) -> AnyAction:
+    def _apply(self, action: AnyAction, *, new: bool = True) -> AnyAction:
         if self._link is None:
             raise DriverError(f"{self.uri} is not open")
-        return self._link.command(action)
+        return self._link.command(action, new=new)
+
+    def _repeat(self, action: AnyAction) -> AnyAction:
+        return self._apply(action, new=False)
+
+    def _alone(self, action: Hover | Land) -> AnyAction:
+        return self._apply(action, new=False)
 
     def checkup(self) -> list[Diagnostic]:
         """Return what the drone's newest state says about a flight."""

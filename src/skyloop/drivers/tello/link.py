@@ -13,6 +13,7 @@ from skyloop.drivers.tello.options import TelloOptions
 from skyloop.drivers.tello.protocol import TelloSession
 from skyloop.drivers.vehicle_link import VehicleLink
 from skyloop.drivers.vehicle_session import SinkCallback
+from skyloop.messages import AnyAction
 
 _BUFFER: Final = 1 << 20  # half a second of video
 
@@ -96,6 +97,10 @@ class TelloLink(VehicleLink[TelloSession]):
         self._states: socket.socket | None = None
 
     # From the proxy's threads ----------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction, *, new: bool = True) -> AnyAction:
+        """Have the session accept an action, and send it soon. Any thread. See :meth:`SetpointController.apply`."""
+        return self._decide(partial(self.session.command, action, new=new))
 
     def ask(self, text: str) -> str | None:
         """Send a command and wait for its answer, up to 0.95 s; None if none came. Any thread but the link's."""

@@ -196,7 +196,7 @@ class TelloSession(VehicleSession):
 
     # From the driver -------------------------------------------------------------------------------------------
 
-    def command(self, action: AnyAction, now_ns: int) -> AnyAction:
+    def command(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
         """Accept an action and have it sent soon.
 
         Returns:
@@ -206,7 +206,8 @@ class TelloSession(VehicleSession):
             DriverError: It can't be done now; see :meth:`SetpointController.apply`.
         """
         before = self.setpoints.intent
-        applied = self.setpoints.apply(action, now_ns)
+        applied = self.setpoints.apply(action, now_ns, new=new)
+        self._keep(action, now_ns)
         if isinstance(action, EmergencyStop):
             self._flips.clear()
             self.due_ns = now_ns
@@ -231,6 +232,9 @@ class TelloSession(VehicleSession):
 
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events()
+
+    def _forget_landing(self) -> bool:
+        return self.setpoints.forget_landing()
 
     def close(self) -> None:
         """End the session: requests that wait get no answer."""

@@ -111,7 +111,7 @@ class SetpointController:
         self.full = Scale()
         self.limits = Scale()
         self.receiving = False  #: whether the drone's state comes
-        #: After a stop that was given up, until something is commanded: left alone, a Tello lands by itself after 15 s.
+        #: After a stop or landing that was given up, until somebody commands: a Tello lands by itself after 15 s then.
         self.left_alone = False
         self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY
@@ -141,12 +141,14 @@ class SetpointController:
 
     # What is decided -------------------------------------------------------------------------------------------
 
-    def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
+    def apply(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
         """Accept an action.
 
         Args:
             action: One of the driver's ``ACTIONS``.
             now_ns: The present time.
+            new: Whether an application newly asked for it. What nobody decided, but a landing, does nothing to a drone
+                that is :attr:`left_alone`.
 
         Returns:
             What is applied: a set-point within the limits, or hover after an emergency stop.
@@ -168,7 +170,7 @@ class SetpointController:
                 raise DriverError("the motors were stopped: reset the emergency first")
             if isinstance(action, Velocity | Attitude):
                 return Hover()
-        else:
+        elif new or not self.left_alone or isinstance(action, Land):
             return self._fly(action, now_ns)
         return action
 
@@ -221,6 +223,14 @@ class SetpointController:
     def _leave_alone(self, given_up: VehicleEvent) -> None:
         self._events.append(given_up)
         self._steering, self.left_alone = False, True
+
+    def forget_landing(self) -> bool:
+        """Land no longer; return whether it was to."""
+        if self._decision is not Decision.LAND:
+            return False
+        self._decision, self.watch.sinking = Decision.STAY, False
+        self._steering, self.left_alone = False, True
+        return True
 
     # What is received ---------------------------------------------------------------------------------------------
 

@@ -96,6 +96,7 @@ class CommandChecks:
         flight: whose it is.
         supported: the actions that the vehicle or the software autopilot can do.
         why_not: why others are not supported, for people; may be empty.
+        native: those that the vehicle itself takes.
     """
 
     def __init__(
@@ -106,6 +107,7 @@ class CommandChecks:
         *,
         supported: frozenset[type[Action]],
         why_not: str,
+        native: frozenset[type[Action]],
     ) -> None:
         self.airspace = Airspace()
         self.returns = ReturnSettings()
@@ -117,6 +119,9 @@ class CommandChecks:
         self._flight = flight
         self._supported = supported
         self._why_not = why_not
+        #: What a person may ask of a vehicle that is not heard, which may hear us all the same: without it only the
+        #: emergency stop would be left to bring it down.
+        self._unheard = native & {Hover, Land}
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
         """Check sequence, age, lease and numbers. None: they passed, which keeps the holder's lease."""
@@ -167,7 +172,7 @@ class CommandChecks:
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
-        if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND:
+        if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND and not automatic:
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
@@ -226,7 +231,8 @@ class CommandChecks:
     ) -> tuple[Refusal, str] | None:
         """What forbids a command of the holder, whatever the policy of the flight state is."""
         kind = type(action)
-        if link is not LinkState.UP and link is not LinkState.DEGRADED:
+        unheard = link is LinkState.LOST and kind in self._unheard and not automatic
+        if link is not LinkState.UP and link is not LinkState.DEGRADED and not unheard:
             return Refusal.VEHICLE_LINK_LOST, f"the link to the vehicle is {link.value}"
         if kind not in self._supported:
             why = self._why_not or "neither the vehicle nor the software autopilot can do it"
@@ -240,7 +246,7 @@ class CommandChecks:
                 return Refusal.WRONG_STATE, f"{others}, and {what} does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
-        if self._ladder.lands_for_battery and (kind in SET_POINTS or automatic):
+        if self._ladder.lands_for_battery and (kind in SET_POINTS or (automatic and kind is not Land)):
             what = "returns to its start" if self._ladder.returning else "lands"
             return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
         if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:

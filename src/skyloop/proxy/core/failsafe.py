@@ -7,7 +7,7 @@ are in ``docs/proxy.md``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from skyloop.clock import nanoseconds
@@ -153,7 +153,10 @@ class FailsafeLadder:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
-        step, reason = due(now_ns, inputs, self.settings, barred=self.barred, battery_low=low)
+        told = inputs  # the driver may not show a landing yet that goes on without its pilot
+        if isinstance(self._wanted, Land):
+            told = replace(inputs, state=FlightState.LANDING)
+        step, reason = due(now_ns, told, self.settings, barred=self.barred, battery_low=low)
         if _RANK[step] > _RANK[self.step]:
             returns = step is Failsafe.LAND and self._should_return(reason) and inputs.state is not FlightState.LANDING
             why = inputs.return_problem if returns else ""
@@ -191,6 +194,11 @@ class FailsafeLadder:
         """The authority changes hands: hover in between, unless the vehicle is landing for a reason."""
         if not isinstance(self._wanted, Land | ReturnToStart):
             self._want(Hover(), now_ns)
+
+    def land_on(self, now_ns: int) -> None:
+        """The pilot leaves, who has asked for a landing that is under way: go on with it."""
+        if not isinstance(self._wanted, Land | ReturnToStart):
+            self._want(Land(), now_ns)
 
     def order_landing(self) -> None:
         """Land because the proxy is about to end; from now on only landing and emergency stop are accepted."""

@@ -161,11 +161,12 @@ class Flight:
         self.whose, self.left_to = Whose.OURS, ""
 
     def slept(self, ns: int) -> None:
-        """Note that nothing was observed for so long because the computer slept: it may be another flight by now."""
-        if ns < BELIEF_NS:
-            return
-        self._believed_until_ns = self._claimed_until_ns = None
-        if self.ours:
+        """Note that the computer slept for so long, which its clock does not count: it may be another flight by now."""
+        if self._believed_until_ns is not None:
+            self._believed_until_ns -= ns
+        if self._claimed_until_ns is not None:
+            self._claimed_until_ns -= ns
+        if ns >= BELIEF_NS and self.ours:
             self.whose = Whose.NOBODYS
 
     def observe(

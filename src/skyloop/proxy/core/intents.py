@@ -59,18 +59,19 @@ class Intent:
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
         """End it, unless it is over already. ``text`` and ``reason``: what its repeats are answered with."""
         if self.fate is Fate.UNDER_WAY:
-            if fate not in _SILENT:
-                self.reason = reason or Refusal.NOT_FRESH
-                self.text = text or f"{ENDINGS[fate]}: send a new command"
+            silent = fate in _SILENT
+            self.reason = None if silent else reason or Refusal.NOT_FRESH
+            self.text = "" if silent else text or f"{ENDINGS[fate]}: send a new command"
             self.fate = fate  # last, as other threads read it
 
     def refuse(self, reason: Refusal, why: str) -> None:
         """End it because it was refused.
 
         A hover and a landing go on where only the driver failed or the link is lost, as nothing is safer; a reset does
-        in any case, as the emergency may not be known yet.
+        in any case, as the emergency may not be known yet. They are told to be refused until a repeat is carried out.
         """
         kind = type(self.action)
+        self.reason, self.text = reason, why
         if not (kind is ResetEmergency or (kind in (Hover, Land) and reason in _PASSING)):
             self.end(Fate.REFUSED, why, reason)
 
@@ -104,7 +105,7 @@ class Intent:
     def outcome(self, app_id: int, name: str) -> Outcome:
         """What feedback tells of it; ``name``: of the application."""
         fate = self.fate  # first, as another thread may end it now
-        if fate is Fate.UNDER_WAY or not self.text:
+        if not self.text:
             return Outcome(app_id, max(0, self.number), fate)
         text = f"{name}: {self.action.name} refused: {self.text}"[:MAX_OUTCOME_TEXT]
         return Outcome(app_id, self.number, fate, self.reason, text)
