@@ -8,7 +8,6 @@ https://docs.px4.io/main/en/simulation/#px4-mavlink-api
 from __future__ import annotations
 
 import math
-import select
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from skyloop.autopilots.coupling import Commands, CoupledFirmware
 from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
 from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
 from skyloop.errors import UsageError
+from skyloop.files import wait_readable
 from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, geodetic
 from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.sim.rotor_parameters import InstrumentParameters
@@ -152,7 +152,7 @@ class Px4(CoupledFirmware):
             return None
         commands: Commands | None = None
         while (link := self._link) is not None:
-            if wait_s > 0.0 and commands is None and not select.select([link], [], [], wait_s)[0]:
+            if wait_s > 0.0 and commands is None and not wait_readable(link, wait_s):
                 break
             data = self._read(link)
             if not data:

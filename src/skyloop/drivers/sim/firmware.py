@@ -54,6 +54,7 @@ _SEVERITIES: Final = {
     FirmwareEventKind.SILENT: Severity.ERROR,
     FirmwareEventKind.DIED: Severity.ERROR,
     FirmwareEventKind.FAILED: Severity.ERROR,
+    FirmwareEventKind.DEAF: Severity.INFO,
 }
 _KEPT_REPORTS: Final = 64
 _POSE_STD_M: Final = 0.001
