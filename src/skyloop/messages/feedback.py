@@ -21,6 +21,9 @@ Vector = tuple[Finite, Finite, Finite]
 MAX_LINK_TEXT = 300  #: characters of a text about the link to the vehicle
 LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
 
+#: How the reason of a link begins whose vehicle still wakes up: it is connecting or degraded, and can't take off yet.
+WAKING_UP = "still waking up"
+
 NO_POSITION = "the vehicle does not report its position"
 #: What lets a vehicle know its position, for people who read the line above.
 POSITION_SOURCES = (
@@ -69,6 +72,11 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far it is on its way back there
     skipped: Count = 0  #: samples before this one that the proxy left out, as the subscriber asked for fewer
     outcome: Outcome | None = None  #: what became of the newest intent; None: a proxy that does not tell
+
+    @property
+    def waking_up(self) -> bool:
+        """Whether the vehicle was started just now and can't take off yet; ``link_reason`` says what it waits for."""
+        return self.link_reason.startswith(WAKING_UP)
 
     @property
     def origin(self) -> EarthOrigin | None:
