@@ -254,6 +254,21 @@ def test_texts_and_health_become_events() -> None:
     assert "the vehicle knows where it is" in told
 
 
+def test_an_autopilot_of_another_component_is_named_and_can_be_chosen() -> None:
+    vehicle = Vehicle(ARDUPILOT)
+    vehicle.codec = Codec(1, 42)
+    bench = Bench(vehicle)
+    for _ in range(3):
+        bench.hear(vehicle.heartbeat())
+    assert [event.text for event in bench.sink.events] == [
+        "an autopilot answers as component 42 of system 1, not as component 1: it is ignored; ?component=42 chooses it"
+    ]
+    given = Bench(vehicle, options("mavlink://udpin:127.0.0.1:14540?parameters=no&component=42")).found()
+    assert given.sink.link_state is LinkState.UP
+    given.go_on(1.1)
+    assert {each.target_component for each in given.heard_of("COMMAND_LONG")} == {42}
+
+
 def test_one_that_still_wakes_up_says_so_once() -> None:
     """A real ArduCopter can't be armed for 42 s after its start: there were two events a second."""
     vehicle = Vehicle(ARDUPILOT)

@@ -106,7 +106,7 @@ class MavlinkSession(VehicleSession):
         self.dropped = 0  #: packets that the connection did not send, for want of room
         self._axes = WorldAxes(options.world_origin)
         self._extra = extra
-        self._selector = VehicleSelector(options.system, options.peer)
+        self._selector = VehicleSelector(options.system, options.peer, options.component)
         self._health = HealthMonitor()
         self._intervals = MessageIntervals({})
         self._out: list[Message] = []
