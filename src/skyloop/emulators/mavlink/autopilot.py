@@ -280,6 +280,19 @@ class Autopilot(ABC):
             for answer in answers(message):
                 port.send(answer)
 
+    def _restart(self) -> None:
+        """Boot again, as if it were switched on now."""
+        self._begun_s = self._gcs_s = None
+        self.home, self._home_given = (0.0, 0.0, 0.0), False
+        self._pose_s, self._posing_s = -math.inf, math.inf
+        for port in self.ports:
+            port.streams.reset()
+
+    @property
+    def channels(self) -> list[int] | None:
+        """Pulse widths of its remote control [µs]; None: it reports none."""
+        return None
+
     def _own(self, port: Port, message: Message) -> bool:  # noqa: ARG002
         """Handle a message that only one of the autopilots answers. Return whether it was such a one."""
         return False
