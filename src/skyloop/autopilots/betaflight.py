@@ -230,7 +230,7 @@ class Betaflight(CoupledFirmware):
         self._sent_s = time.monotonic()
 
 
-def connected(port: int, words: bytes, answer: bytes, within_s: float) -> socket.socket:
+def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:
     """Return a connection to a serial port that is opened soon, once these words got an answer that has this in it.
 
     What comes before the port works is lost, or ends the connection: so it is tried again.
