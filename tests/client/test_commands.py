@@ -284,7 +284,7 @@ def test_a_reason_is_over_with_the_take_off_that_it_kept_back(proxy: ScriptedPro
 
 
 def test_a_vehicle_that_still_wakes_up_is_not_asked_again_and_again(proxy: ScriptedProxy, drone: Drone) -> None:
-    proxy.more |= {"vehicle_link": "degraded", "link_reason": f"{WAKING_UP}: its own checks do not pass yet"}
+    proxy.more |= {"vehicle_link": "up", "link_reason": f"{WAKING_UP}: its own checks do not pass yet"}
     drone.wait(lambda feedback: feedback.waking_up, WAIT_S)
 
     def vehicle() -> None:

@@ -198,7 +198,7 @@ def test_a_private_proxy_that_still_lands_its_vehicle_is_left_to_that(monkeypatc
 
 def test_a_vehicle_that_still_wakes_up_is_waited_for(alpha: ScriptedProxy, caplog: pytest.LogCaptureFixture) -> None:
     """``connect()`` returned while the firmware could not arm, and nothing said what it waited for."""
-    asleep = {"vehicle_link": "degraded", "link_reason": f"{WAKING_UP}: the checks before arming do not pass yet"}
+    asleep = {"link_reason": f"{WAKING_UP}: the checks before arming do not pass yet"}
     alpha.more |= asleep
 
     def wakes_up() -> None:

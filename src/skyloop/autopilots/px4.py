@@ -330,7 +330,7 @@ def _runs(instance: int) -> bool:
         return False
     asked = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)  # struct flock: all of the file
     try:
-        with open(f"{LOCK_FILE}-{instance}", "rb") as file:
+        with Path(f"{LOCK_FILE}-{instance}").open("rb") as file:
             answer = fcntl.fcntl(file, fcntl.F_GETLK, asked)
     except OSError:
         return False  # there is none

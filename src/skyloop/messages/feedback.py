@@ -21,7 +21,7 @@ Vector = tuple[Finite, Finite, Finite]
 MAX_LINK_TEXT = 300  #: characters of a text about the link to the vehicle
 LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
 
-#: How the reason of a link begins whose vehicle still wakes up: it is connecting or degraded, and can't take off yet.
+#: How the reason of a link begins whose vehicle still wakes up: it is connecting or up, and can't take off yet.
 WAKING_UP = "still waking up"
 
 NO_POSITION = "the vehicle does not report its position"
@@ -65,7 +65,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     owner_priority: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None  #: 0 is the highest
     lease: Count = 0  #: number of the lease in force; 0 for none
     failsafe: Failsafe = Failsafe.NONE
-    link_reason: LinkText = ""  #: why the hop proxy–vehicle is as it is; empty while it is up
+    link_reason: LinkText = ""  #: why the hop proxy–vehicle is as it is; while it is up: see :attr:`waking_up`
     link_remedy: LinkText = ""  #: what a person can do about it
     others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
     start_position_m: Vector | None = None  #: where it took off last, in world axes [m]; None: that is not known

@@ -121,6 +121,7 @@ class MavlinkSession(VehicleSession):
         self._heard_by_it = True  # False: nothing shows yet that it reads what is sent
         self._said: tuple[int | None, bool, int] | None = None  # mode, whether it is armed, MAV_STATE, when last looked
         self._waking = False  # it was started just now and can't be armed yet
+        self._prearm = ""  # the last reason that it gave
         self._unsupported_reason = "no data from it"
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
 
@@ -162,7 +163,7 @@ class MavlinkSession(VehicleSession):
         if isinstance(action, Idle):
             return action  # nothing comes of it; pilots on the ground send it all the time
         if self._waking and isinstance(action, Takeoff):
-            raise DriverError(f"the vehicle is {_WAKING}")
+            raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))
         applied = self.setpoints.apply(action, self.vehicle_state(now_ns), now_ns, alone=alone, new=new)
         due_ns = self.setpoints.due_ns(now_ns)
         self.due_ns = min(self.due_ns, now_ns if due_ns is None else max(now_ns, due_ns))
@@ -264,6 +265,8 @@ class MavlinkSession(VehicleSession):
         elif kind == "STATUSTEXT":
             for event in self._health.on_text(message, quiet=self._waking):
                 self._publish_event(event)
+                if event.data["reason"] == "prearm":
+                    self._prearm = event.text
                 if self.setpoints is not None and event.data["reason"] == "prearm":
                     self.setpoints.on_prearm_reason(event.text)
         elif kind == "AUTOPILOT_VERSION":
@@ -359,17 +362,17 @@ class MavlinkSession(VehicleSession):
             self._publish_event(event)
         exchange = self.parameters
         was_waking, self._waking = self._waking, self._wakes_up(vehicle, now_ns)
-        if self._waking and not was_waking and self.link_state in (LinkState.UP, LinkState.DEGRADED):
-            self._report_link(LinkState.DEGRADED, _WAKING)
+        if self._waking is not was_waking and self.link_state is LinkState.UP:
+            self._report_link(LinkState.UP, _WAKING if self._waking else "")
         if self._known_as is not None and now_ns - self._found_ns > IDENTITY_NS:
             self._read_again(now_ns)  # it does not say which one it is
         if self.link_state is not LinkState.DEGRADED or self._silent(now_ns):
             return
-        if self._known_as is not None or not self._heard_by_it or self._waking:
+        if self._known_as is not None or not self._heard_by_it:
             return
         waited = now_ns - self._found_ns > PARAMETERS_NS
         if not self.options.parameters or exchange.complete or exchange.given_up or waited:
-            self._set_link_state(LinkState.UP)
+            self._set_link_state(LinkState.UP, _WAKING if self._waking else "")
 
     def _wakes_up(self, vehicle: VehicleState | None, now_ns: int) -> bool:
         """Return whether it was started just now and has not been ready since."""
@@ -404,7 +407,7 @@ class MavlinkSession(VehicleSession):
 
     def _lose(self, reason: str, now_ns: int) -> None:
         self._received_ns = self._said = None
-        self._waking = False
+        self._waking, self._prearm = False, ""
         self._unheard = self.telemetry.armed()
         self._selector.forget()
         self._axes.forget()

@@ -80,6 +80,7 @@ class MspSession(VehicleSession):
         self._counted_ns = now_ns
         self._slow = False
         self._wakes_until_ns: int | None = None  # None: its state is not known yet; 0: it was ready since
+        self._woke = False  # it was still waking up when last looked
         self._may_steer = False  # its state is known: what is sent does not disarm a flying one
         self._armed_throttle: float | None = None
         self._set_link_state(LinkState.CONNECTING, f"waiting for the flight controller on {options}")
@@ -231,11 +232,12 @@ class MspSession(VehicleSession):
     def _publish(self, now_ns: int) -> None:
         if self.setpoints.report.armed is None or self.reported.altitude is None:
             return  # what it does is not known yet
-        if self._wakes_up(now_ns):
+        wakes = self._wakes_up(now_ns)
+        if self.link_state is not LinkState.UP or wakes is not self._woke:
             names = ", ".join(self.setpoints.report.hindrances)
-            self._set_link_state(LinkState.DEGRADED, f"{WAKING_UP}: the flight controller can't be armed yet ({names})")
-        elif self.link_state is not LinkState.UP:
-            self._set_link_state(LinkState.UP)
+            why = f"{WAKING_UP}: the flight controller can't be armed yet ({names})" if wakes else ""
+            self._woke = wakes
+            self._report_link(LinkState.UP, why)
         motion = self.motion.at(now_ns)
         self.setpoints.on_motion(motion)
         flight = self.setpoints.flight_state()

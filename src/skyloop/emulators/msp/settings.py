@@ -37,8 +37,8 @@ _ACTUAL: Final = AxisRates(7, 0, 67)
 USUAL_RATES: Final = Rates("actual", _ACTUAL, _ACTUAL, _ACTUAL)
 #: (permanent number, name) in the order of the status' bits, as Betaflight 4.6 lists them without more features.
 BOXES: Final = ((0, "ARM"), (1, "ANGLE"), (2, "HORIZON"), (27, "FAILSAFE"), (28, "AIR MODE"), (36, "PREARM"))
-#: Replies of Betaflight 4.6.0 to what the emulation has no state of, by number: how many bytes, and the first of them in
-#: hexadecimal digits; the rest are zeros. Recorded of its own simulation, with its defaults, at rest.
+#: Replies of Betaflight 4.6.0 to what the emulation has no state of, by number: how many bytes, and the first of them
+#: as hexadecimal digits; the rest are zeros. Recorded from its own simulation, with its defaults, at rest.
 RECORDED: Final[dict[int, tuple[int, str]]] = {
     5: (30, "4e6f76203236203230323631353a30343a323700484f52495a4f1f402b20"),
     10: (0, ""),

@@ -113,7 +113,7 @@ PADS: Final = range(1, 9)  #: the numbers of the pads that there are
 
 
 def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector | None) -> Pad | None:
-    if number not in PADS:  # -1 and 0: none is in view; some firmware says 257 then
+    if number is None or number not in PADS:  # -1 and 0: none is in view; some firmware says 257 then
         return None
     angles = fields.get("mpry")
     nowhere = (float(NOWHERE_CM),) * 3
