@@ -129,7 +129,7 @@ class UdpSender(UdpListener):
 
     def __init__(self, address: Address) -> None:
         family, *_, found = socket.getaddrinfo(address.place, address.number, 0, socket.SOCK_DGRAM)[0]
-        self._to = _peer_of((str(found[0]), *found[1:]))  # type: ignore[arg-type]
+        self._to = _peer_of((str(found[0]), *found[1:]))
         super().__init__(Address(ConnectionKind.UDP_IN, "::" if family == socket.AF_INET6 else "", 0))
 
     def send(self, packet: Packet) -> None:
