@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,40 @@ import skyloop.sim
 from skyloop.cockpit.access import read_tokens
 from skyloop.control.route import Route, RouteWaypoint, load_route
 from skyloop.errors import FileFormatError, UsageError
-from skyloop.files import expand, read_bytes, read_json, read_text, replacing, write
+from skyloop.files import expand, read_bytes, read_json, read_text, replacing, wait_readable, write
 from skyloop.host.fleet import read_fleet
 from skyloop.sim.world_file import load_world
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="numbers of sockets are others there")
+def test_a_descriptor_of_any_number_is_waited_for() -> None:
+    """``select.select`` raises for 1,024 and more, and a ground station with many drones has as many."""
+    import fcntl
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(limits[0], 2048), max(limits[1], 2048)))
+    reader, writer = os.pipe()
+    high = fcntl.fcntl(reader, fcntl.F_DUPFD, 1500)
+    try:
+        assert high >= 1500
+        assert not wait_readable(high, 0.001)
+        os.write(writer, b".")
+        assert wait_readable(high, 10.0)
+        os.read(high, 1)
+        os.close(writer)
+        writer = -1
+        assert wait_readable(high, 10.0), "its end counts as well"
+    finally:
+        for descriptor in filter(lambda number: number >= 0, (reader, writer, high)):
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_nothing_in_the_package_waits_by_select() -> None:
+    package = Path(skyloop.__file__).parent
+    found = [path.name for path in package.rglob("*.py") if "select.select(" in path.read_text(encoding="utf-8")]
+    assert found == ["files.py"], "skyloop.files.wait_readable takes descriptors of all numbers"
 
 
 def test_a_file_is_replaced_in_one_step(tmp_path: Path) -> None:

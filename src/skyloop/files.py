@@ -1,13 +1,15 @@
-"""Files at the edge: read up to a limit and decoded with one kind of error, and written whole or not at all."""
+"""Files at the edge: read up to a limit and decoded with one kind of error, written whole or not at all, waited for."""
 
 from __future__ import annotations
 
+import math
 import os
+import select
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, Protocol, TypeVar
 
 import msgspec
 
@@ -57,6 +59,24 @@ def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
         return msgspec.json.decode(decoded(content), type=kind)
     except (msgspec.MsgspecError, UsageError, UnicodeDecodeError, RecursionError) as error:
         raise FileFormatError(f"{path} is not {what}: {error}") from None
+
+
+class Descriptor(Protocol):
+    """Something open."""
+
+    def fileno(self) -> int: ...
+
+
+def wait_readable(source: Descriptor | int, within_s: float) -> bool:
+    """Wait until a descriptor, whatever its number, can be read from or has ended. False: not within ``within_s`` [s].
+
+    ``select.select`` raises for numbers from 1,024 on.
+    """
+    if not hasattr(select, "poll"):  # Windows
+        return bool(select.select([source], [], [], within_s)[0])
+    poll = select.poll()
+    poll.register(source, select.POLLIN)
+    return bool(poll.poll(math.ceil(within_s * 1000.0)))
 
 
 def expand(path: str | Path) -> Path:

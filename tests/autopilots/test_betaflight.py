@@ -16,6 +16,7 @@ from skyloop.autopilots.betaflight import LEAST_SPACING_S, SETTINGS, VARIABLE, B
 from skyloop.autopilots.coupling import STOPPED
 from skyloop.autopilots.ports import bound
 from skyloop.autopilots.program import FirmwareEventKind
+from skyloop.drivers.msp.firmware import LONG_DELAY_S
 from skyloop.errors import UsageError
 from tests.autopilots.rig import COMMANDS, FIX, Rig, flying, program
 
@@ -63,6 +64,7 @@ def test_it_is_configured_and_flies_at_the_computers_pace(rig: Rig, tmp_path: Pa
 
 def test_silence_is_an_event(rig: Rig) -> None:
     rig.answered()
+    rig.event(FirmwareEventKind.STARTED)  # before, one that does not answer is started again
     os.kill(rig.firmware.program.pid, signal.SIGSTOP)
     assert "does not answer" in rig.event(FirmwareEventKind.SILENT)
     assert rig.step() == STOPPED
@@ -110,6 +112,33 @@ def test_one_that_cannot_be_configured_is_an_event(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(betaflight, "CONFIGURE_S", 0.1)
     with flying(Betaflight) as rig:
         assert "can't be started" in rig.event(FirmwareEventKind.FAILED)
+
+
+def test_a_deaf_start_is_ended_and_another_one_begins_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of Betaflight's starts in ten never answers: when it is configured, and when it is to fly."""
+    deaf = tmp_path / "deaf"
+    deaf.mkdir()
+    for n in range(3):
+        (deaf / str(n)).touch()
+    monkeypatch.setenv("STANDIN_DEAF", str(deaf))
+    monkeypatch.setenv(VARIABLE, str(program(tmp_path, "betaflight")))
+    rig = Rig()
+    rig.firmware = Betaflight(rig.events.put, folder=tmp_path / "kept")
+    rig.firmware.program._restart_s = 600.0  # there is no pause
+    rig.firmware.start()
+    try:
+        text = rig.event(FirmwareEventKind.DEAF)
+        assert text == "Betaflight is started again: it did not answer within 1.5 s of its start"
+        assert rig.event(FirmwareEventKind.DEAF).endswith("within 3 s of its start"), "the computer may be busy"
+        rig.event(FirmwareEventKind.DEAF)
+        rig.answered()
+    finally:
+        rig.firmware.close()
+
+
+def test_it_is_set_up_so_that_its_own_driver_has_no_warning() -> None:
+    delay = next(line for line in SETTINGS if line.startswith("set failsafe_delay"))
+    assert int(delay.split()[-1]) / 10 <= LONG_DELAY_S
 
 
 def test_the_package_s_program_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

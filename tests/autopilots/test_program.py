@@ -11,7 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.autopilots.program import FirmwareEvent, FirmwareEventKind, Launch, Program, find_program
+from skyloop.autopilots.program import (
+    AT_ONCE,
+    FirmwareEvent,
+    FirmwareEventKind,
+    Launch,
+    Program,
+    StartedInVainError,
+    find_program,
+)
 from skyloop.errors import UsageError
 
 pytestmark = pytest.mark.process
@@ -97,6 +105,23 @@ def test_last_words_are_in_the_event_and_the_folder_stays(tmp_path: Path) -> Non
         assert text.startswith("Testware ended with exit code 1; its output ends with:")
         assert text.endswith("first line\nno sensors found")
     assert "no sensors found" in (tmp_path / "kept" / "firmware.log").read_text()
+
+
+@pytest.mark.parametrize("code", [129, 255])
+def test_an_exit_code_is_no_signal_unless_there_is_one_of_its_number(code: int) -> None:
+    told = {129: "Testware was killed by SIGHUP", 255: "Testware ended with exit code 255"}
+    with Watched((sys.executable, "-S", "-c", f"import os; os._exit({code})")) as watched:
+        watched.next(FirmwareEventKind.STARTED)
+        assert watched.next(FirmwareEventKind.DIED) == told[code]
+
+
+def test_one_that_does_not_answer_is_started_again_at_once_but_not_for_ever() -> None:
+    def verify() -> None:
+        raise StartedInVainError("it does not listen")
+
+    with Watched(SLEEPS, verify=verify) as watched:
+        for _ in range(AT_ONCE + 2):
+            assert watched.next(FirmwareEventKind.DEAF) == "Testware is started again: it does not listen"
 
 
 def test_it_ends_with_its_keeper() -> None:

@@ -6,6 +6,8 @@ import itertools
 import os
 import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -74,6 +76,25 @@ def test_it_is_told_how_late_the_gps_is(rig: Rig, tmp_path: Path) -> None:
     rig.answered()
     given = (tmp_path / "kept" / "parameters.txt").read_text().splitlines()
     assert {"PX4_PARAM_EKF2_GPS_DELAY=170", "PX4_PARAM_SENS_GPS0_DELAY=170", "PX4_PARAM_MPC_THR_HOVER=0.7"} <= {*given}
+
+
+def test_another_px4_on_the_computer_leaves_the_next_instance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was started as the same instance for ever, and ended each time: "PX4 server already running"."""
+    monkeypatch.setattr(px4, "LOCK_FILE", str(tmp_path / "px4_lock"))
+    monkeypatch.setenv(VARIABLE, str(program(tmp_path, "px4")))
+    (tmp_path / "etc" / "init.d-posix").mkdir(parents=True)
+    holds = "import fcntl, sys; f = open(sys.argv[1], 'wb'); fcntl.lockf(f, fcntl.LOCK_EX); print(); sys.stdin.read()"
+    command = [sys.executable, "-S", "-c", holds, f"{px4.LOCK_FILE}-0"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdin is not None
+        other.stdout.readline()
+        with flying(lambda on_event: Px4(on_event, folder=tmp_path / "kept")) as rig:
+            rig.answered()
+            assert "sysid=2" in rig.firmware.address
+        other.stdin.close()
+    assert not px4._runs(0)
+    assert not px4._runs(1)
 
 
 def test_silence_is_an_event_and_blocks_one_step_only(rig: Rig, tmp_path: Path) -> None:

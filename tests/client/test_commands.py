@@ -32,6 +32,7 @@ from skyloop.messages import (
     Hover,
     Idle,
     Land,
+    LinkState,
     Outcome,
     Position,
     Refusal,
@@ -41,6 +42,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.messages.feedback import WAKING_UP
 from skyloop.proxy.core.intents import TAKEOFF_NS
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
 
@@ -267,6 +269,54 @@ def test_take_off_that_does_not_happen(proxy: ScriptedProxy, drone: Drone) -> No
     with pytest.raises(NoAnswerError, match="landed; me: no GPS"):
         drone.takeoff(timeout_s=1.5)
     thread.join(WAIT_S)
+
+
+def test_a_reason_is_no_older_than_the_link_that_it_speaks_of(proxy: ScriptedProxy, drone: Drone) -> None:
+    """Betaflight's take-off failed with "the link is connecting", seconds after it was up."""
+    proxy.more["vehicle_link"] = "connecting"
+    drone.wait(lambda feedback: feedback.vehicle_link is LinkState.CONNECTING, WAIT_S)
+
+    def vehicle() -> None:
+        command = proxy.until_commanded(Takeoff())
+        refuse(proxy, command, Refusal.VEHICLE_LINK_LOST, "me: the link to the vehicle is connecting")
+        drone.wait(lambda feedback: feedback.outcome is not None and feedback.outcome.failed, WAIT_S)
+        proxy.more["vehicle_link"] = "up"
+
+    comes_up = background(vehicle)
+    with pytest.raises(NoAnswerError, match=r"the vehicle is landed$"):
+        drone.takeoff(timeout_s=0.8)
+    comes_up.join(WAIT_S)
+    proxy.more |= {"vehicle_link": "lost", "link_reason": "no reply"}
+    drone.wait(lambda feedback: feedback.vehicle_link is LinkState.LOST, WAIT_S)
+    with pytest.raises(NoAnswerError, match=r"and its own link is lost \(no reply\)$"):
+        drone.takeoff(timeout_s=0.2)
+
+
+def test_a_reason_is_over_with_the_take_off_that_it_kept_back(proxy: ScriptedProxy, drone: Drone) -> None:
+    def vehicle() -> None:
+        first = proxy.until_commanded(Takeoff())
+        refuse(proxy, first, Refusal.DRIVER_FAILED, "me: BOOTGRACE")
+        proxy.until(lambda: proxy.commands[-1].intent > first.intent, "the next take-off")
+        proxy.more["outcome"] = Outcome(drone.app_id, proxy.commands[-1].intent)
+
+    rises = background(vehicle)
+    with pytest.raises(NoAnswerError, match=r"the vehicle is landed$"):
+        drone.takeoff(timeout_s=1.5)
+    rises.join(WAIT_S)
+
+
+def test_a_vehicle_that_still_wakes_up_is_not_asked_again_and_again(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.more |= {"vehicle_link": "up", "link_reason": f"{WAKING_UP}: its own checks do not pass yet"}
+    drone.wait(lambda feedback: feedback.waking_up, WAIT_S)
+
+    def vehicle() -> None:
+        refuse(proxy, proxy.until_commanded(Takeoff()), Refusal.DRIVER_FAILED, "me: not yet")
+
+    refuses = background(vehicle)
+    with pytest.raises(NoAnswerError, match=r"landed; it is still waking up: its own checks do not pass yet$"):
+        drone.takeoff(timeout_s=1.5)
+    refuses.join(WAIT_S)
+    assert len({command.intent for command in proxy.commands if command.action == Takeoff()}) == 1
 
 
 @pytest.mark.parametrize(

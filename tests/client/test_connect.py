@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,7 @@ from skyloop.client.drone import open_drone
 from skyloop.client.private_proxy import PrivateProxy
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import FlightState, LinkState
+from skyloop.messages.feedback import WAKING_UP
 from skyloop.transport.fabric.settings import FabricSettings
 from skyloop.transport.local import LocalServer
 from tests.client.scripted import ScriptedProxy
@@ -192,6 +194,35 @@ def test_a_private_proxy_that_still_lands_its_vehicle_is_left_to_that(monkeypatc
     drone.close()
     assert alive(proxy.pid)
     assert proxy._process.wait(20.0) == 0, "it ended by itself"
+
+
+def test_a_vehicle_that_still_wakes_up_is_waited_for(alpha: ScriptedProxy, caplog: pytest.LogCaptureFixture) -> None:
+    """``connect()`` returned while the firmware could not arm, and nothing said what it waited for."""
+    asleep = {"link_reason": f"{WAKING_UP}: the checks before arming do not pass yet"}
+    alpha.more |= asleep
+
+    def wakes_up() -> None:
+        deadline_s = time.monotonic() + 30.0
+        while not caplog.records and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        for key in asleep:
+            del alpha.more[key]
+
+    waking = threading.Thread(target=wakes_up)
+    waking.start()
+    with connect("alpha", timeout_s=30.0) as drone:
+        assert not drone.feedback().waking_up
+    waking.join()
+    assert [record.getMessage() for record in caplog.records] == [
+        "scripted is still waking up: the checks before arming do not pass yet; waiting for it"
+    ]
+    caplog.clear()
+    alpha.more |= asleep
+    with connect("alpha", timeout_s=1.5) as drone:
+        assert drone.feedback().waking_up, "it is connected all the same"
+    assert caplog.records[-1].getMessage().endswith("do not pass yet: it can't take off yet")
+    with connect("alpha", access="observe") as drone:
+        pass  # at once
 
 
 @pytest.mark.process

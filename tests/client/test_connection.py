@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Iterator
 
+import msgspec
 import pytest
 
 from skyloop.client import Drone, LinkStatus, RedialPolicy
 from skyloop.client.drone import open_drone
-from skyloop.errors import AuthorityError, ClosedError, LinkError, NoAnswerError, RefusedError
+from skyloop.errors import AuthorityError, ClosedError, LinkError, NoAnswerError, RefusedError, UnknownNameError
 from skyloop.messages import (
     Command,
     Event,
@@ -32,7 +34,7 @@ from skyloop.messages import (
 )
 from skyloop.transport.base import EVENTS, FEEDBACK, ClientHandler, TransportClient, video
 from skyloop.transport.memory import Faults
-from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, flown, scripted
+from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
 
 
 @pytest.fixture
@@ -168,6 +170,27 @@ def test_a_proxy_without_feedback_is_pinged_and_asked_again(proxy: ScriptedProxy
     assert LinkState.LOST not in told.states
     proxy.beating.set()
     told.until(LinkState.UP, at)
+
+
+def test_a_proxy_that_is_restarted_with_another_camera_is_read_by_that(proxy: ScriptedProxy, drone: Drone) -> None:
+    """The reader waited for the old camera for ever."""
+    found: list[str] = []
+    reads = background(lambda: found.append(next(drone.frames(timeout_s=WAIT_S)).camera))
+    proxy.until(lambda: proxy.server.subscribers("video/front") == 1, "the first subscription")
+    top = msgspec.structs.replace(proxy.capabilities.cameras[0], name="top")
+    proxy.capabilities = msgspec.structs.replace(proxy.capabilities, cameras=(top,))
+    restarted(proxy)
+    proxy.until(lambda: proxy.server.subscribers("video/top") >= 1, "the new camera's subscription")
+    end_s = time.monotonic() + WAIT_S
+    for seq in itertools.count(1):
+        proxy.frame(seq, "top")
+        if not reads.is_alive() or time.monotonic() > end_s:
+            break
+        time.sleep(0.01)
+    reads.join(WAIT_S)
+    assert found == ["top"]
+    with pytest.raises(UnknownNameError, match="front"):
+        drone.next_frame("front")
 
 
 def test_garbage_restarts_the_connection(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -69,6 +69,22 @@ def test_a_covariance_counts_by_direction() -> None:
     assert filtered.newest.position == pytest.approx([0.2, 0.0], abs=0.01)
 
 
+@pytest.mark.parametrize("deviation", [1e-4, 1e-7, 1e-9, 1e-12, 0.0])
+def test_what_is_all_but_exact_is_taken(deviation: float) -> None:
+    """A simulator without noise, or motion capture that says so: the filter raised."""
+    filtered = ConstantVelocityFilter(3, gate=math.inf)
+    for n in range(200):
+        place = np.array([0.0005 * n, 0.0, 1.0]) + 1e-9 * math.sin(n)
+        assert filtered.update(place, deviation, n * 1_000_000)
+    assert filtered.newest is not None
+    assert filtered.newest.position == pytest.approx([0.0995, 0.0, 1.0], abs=1e-4)
+    assert np.isfinite(filtered.newest.covariance).all()
+    axes = np.diag([1e-4, 0.0, 0.0])  # exact along two axes only
+    for _ in range(3):
+        filtered.update(np.array([0.0995, 0.0, 1.0]), axes, 200_000_000)
+    assert np.isfinite(filtered.newest.covariance).all()
+
+
 def test_what_makes_no_sense() -> None:
     filtered = ConstantVelocityFilter(2)
     with pytest.raises(UsageError, match="never seen"):

@@ -232,6 +232,22 @@ def test_what_the_firmware_s_driver_reports_has_the_truth_beside_it_once_that_is
         inner.stream("front", b"", 1, width=2, height=2, key=True)
 
 
+def test_what_is_said_of_the_link_names_what_is_inside() -> None:
+    """Its driver told people to start what this drone starts by itself, at a port that they had never seen."""
+    flight = FirmwareFlight(options_of(parse_uri("sim://?autopilot=betaflight")), "")
+    sink = RecordingSink()
+    inner = _InnerSink(flight, sink)
+    for state in (LinkState.CONNECTING, LinkState.LOST):
+        inner.link(state, "no reply from the flight controller on tcp:127.0.0.1:39999", "skyloop sim --firmware …")
+        assert flight.link(state, "")[2] == ""
+        assert sink.links[-1] == (LinkState.CONNECTING, "still waking up: Betaflight is being started")
+    inner.link(LinkState.UP)
+    assert sink.links[-1] == (LinkState.UP, "")
+    inner.link(LinkState.LOST, "the connection failed", "skyloop sim --firmware betaflight")
+    assert sink.links[-1] == (LinkState.LOST, "the connection failed")
+    assert flight.link(LinkState.LOST, "")[2].startswith("Betaflight runs within this drone")
+
+
 # The truth beside it ---------------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import struct
 import sys
 import tempfile
 import time
@@ -462,3 +463,34 @@ def test_what_sends_h264_announces_a_stream() -> None:
         capabilities = make_driver(uri).capabilities()
         assert [camera.stream for camera in capabilities.cameras] == [stream]
         assert "secret" not in capabilities.description
+
+
+@pytest.mark.parametrize(("turned", "matrix"), [("clockwise", (0, 1, -1, 0)), ("upside down", (-1, 0, 0, -1))])
+def test_a_phone_s_portrait_video_is_upright(tmp_path: Path, turned: str, matrix: tuple[int, int, int, int]) -> None:
+    """The sensor lies on its side; the container says how its pictures are turned."""
+    path = tmp_path / "phone.mp4"
+    picture = np.full((48, 64, 3), 40, np.uint8)
+    picture[:24, :32] = 220  # the top left corner of what is stored
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode(None))
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 44  # ISO 14496-12: a, b, u, c, d, v, x, y, w in 16.16, u, v and w in 2.30
+    a, b, c, d = (one << 16 for one in matrix)
+    data[at : at + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+    sink = play(f"video://{path}?{FAST}", keep_pixels=True)
+    seen = sink.frames[-1].pixels
+    if turned == "clockwise":
+        assert seen.shape == (64, 48, 3)
+        assert seen[10, 40].mean() > 180, "its bright corner is at the top right now"
+        assert seen[10, 8].mean() < 80
+    else:
+        assert seen.shape == (48, 64, 3)
+        assert seen[40, 56].mean() > 180
+    (camera,) = make_driver(f"video://{path}").capabilities().cameras
+    assert (camera.height, camera.width) == seen.shape[:2]
+    assert camera.stream == "", "the stored pictures lie on their side"

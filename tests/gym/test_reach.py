@@ -76,6 +76,28 @@ def test_observations_are_numbers_pictures_or_both() -> None:
         FollowEnv(observe="video")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("kind", [FollowVectorEnv, GatesVectorEnv, HoverVectorEnv, ReachVectorEnv])
+def test_an_episode_begins_the_same_whatever_was_before(kind: Any) -> None:
+    """Targets began where the last episode had left them, and the velocity was that of its end."""
+    fresh, used = kind(3), kind(3)
+    seen, _ = used.reset(seed=5)
+    for _ in range(40):
+        seen, *_ = used.step(steer(seen))
+    assert np.abs(seen[:, 3:6]).max() > 0.1
+    one, other = fresh.reset(seed=7)[0], used.reset(seed=7)[0]
+    assert np.array_equal(one, other)
+    for _ in range(40):
+        other, *_ = used.step(steer(other))
+    again, _ = used.reset()
+    assert np.abs(again[:, 3:6]).max() < 0.2, "it begins at rest"
+    assert np.array_equal(used._task.age, [0, 0, 0])
+    before = used._task.goals.copy()
+    used._task.age[:] = 0
+    if hasattr(used._task, "_walk"):
+        used._task._walk(used._task.age)
+    assert np.array_equal(before, used._task.goals)
+
+
 def test_pictures_have_the_size_asked_for_and_show_no_other_drone() -> None:
     envs = ReachVectorEnv(4, observe="pixels", size_px=84)
     many, _ = envs.reset(seed=1)

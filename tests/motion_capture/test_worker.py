@@ -18,7 +18,8 @@ import pytest
 from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError, MissingExtraError, UsageError
 from skyloop.messages import FlightState
-from skyloop.motion_capture import MotionCapture, parse_system, worker
+from skyloop.motion_capture import MotionCapture, TrackState, parse_system, worker
+from skyloop.motion_capture.capture import TrackEvent
 from skyloop.motion_capture.source import ChildSource
 from skyloop.motion_capture.worker import RawFrame, read
 from skyloop.transport.testing import wait_until
@@ -137,6 +138,45 @@ def test_the_same_trouble_is_told_once() -> None:
     take(RawFrame(1, {}))
     trouble("refused")
     assert told == ["refused", "no route", "refused", "refused"]
+
+
+def opened(address: str) -> tuple[MotionCapture, Callable[[RawFrame], None]]:
+    """A capture whose system is the test."""
+    sources: list[Callable[[RawFrame], None]] = []
+
+    def make(_system: Any, _names: Any, take: Any, _trouble: Any) -> Any:
+        sources.append(take)
+        return types.SimpleNamespace(start=lambda timeout_s: None, close=lambda: None)
+
+    return MotionCapture(parse_system(address), {"alpha": "body"}, make)._open(), sources[0]
+
+
+def test_poses_that_are_late_by_more_than_a_body_may_be_silent_are_taken() -> None:
+    """With latency=0.3 each pose was lost as it came."""
+    capture, take = opened("vicon://nowhere?latency=0.3")
+    with capture:
+        take(RawFrame(monotonic_ns(), {"body": ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))}))
+        pose = capture.pose("alpha")
+        assert pose is not None
+        assert monotonic_ns() - pose.captured_ns >= 300_000_000
+        wait_until(lambda: capture.pose("alpha") is None, "it is lost once none comes any more")
+
+
+def test_it_may_be_closed_by_its_own_callback() -> None:
+    capture, take = opened("vicon://nowhere")
+    closed = threading.Event()
+
+    def on_event(event: TrackEvent) -> None:
+        if event.state is TrackState.LOST:  # on the thread that watches
+            capture.close()
+            closed.set()
+
+    capture.on_event(on_event, inline=True)
+    take(RawFrame(monotonic_ns(), {"body": ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))}))
+    assert closed.wait(20.0)
+    capture._watch.join(20.0)
+    assert not capture._watch.is_alive()
+    assert capture.state("alpha") is TrackState.ENDED
 
 
 def test_a_child_that_sends_nonsense_is_replaced() -> None:

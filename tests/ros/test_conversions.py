@@ -6,7 +6,10 @@ import math
 import struct
 from array import array
 from types import SimpleNamespace
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,7 +17,9 @@ from hypothesis import strategies as st
 from skyloop.errors import DecodeError
 from skyloop.messages import Encoding, Intrinsics
 from skyloop.messages.geometry import quaternion_from_euler, rotation_from_euler
+from skyloop.vision import unproject
 from skyloop.wire.ros2.conversions import (
+    ENCODINGS,
     NOT_KNOWN,
     ClockMap,
     body_velocity,
@@ -151,12 +156,106 @@ def test_pixels_with_transparency_become_blue_green_red() -> None:
 
 
 def test_other_pixels_are_refused() -> None:
-    with pytest.raises(DecodeError, match="encoding 'mono16' are not read, only bgr8"):
-        pixels_of(image("mono16", 2))
+    with pytest.raises(DecodeError, match="encoding '32FC1' are not read, only bgr8"):
+        pixels_of(image("32FC1", 4))
     short = image("bgr8", 3)
     short.height = 3
     with pytest.raises(DecodeError, match="can't have 18 bytes"):
         pixels_of(short)
+
+
+def packed(encoding: str, rows: np.ndarray[Any, Any], width: int, height: int, padding: int = 4) -> SimpleNamespace:
+    """An image of these bytes, with padding at the end of each row."""
+    padded = np.pad(rows, ((0, 0), (0, padding)), constant_values=255)
+    return SimpleNamespace(
+        encoding=encoding, height=height, width=width, step=padded.shape[1], data=padded.tobytes(), is_bigendian=0
+    )
+
+
+def as_camera(encoding: str, picture: np.ndarray[Any, Any]) -> SimpleNamespace:
+    """A BGR picture as a camera would send it."""
+    height, width = picture.shape[:2]
+    blue, green, red = (picture[..., n].astype(np.uint8) for n in range(3))
+    if encoding.startswith("bayer_"):
+        pattern = encoding[6:10]
+        planes = {"r": red, "g": green, "b": blue}
+        mosaic = np.empty((height, width), np.uint8)
+        for n, letter in enumerate(pattern):
+            mosaic[n // 2 :: 2, n % 2 :: 2] = planes[letter][n // 2 :: 2, n % 2 :: 2]
+        if encoding.endswith("16"):
+            mosaic = (mosaic.astype("<u2") << 8).view(np.uint8)
+        return packed(encoding, mosaic, width, height)
+    planar = cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420)
+    luma, chroma = planar[:height], planar[height:].reshape(2, height // 2, width // 2)
+    if encoding in ("nv12", "nv21"):
+        order = chroma if encoding == "nv12" else chroma[::-1]
+        return packed(encoding, np.vstack([luma, np.dstack(list(order)).reshape(height // 2, width)]), width, height)
+    us, vs = (plane.repeat(2, axis=0) for plane in chroma)
+    pairs = np.empty((height, width // 2, 4), np.uint8)
+    places = (0, 1, 2, 3) if encoding in ("yuv422_yuy2", "yuyv") else (1, 0, 3, 2)
+    for place, plane in zip(places, (luma[:, ::2], us, luma[:, 1::2], vs), strict=True):
+        pairs[..., place] = plane
+    return packed(encoding, pairs.reshape(height, -1), width, height)
+
+
+PLAIN = {"bgr8", "8UC3", "rgb8", "mono8", "8UC1", "bgra8", "8UC4", "rgba8", "mono16"}
+
+
+@pytest.mark.parametrize("encoding", sorted({*ENCODINGS} - PLAIN))
+def test_what_cameras_send_by_default_becomes_blue_green_red(encoding: str) -> None:
+    """``yuv422_yuy2`` is what usb_cam sends if nobody says otherwise."""
+    picture = np.zeros((24, 32, 3), np.uint8)
+    picture[:12, :16], picture[:12, 16:], picture[12:, :16] = (200, 60, 40), (40, 200, 60), (60, 40, 200)
+    pixels, read_as = pixels_of(as_camera(encoding, picture))
+    assert (read_as, pixels.shape) == (Encoding.BGR8, picture.shape)
+    assert pixels.dtype == np.uint8
+    assert pixels.flags.c_contiguous
+    for y, x in ((6, 8), (6, 24), (18, 8), (18, 24)):
+        assert pixels[y, x].astype(int) == pytest.approx(picture[y, x].astype(int), abs=8), (y, x)
+
+
+def test_sixteen_bits_of_grey_become_eight() -> None:
+    grey = np.array([[0x1234, 0xFF00], [0x00FF, 0x8000]], "<u2")
+    little = packed("mono16", grey.view(np.uint8), 2, 2)
+    pixels, read_as = pixels_of(little)
+    assert read_as is Encoding.MONO8
+    assert pixels.tolist() == [[0x12, 0xFF], [0x00, 0x80]]
+    big = packed("mono16", grey.astype(">u2").view(np.uint8), 2, 2)
+    big.is_bigendian = 1
+    assert pixels_of(big)[0].tolist() == pixels.tolist()
+
+
+def test_an_image_that_can_not_be_halved_is_refused() -> None:
+    with pytest.raises(DecodeError, match="can't be converted"):
+        pixels_of(packed("nv12", np.zeros((5, 3), np.uint8), 3, 3))
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "kept"),
+    [
+        ("plumb_bob", [0.1, 0.2], (0.1, 0.2, 0.0, 0.0)),
+        ("plumb_bob", [0.1] * 6, (*[0.1] * 6, 0.0, 0.0)),
+        ("rational_polynomial", [0.1] * 7, (*[0.1] * 7, 0.0)),
+        ("plumb_bob", [0.1, 0.2, 0.0, 0.0, 0.0], (0.1, 0.2, 0.0, 0.0)),
+        ("equidistant", [0.1, 0.2, 0.3, 0.4, 0.0], (0.1, 0.2, 0.3, 0.4)),
+        ("equidistant", [0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (0.1, 0.2, 0.0, 0.0)),
+        ("", [], ()),
+    ],
+)
+def test_coefficients_are_as_many_as_opencv_takes(model: str, given: list[float], kept: tuple[float, ...]) -> None:
+    """With 2, 6 or 7 of them the first use raised in the application's own callback."""
+    k = [300.0, 0.0, 159.5, 0.0, 300.0, 119.5, 0.0, 0.0, 1.0]
+    found = intrinsics_of(SimpleNamespace(distortion_model=model, d=given, k=k))
+    assert found is not None
+    assert found.distortion == kept
+    assert np.isfinite(unproject([[200.0, 100.0]], found)).all()
+
+
+@pytest.mark.parametrize(("model", "given"), [("equidistant", [0.1] * 5), ("omni", [0.1]), ("plumb_bob", [0.1] * 15)])
+def test_a_lens_that_is_not_known_is_refused_when_it_is_told(model: str, given: list[float]) -> None:
+    k = [300.0, 0.0, 159.5, 0.0, 300.0, 119.5, 0.0, 0.0, 1.0]
+    with pytest.raises(DecodeError, match=model):
+        intrinsics_of(SimpleNamespace(distortion_model=model, d=given, k=k))
 
 
 def test_transforms_as_the_bytes_of_their_type() -> None:

@@ -370,6 +370,20 @@ def test_frames_have_the_cameras_intrinsics_and_other_sizes_are_named_once() -> 
     assert (frame.width, frame.height, frame.encoding) == (4, 2, Encoding.BGR8)
     assert frame.intrinsics is not None
     assert frame.captured_ns == rig.clock() - 20_000_000
+    info.k[1] = 0.4
+    for _ in range(2):
+        rig.session.on_info(info)
+    assert [event.text for event in rig.sink.events] == [
+        "the camera's pixels have a skew of 0.4 px, which is left out: calibrate without it"
+    ]
+    info.distortion_model, info.d = "equidistant", [0.1] * 8
+    rig.session.on_info(info)
+    assert "intrinsics can't be used: a lens of the model 'equidistant' has 4" in rig.sink.events[-1].text
+    rig.session.on_image(image(rig.system()))
+    assert rig.sink.frames[-1].intrinsics is None, "and no exception in the application"
+    rig.sink.events.clear()
+    rig.sink.frames.clear()
+    rig.session.on_image(image(rig.system()))
     for _ in range(2):
         rig.session.on_image(image(rig.system(), width=8))
     rig.session.on_image(image(rig.system(), encoding="bayer"))

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
+import time
 
 import pytest
 from hypothesis import given
@@ -10,7 +12,10 @@ from hypothesis import strategies as st
 from skyloop.clock import ManualClock
 from skyloop.errors import UsageError
 from skyloop.sim import STEP_S, Pacer
+from skyloop.sim.host import Report, SimHost
+from skyloop.sim.options import SimOptions
 from skyloop.sim.pacing import MOST_LAG_S, SLOW_AGAIN_NS, SLOW_NS, SlownessWatch
+from skyloop.sim.reports import Occurrence
 
 
 class Counter:
@@ -104,3 +109,52 @@ def test_a_simulation_that_stays_behind_is_said_now_and_then() -> None:
             said.append(now_ns)
     assert said[0] == 5 * SLOW_NS, "a little is no matter"
     assert [b - a for a, b in itertools.pairwise(said)] == [SLOW_AGAIN_NS] * 2
+
+
+def test_one_thread_at_a_time_steps_a_world_that_is_left_and_joined_again() -> None:
+    """The one that ended was still in a step when the next one began."""
+
+    class Observer:
+        def __init__(self) -> None:
+            self.reports = threading.Event()
+            self.failures: list[Exception] = []
+
+        def report(self, report: Report) -> None:
+            self.reports.set()
+
+        def happened(self, occurrence: Occurrence) -> None: ...
+
+        def wanted_fps(self, camera: str) -> float:
+            return 0.0
+
+        def failed(self, error: Exception) -> None:
+            self.failures.append(error)
+
+    host = SimHost(SimOptions(world="empty", cameras=()))
+    inside, most = [0], [0]
+    step, entered, go_on = host.simulation.step, threading.Event(), threading.Event()
+
+    def slow(steps: int) -> None:
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        entered.set()
+        go_on.wait(20.0)
+        step(steps)
+        inside[0] -= 1
+
+    host.simulation.step = slow  # type: ignore[method-assign, assignment]
+    first, second = Observer(), Observer()
+    host.attach(0, first, None, [])  # type: ignore[arg-type]
+    assert entered.wait(20.0)
+    leaving = threading.Thread(target=host.detach, args=(0, first))
+    leaving.start()
+    while host.observers:
+        time.sleep(0.001)
+    host.attach(0, second, None, [])  # type: ignore[arg-type]
+    assert not second.reports.wait(0.1), "the first one is still in its step"
+    go_on.set()
+    leaving.join(20.0)
+    assert second.reports.wait(20.0)
+    host.detach(0, second)
+    assert most == [1]
+    assert first.failures == second.failures == []

@@ -90,3 +90,19 @@ def test_pictures_that_cannot_be_straightened() -> None:
         undistort(np.zeros((4, 4)), PINHOLE)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="balance"):
         undistort(np.zeros((4, 4), np.uint8), PINHOLE, balance=2.0)
+
+
+def test_beyond_the_fold_of_a_pinhole_s_distortion_nothing_is_seen() -> None:
+    """The directions to such pixels were finite, and wrong by tens of degrees."""
+    lens = Intrinsics(250.0, 250.0, 320.0, 240.0, (-0.3, 0.0, 0.0, 0.0))  # 0.703 f from the axis is the farthest
+    pixels = [[320.0 + 250.0 * 0.69, 240.0], [320.0 + 250.0 * 0.72, 240.0], [320.0, 240.0 - 250.0 * 2.0]]
+    rays = unproject(pixels, lens)
+    assert np.isfinite(rays[0]).all()
+    assert project(rays[:1], lens) == pytest.approx(np.array(pixels[:1]), abs=0.02)
+    assert np.isnan(rays[1:]).all()
+    assert np.isnan(normalised(pixels[1:], lens)).all()
+    shown = project([[1.0, 0.0, 1.0], [1.2, 0.0, 1.0], [5.0, 0.0, 1.0]], lens)
+    assert np.isfinite(shown[0]).all()
+    assert np.isnan(shown[1:]).all(), "it would come back into the picture"
+    wide = Intrinsics(250.0, 250.0, 320.0, 240.0, (0.3, 0.1, 0.0, 0.0))
+    assert np.isfinite(project([[5.0, 0.0, 1.0]], wide)).all(), "this one has no fold"

@@ -6,7 +6,6 @@ its own ``SIM_`` parameters set; gyro, accelerometer, range finder and battery a
 
 from __future__ import annotations
 
-import select
 import socket
 import time
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from skyloop.autopilots.coupling import Commands, CoupledFirmware
 from skyloop.autopilots.ports import LOOPBACK, bound, free_udp_port, release_instance, reserve_instance
 from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
 from skyloop.errors import DecodeError
+from skyloop.files import wait_readable
 from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG
 from skyloop.sim.firmware import Readings
 from skyloop.wire.ardupilot_json import MAX_PACKET, SimulatedState, decode_servos, encode_state
@@ -145,7 +145,7 @@ class ArduCopter(CoupledFirmware):
         until_s = time.monotonic() + wait_s
         while (commands := self._read()) is None and self._socket is not None:
             left_s = until_s - time.monotonic()
-            if wait_s <= 0.0 or left_s <= 0.0 or not select.select([self._socket], [], [], left_s)[0]:
+            if wait_s <= 0.0 or left_s <= 0.0 or not wait_readable(self._socket, left_s):
                 break
         return commands
 

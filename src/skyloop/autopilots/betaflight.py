@@ -18,7 +18,8 @@ from skyloop.autopilots import apart
 from skyloop.autopilots.apart import Apart
 from skyloop.autopilots.coupling import Commands, CoupledFirmware
 from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
-from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
+from skyloop.autopilots.program import FirmwareEvent, Launch, StartedInVainError, find_program
+from skyloop.child_process import ChildProcess
 from skyloop.errors import DecodeError, UsageError
 from skyloop.sim.earth import geodetic
 from skyloop.sim.firmware import GpsFix, Readings
@@ -39,7 +40,7 @@ MAX_TEXT: Final = 4096
 
 #: The first switch arms, angle mode is always on, the third keeps it from being armed (PARALYZE). MSP is answered as
 #: fast as it is asked, and on a second port too. Without sticks it goes on level with a little less than the throttle
-#: that carries a racer, and lands by that after 3 s.
+#: that carries a racer, and lands by that after 2 s.
 SETTINGS: Final = (
     "serial UART2 1 115200 57600 0 115200",
     "aux 0 0 0 1700 2100 0 0",
@@ -47,13 +48,16 @@ SETTINGS: Final = (
     "aux 2 45 2 1700 2100 0 0",
     "set serial_update_rate_hz = 2000",
     "rxfail 3 s 1420",
-    "set failsafe_delay = 30",
+    "set failsafe_delay = 20",
     "set failsafe_procedure = AUTO-LAND",
     "set failsafe_throttle = 1420",
 )
 PROMPT: Final = b"\n# "
 SETTINGS_FILE: Final = "eeprom.bin"
 CONFIGURE_S: Final = 5.0
+#: For the first answer of a start. Healthy ones take 0.8 s; one in ten never answers, by a race between its threads.
+ANSWER_S: Final = 1.5
+LONGEST_ANSWER_S: Final = 6.0  #: as that is doubled with each start in vain, for a computer that is busy
 START_S: Final = 5.0  #: from the start of its process until its first motors, at most
 ATTEMPT_S: Final = 0.5
 _PAUSE_S: Final = 0.05
@@ -77,6 +81,7 @@ class Betaflight(CoupledFirmware):
         self._fix: GpsFix | None = None
         self._sent_s = 0.0
         self._begun_s = 0.0
+        self._patience_s = ANSWER_S
 
     @property
     def address(self) -> str:
@@ -128,7 +133,8 @@ class Betaflight(CoupledFirmware):
         firmware = self._launch().keep(folder, "configuring.log")
         saved = False
         try:
-            with connected(self._msp_port, b"#", PROMPT) as link:
+            firmware.stdout.readline()  # it runs from here on
+            with self._connected(b"#", PROMPT, firmware) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
                     if b"ERROR" in _read_until(link, PROMPT):
@@ -143,8 +149,8 @@ class Betaflight(CoupledFirmware):
             raise OSError("its settings could not be saved")
 
     def _verify(self) -> None:
-        """Ask it something on its serial port: one in twenty never listens there, by a race between its threads."""
-        with connected(self._msp_port, encode(Frame(Function.API_VERSION)), b"$M>"):
+        """Ask it something on its serial port."""
+        with self._connected(encode(Frame(Function.API_VERSION)), b"$M>"):
             pass
         time.sleep(_PAUSE_S)  # until it is ready for the next: it takes one
         if self._apart is not None:
@@ -153,6 +159,23 @@ class Betaflight(CoupledFirmware):
             self._motors = motors  # at once: the simulation's thread has it
             if before is not None:
                 before.close()
+
+    def _connected(self, words: bytes, answer: bytes, firmware: ChildProcess | None = None) -> socket.socket:
+        """Return :func:`connected`; one that is in vain gets more time the next time.
+
+        Raises:
+            StartedInVainError: It does not answer.
+            OSError: It has ended.
+        """
+        try:
+            link = connected(self._msp_port, words, answer, self._patience_s)
+        except OSError as error:
+            if firmware is not None and firmware.code is not None:
+                raise OSError(f"it {firmware.ending}{firmware.quoted_output}") from error
+            waited_s, self._patience_s = self._patience_s, min(2 * self._patience_s, LONGEST_ANSWER_S)
+            raise StartedInVainError(f"it did not answer within {waited_s:g} s of its start") from error
+        self._patience_s = ANSWER_S
+        return link
 
     def _begin(self) -> None:
         self._receive(0.0)  # what the process before may have sent last
@@ -207,20 +230,20 @@ class Betaflight(CoupledFirmware):
         self._sent_s = time.monotonic()
 
 
-def connected(port: int, words: bytes, answer: bytes) -> socket.socket:
+def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:
     """Return a connection to a serial port that is opened soon, once these words got an answer that has this in it.
 
     What comes before the port works is lost, or ends the connection: so it is tried again.
 
     Raises:
-        OSError: There is none within :data:`CONFIGURE_S`.
+        OSError: There is none within ``within_s`` [s].
     """
-    end_s = time.monotonic() + CONFIGURE_S
+    end_s = time.monotonic() + within_s
     while True:
         time.sleep(_PAUSE_S)
         link = None
         try:
-            link = socket.create_connection((LOOPBACK, port), ATTEMPT_S)
+            link = socket.create_connection((LOOPBACK, port), max(_PAUSE_S, min(ATTEMPT_S, end_s - time.monotonic())))
             link.sendall(words)
             _read_until(link, answer)
         except OSError:

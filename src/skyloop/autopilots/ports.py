@@ -51,13 +51,19 @@ def is_free(kind: socket.SocketKind, port: int) -> bool:
     return True
 
 
-def reserve_instance(firmware: str, most: int, ports: Callable[[int], Iterable[tuple[socket.SocketKind, int]]]) -> int:
-    """Return the first instance number whose ports are free, and reserve it within this process.
+def reserve_instance(
+    firmware: str,
+    most: int,
+    ports: Callable[[int], Iterable[tuple[socket.SocketKind, int]]],
+    runs: Callable[[int], bool] = lambda _: False,
+) -> int:
+    """Return the first instance number that is free, and reserve it within this process.
 
     Args:
         firmware: Its name.
         most: How many instances its ports allow on a computer.
         ports: The ports of an instance.
+        runs: Whether an instance runs that may not have opened its ports.
 
     Raises:
         UsageError: There is none.
@@ -66,7 +72,7 @@ def reserve_instance(firmware: str, most: int, ports: Callable[[int], Iterable[t
         for instance in range(most):
             if (firmware, instance) in _reserved:
                 continue
-            if all(is_free(kind, port) for kind, port in ports(instance)):
+            if all(is_free(kind, port) for kind, port in ports(instance)) and not runs(instance):
                 _reserved.add((firmware, instance))
                 return instance
     raise UsageError(f"no ports are free for another {firmware}: {most} at most fly on one computer; end one of them")

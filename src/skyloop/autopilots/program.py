@@ -24,6 +24,7 @@ from skyloop.errors import SkyloopError, UsageError
 RESTART_S: Final = 1.0  #: from the firmware's death to its next start; doubled each time that it dies soon
 LONGEST_RESTART_S: Final = 30.0
 SOON_S: Final = 10.0
+AT_ONCE: Final = 5  #: starts in vain in a row that are tried again without a pause
 LOG: Final = "firmware.log"
 _LAST_LINES: Final = 5
 _LAST_BYTES: Final = 2000
@@ -37,6 +38,11 @@ class FirmwareEventKind(StrEnum):
     SILENT = "silent"  #: it has not answered for a while, and the rotors stand
     DIED = "died"  #: its process ended; it is started again
     FAILED = "failed"  #: it could not be started; that is tried again
+    DEAF = "deaf"  #: its process ran and did not answer; another is started at once
+
+
+class StartedInVainError(OSError):
+    """Its process runs, and will never answer: it is ended, and started again at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +95,7 @@ class Program:
                 :class:`~skyloop.errors.SkyloopError` or ``OSError`` if it can't be started now.
             report: Called with each event, on a thread of this object.
             verify: Called when its process runs, before that is reported; raises ``OSError`` for one that was started
-                in vain: it is ended, and started again. None: none is.
+                in vain: it is ended, and started again; :class:`StartedInVainError`: at once. None: none is.
             folder: Where it runs and keeps its settings; None: a new one, which is removed at the end.
             restart_s: From its death to its next start [s].
         """
@@ -136,13 +142,20 @@ class Program:
 
     def _watch(self, folder: Path) -> None:
         pause_s = self._restart_s
+        in_vain = 0
         while not self._ending.is_set():
             begun_s = time.monotonic()
             try:
                 ended = self._run_once(folder)
+            except StartedInVainError as error:
+                self._report(FirmwareEvent(FirmwareEventKind.DEAF, f"{self.name} is started again: {error}"))
+                in_vain += 1
+                if in_vain <= AT_ONCE:
+                    continue
             except (SkyloopError, OSError) as error:
                 self._report(FirmwareEvent(FirmwareEventKind.FAILED, f"{self.name} can't be started: {error}"))
             else:
+                in_vain = 0
                 if not self._ending.is_set():
                     self._report(FirmwareEvent(FirmwareEventKind.DIED, f"{self.name} {ended}{_last_words(folder)}"))
             soon = time.monotonic() - begun_s < SOON_S
@@ -163,8 +176,12 @@ class Program:
                 raise UsageError(f"its process could not be started{child.quoted_output}")
             self.starts += 1
             self.pid = int(number)
-            if self._verify is not None:
-                self._verify()
+            try:
+                if self._verify is not None:
+                    self._verify()
+            except StartedInVainError:
+                if child.code is None:
+                    raise  # else it died, which is told with its output
             self._report(FirmwareEvent(FirmwareEventKind.STARTED, f"{self.name} runs as process {self.pid}"))
             child.wait()
             return _ending(child.code)
@@ -210,11 +227,8 @@ def find_program(variable: str, names: Sequence[str], what: str, where: str) -> 
 
 
 def _ending(code: int | None) -> str:
-    if code is not None and code > 128:
-        name = str(code - 128)
-        with suppress(ValueError):
-            name = signal.Signals(code - 128).name
-        return f"was killed by {name}"
+    with suppress(ValueError, TypeError):  # 255 and the like are a program's own, as -1 is
+        return f"was killed by {signal.Signals((code or 0) - 128).name}"
     return f"ended with exit code {code}"
 
 

@@ -7,9 +7,12 @@ https://docs.px4.io/main/en/simulation/#px4-mavlink-api
 
 from __future__ import annotations
 
+import fcntl
 import math
-import select
+import os
 import socket
+import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -18,6 +21,7 @@ from skyloop.autopilots.coupling import Commands, CoupledFirmware
 from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
 from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
 from skyloop.errors import UsageError
+from skyloop.files import wait_readable
 from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, geodetic
 from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.sim.rotor_parameters import InstrumentParameters
@@ -39,6 +43,7 @@ STEP_US: Final = 4000
 TRUTH_EVERY: Final = 5  #: of its steps
 RANGE_EVERY: Final = 10
 PROBE_EVERY: Final = 25  #: of its steps, while it is silent
+LOCK_FILE = "/tmp/px4_lock"
 MAX_BACKLOG: Final = 4096  #: bytes that wait to be sent; PX4 does not read any more then
 MAX_READ: Final = 65536
 #: What PX4 must know of this vehicle; and without a remote control it is to hold its place when set-points stop.
@@ -111,7 +116,7 @@ class Px4(CoupledFirmware):
         self._program = find_program(VARIABLE, ("px4",), self.NAME, WHERE)
         if not self._files().is_dir():
             raise UsageError(f"{self._program} has no {self._files()}: {VARIABLE} must be bin/px4 of a whole build")
-        self._instance = reserve_instance(self.NAME, MOST_INSTANCES, _ports)
+        self._instance = reserve_instance(self.NAME, MOST_INSTANCES, _ports, _runs)
         self._server = bound(socket.SOCK_STREAM, SIMULATOR_PORT + self._instance)
         self._server.listen(1)
         self._server.setblocking(False)
@@ -152,7 +157,7 @@ class Px4(CoupledFirmware):
             return None
         commands: Commands | None = None
         while (link := self._link) is not None:
-            if wait_s > 0.0 and commands is None and not select.select([link], [], [], wait_s)[0]:
+            if wait_s > 0.0 and commands is None and not wait_readable(link, wait_s):
                 break
             data = self._read(link)
             if not data:
@@ -317,6 +322,19 @@ def _commands(controls: list[float]) -> Commands | None:
 
 def _short(value: float) -> int:
     return max(-32768, min(32767, round(value)))
+
+
+def _runs(instance: int) -> bool:
+    """Return whether a PX4 has the lock of this instance: another one would end at once, whatever its ports are."""
+    if sys.platform != "linux":
+        return False
+    asked = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)  # struct flock: all of the file
+    try:
+        with Path(f"{LOCK_FILE}-{instance}").open("rb") as file:
+            answer = fcntl.fcntl(file, fcntl.F_GETLK, asked)
+    except OSError:
+        return False  # there is none
+    return int(struct.unpack("hhqqi", answer)[0]) != fcntl.F_UNLCK
 
 
 def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import select
 import signal
 import sys
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 from skyloop.errors import UnsupportedError, UsageError
+from skyloop.files import wait_readable
 from skyloop.messages import FlightState
 
 HOLD_S: Final = 0.6  #: how long a press moves its stick
@@ -312,4 +312,4 @@ class Keyboard:
         return self._tokens.feed(data)
 
     def _ready(self, within_s: float) -> bool:
-        return bool(select.select([self._fd], [], [], within_s)[0])
+        return wait_readable(self._fd, within_s)

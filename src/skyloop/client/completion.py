@@ -23,6 +23,7 @@ from skyloop.messages import (
     Feedback,
     FlightState,
     Land,
+    LinkState,
     Outcome,
     Position,
     Refusal,
@@ -112,6 +113,7 @@ class ActionWait:
         self._connection = connection
         self._problem: Exception | None = None
         self._why = ""  # it was not done yet, for people
+        self._why_link: LinkState | None = None  # the vehicle's link at that time, of which it may speak
         self._flew = False  # it was in the air meanwhile
         self._refused, self._refused_ns = 0, 0  # the newest intent of ours that was not possible yet, and since when
         self._asked_ns = state.scheduler.clock()
@@ -179,13 +181,14 @@ class ActionWait:
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
         told = self._commands.told
         if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
-            self._why = told.text  # nothing any more, once a repeat is carried out
+            self._note(told.text)  # nothing any more, once a repeat is carried out
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
             return None
         if outcome.reason is Refusal.UNSUPPORTED:
             return UnsupportedError(outcome.text)
-        self._why = self._why if outcome.fate in OUTDONE else outcome.text
+        if outcome.fate not in OUTDONE:
+            self._note(outcome.text)
         if type(self._action) is Takeoff:
             return self._why_no_takeoff(outcome)
         if type(self._action) is Land:
@@ -206,7 +209,8 @@ class ActionWait:
             if self._refused != self._intent:
                 self._refused, self._refused_ns = self._intent, now_ns
             # Its withdrawal shows as a landing at first, which would end another take-off.
-            stands = newest is not None and not newest.state.airborne
+            # One that still wakes up is asked again when it is awake: until then it can only refuse.
+            stands = newest is not None and not newest.state.airborne and not newest.waking_up
             if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
                 self._again()
             return None
@@ -232,7 +236,19 @@ class ActionWait:
         text = f"{self._action.name} was not completed within {timeout_s:g} s: the vehicle is {state}"
         if connection.state.value not in ("up", "degraded"):
             return f"{text}, and the link is {connection.state.value} ({connection.reason})"
-        return f"{text}; {self._why}" if self._why else text
+        if newest is not None and newest.vehicle_link not in (LinkState.UP, LinkState.DEGRADED):
+            return f"{text}, and its own link is {newest.vehicle_link.value} ({newest.link_reason})"
+        if newest is not None and newest.waking_up:
+            return f"{text}; it is {newest.link_reason}"
+        return f"{text}; {self._why}" if self._why and self._why_link is self._vehicle_link else text
+
+    def _note(self, why: str) -> None:
+        if self._why != why:
+            self._why, self._why_link = why, self._vehicle_link
+
+    @property
+    def _vehicle_link(self) -> LinkState | None:
+        return None if self._state.newest is None else self._state.newest.vehicle_link
 
 
 def _refused(outcome: Outcome) -> RefusedError:

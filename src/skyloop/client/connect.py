@@ -101,7 +101,9 @@ def connect(
 ) -> Drone:
     """Connect to a drone.
 
-    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded.
+    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. A vehicle that was
+    started just now is waited for until it can take off, and the log (``skyloop``) says so; after ``timeout_s`` the
+    call returns all the same, and :meth:`Drone.takeoff` goes on waiting.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.

@@ -72,6 +72,7 @@ OTHERS_S: Final = 1.0  #: within which feedback says who took a vehicle whose la
 RETURN_S: Final = 180.0  #: how long a return that the proxy began is waited for
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _SINKING: Final = (*_ENDED_IN, FlightState.LANDING)
+_SOON_S: Final = 1.0  #: a vehicle that still wakes up then is waited for audibly
 _log = logging.getLogger("skyloop")
 
 
@@ -204,7 +205,8 @@ class DroneCore:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone if anything fails.
 
         Args:
-            timeout_s: Time for the proxy to answer and to send its first feedback [s].
+            timeout_s: Time for the proxy to answer, to send its first feedback and, as a pilot, for the vehicle to
+                wake up [s].
             authority: How a pilot asks for the authority; None: ``Authority()``.
             acquire: Whether a pilot asks for the authority now; if False it does so when it wants.
             wait_for_state: Whether to wait for feedback.
@@ -227,6 +229,8 @@ class DroneCore:
                 self.commands.request(
                     authority_request(asked.priority, asked.for_s, asked.takeover), asked.wait_s, stay=asked.stay
                 )
+                if wait_for_state and not self.state.scheduler.in_step:
+                    self._wait_until_awake(deadline)
             self.state.scheduler.opened()
         except BaseException:
             self.close()
@@ -397,6 +401,18 @@ class DroneCore:
     def _known(self) -> bool:
         """Whether feedback has come and the link's state was judged."""
         return self.state.newest is not None and self.state.status.application is not LinkState.CONNECTING
+
+    def _wait_until_awake(self, deadline_s: float) -> None:
+        """Wait while the vehicle wakes up, as long as there is time; what it waits for goes to the log."""
+        if self.state.notifier.wait_for(lambda: not self._why_asleep(), min(_SOON_S, deadline_s - time.monotonic())):
+            return
+        _log.warning("%s is %s; waiting for it", self.name, self._why_asleep())
+        if not self.state.notifier.wait_for(lambda: not self._why_asleep(), deadline_s - time.monotonic()):
+            _log.warning("%s is %s: it can't take off yet", self.name, self._why_asleep())
+
+    def _why_asleep(self) -> str:
+        newest = self.state.newest
+        return newest.link_reason if newest is not None and newest.waking_up and not self.closed else ""
 
     def _is_down(self) -> bool:
         newest = self.state.newest

@@ -96,6 +96,7 @@ from skyloop.transport.base import Dialer
 T = TypeVar("T")
 EVENT_DEPTH: Final = 256  #: how many events, log entries and the like wait for a slow callback
 WHOLE_S: Final = 1.0  #: for every field of feedback to come, where less had been asked for
+_LOOK_S: Final = 0.5  #: how often who waits for a frame looks whether its camera is still there
 _log = logging.getLogger("skyloop")
 
 
@@ -668,16 +669,19 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
-        channel = self._core.channel(camera)
-        channel.keep()
-        self._core.check_may_wait()
         deadline = time.monotonic() + timeout_s
-        while channel.notifier.wait_for(lambda: channel.unread or self._core.closed, deadline - time.monotonic()):
-            self._core.check_open()
-            frame = channel.read()
-            if frame is not None:
-                return frame
-        raise self._core.no_frame(channel.camera.name, timeout_s)
+        while True:
+            channel = self._core.channel(camera)  # anew: the proxy may have been started again with another camera
+            channel.keep()
+            self._core.check_may_wait()
+            left_s = min(_LOOK_S, deadline - time.monotonic())
+            while channel.notifier.wait_for(lambda: channel.unread or self._core.closed, left_s):  # noqa: B023
+                self._core.check_open()
+                frame = channel.read()
+                if frame is not None:
+                    return frame
+            if time.monotonic() >= deadline:
+                raise self._core.no_frame(channel.camera.name, timeout_s)
 
     def frames(
         self,
@@ -708,19 +712,25 @@ class Drone:
             ClosedError: If the drone was closed before.
         """
         channel = self._core.channel(camera, **how)
-        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._core.sample_notifier())
         self._core.check_may_wait()
         max_age_s, deadline = how.get("max_age_s"), time.monotonic() + timeout_s
-        with self._core.closing(mailbox), channel.into(mailbox):
-            while not self._core.closed:
-                arrival = mailbox.wait(max(0.0, deadline - time.monotonic()))
-                if arrival is not None:
-                    frame = channel.picture(arrival, max_age_s)
-                    if frame is not None:
-                        yield frame
-                        deadline = time.monotonic() + timeout_s
-                elif not mailbox.closed:
-                    raise self._core.no_frame(channel.camera.name, timeout_s)
+        while not self._core.closed:
+            mailbox: Mailbox[Arrival] = Mailbox(notifier=self._core.sample_notifier())
+            with self._core.closing(mailbox), channel.into(mailbox):
+                while not self._core.closed:
+                    arrival = mailbox.wait(max(0.0, min(_LOOK_S, deadline - time.monotonic())))
+                    if arrival is not None:
+                        frame = channel.picture(arrival, max_age_s)
+                        if frame is not None:
+                            yield frame
+                            deadline = time.monotonic() + timeout_s
+                    elif mailbox.closed:
+                        continue
+                    elif time.monotonic() >= deadline:
+                        raise self._core.no_frame(channel.camera.name, timeout_s)
+                    elif (now := self._core.channel(camera, **how)) is not channel:
+                        channel = now  # the proxy was started again with another camera
+                        break
 
     def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
         """Wait until the newest feedback is as wanted.

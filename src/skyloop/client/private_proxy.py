@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 import re
-import select
 import sys
 import threading
 import time
@@ -17,6 +16,7 @@ from skyloop.address import shown_address
 from skyloop.child_process import GRACE_S, ChildProcess
 from skyloop.client.connection import Scheduler
 from skyloop.errors import LinkError, NoAnswerError, UsageError
+from skyloop.files import wait_readable
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient
 
 _USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address; it prints why in one line
@@ -103,6 +103,5 @@ class PrivateProxy:
     def _wait_for_output(self) -> None:
         """Sleep until the child prints something (that it is ready), ends, or a moment has passed."""
         stdout = self._process.stdout
-        readable, _, _ = select.select([stdout], [], [], _LOOK_S)
-        if readable and not os.read(stdout.fileno(), 4096):
+        if wait_readable(stdout, _LOOK_S) and not os.read(stdout.fileno(), 4096):
             time.sleep(0.005)  # it closed its output and is about to end

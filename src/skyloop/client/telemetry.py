@@ -307,6 +307,8 @@ class Receiver:
         now_ns = self._clock()
         for channel in state.variants.values():
             channel.restart(now_ns)
+        for gone in state.channels.keys() - {camera.name for camera in welcome.capabilities.cameras}:
+            del state.channels[gone]  # the proxy was started again, with other cameras
         for camera in welcome.capabilities.cameras:
             if camera.name not in state.channels:
                 state.channels[camera.name] = state.video(camera)
@@ -364,11 +366,16 @@ class Receiver:
         counter.add(now_ns + offset_ns - sample.published_ns, sample.captured_ns - offset_ns, now_ns)
         if not changed:
             self._commands.feedback(sample, now_ns)
-        if sample.vehicle_link is not state.status.vehicle or (
-            sample.link_reason
-            and (sample.link_reason, sample.link_remedy) != (state.status.reason, state.status.remedy)
+        awake = before is not None and before.waking_up and not sample.waking_up
+        if (
+            sample.vehicle_link is not state.status.vehicle
+            or awake
+            or (
+                sample.link_reason
+                and (sample.link_reason, sample.link_remedy) != (state.status.reason, state.status.remedy)
+            )
         ):
-            reason = sample.link_reason or state.vehicle_reason()
+            reason = sample.link_reason or ("" if awake else state.vehicle_reason())
             status = replace(state.status, vehicle=sample.vehicle_link, reason=reason, remedy=sample.link_remedy)
             state.set_status(status)
 

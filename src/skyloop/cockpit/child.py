@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import sys
 import time
 import urllib.request
@@ -14,6 +13,7 @@ from typing import Any, Self
 
 from skyloop.child_process import ChildProcess
 from skyloop.errors import LinkError
+from skyloop.files import wait_readable
 
 _ASK_S = 2.0
 
@@ -55,7 +55,7 @@ class CockpitProcess:
         deadline = time.monotonic() + timeout_s
         line = b""
         while self._address is None:
-            ready, _, _ = select.select([self._process.stdout], [], [], max(0.0, deadline - time.monotonic()))
+            ready = wait_readable(self._process.stdout, max(0.0, deadline - time.monotonic()))
             more = os.read(self._process.stdout.fileno(), 4096) if ready else b""
             if not more:
                 raise LinkError(f"the cockpit did not start: {self._complaint()}")

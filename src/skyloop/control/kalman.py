@@ -19,6 +19,8 @@ from skyloop.control.limiting import within
 from skyloop.errors import UsageError
 
 Array = NDArray[np.float64]
+#: Added to the spread of an innovation, so that what is known all but exactly can be divided by.
+_EXACT_M2, _ROUNDING = 1e-18, 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,12 +128,10 @@ class ConstantVelocityFilter:
         n, before = self._n, self.at(at_ns)
         innovation = measured - before.position
         spread = before.covariance[:n, :n] + noise
-        try:
-            distance = math.sqrt(float(innovation @ np.linalg.solve(spread, innovation)))
-        except np.linalg.LinAlgError:
-            raise UsageError(
-                "a measurement without deviation, of a point that is known exactly, adds no information"
-            ) from None
+        if not spread.any():
+            raise UsageError("a measurement without deviation, of a point that is known exactly, adds no information")
+        spread = (spread + spread.T) / 2 + np.eye(n) * max(_EXACT_M2, _ROUNDING * float(np.abs(spread).max()))
+        distance = math.sqrt(max(0.0, float(innovation @ np.linalg.solve(spread, innovation))))
         if distance > self._gate:
             self.refused += 1
             return False
@@ -141,7 +141,7 @@ class ConstantVelocityFilter:
         keep = np.eye(2 * n)
         keep[:, :n] -= share
         covariance = keep @ before.covariance @ keep.T + share @ noise @ share.T
-        self._estimate = Estimate(at_ns, state[:n], state[n:], covariance)
+        self._estimate = Estimate(at_ns, state[:n], state[n:], (covariance + covariance.T) / 2)
         return True
 
     def at(self, at_ns: int, *, longest_s: float = math.inf) -> Estimate:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import select
 import socket
 import time
 from abc import ABC, abstractmethod
@@ -15,6 +14,7 @@ from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.errors import MissingExtraError
+from skyloop.files import wait_readable
 
 CONNECT_S: Final = 1.0
 STUCK_NS: Final = nanoseconds(0.5)  #: a connection that has no room for so long is no longer read
@@ -205,9 +205,11 @@ class SerialStream(ByteStream):
         Raises:
             OSError: It was unplugged.
         """
-        if not select.select([self], [], [], 0)[0]:
+        if not wait_readable(self, 0.0):
             return b""
-        data: bytes = self._port.read(_MOST)  # raises SerialException, an OSError, once it is unplugged
+        data = os.read(self.fileno(), _MOST)  # pyserial's own waits by select.select, which knows low numbers only
+        if not data:
+            raise ConnectionError("the port was unplugged, or another program reads it")
         return data
 
     def _write(self, data: bytes) -> int:

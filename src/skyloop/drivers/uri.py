@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import math
 import re
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ from urllib.parse import parse_qsl, unquote
 from skyloop.address import HIDDEN, is_broken, shown_address, shown_name, without_secrets
 from skyloop.errors import UsageError
 
+_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
 
@@ -155,6 +157,25 @@ class VehicleUri:
         if given.lower() not in meanings:
             raise UsageError(f"{self}: option {option} is {given!r} and must be true or false")
         return meanings[given.lower()]
+
+
+def host_and_port(text: str) -> tuple[str, int] | None:
+    """Return a host and its port; None for anything else.
+
+    Args:
+        text: Such as ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` or ``[fe80::1%eth0]:14550``: an
+            address of IPv6 stands in brackets, which are not part of the host.
+    """
+    host, _, port = text.rpartition(":")
+    if not port.isdecimal() or not 1 <= int(port) <= 65_535:
+        return None
+    if _HOST.match(host):
+        return host, int(port)
+    try:
+        known = ipaddress.IPv6Address(host[1:-1]) if host.startswith("[") and host.endswith("]") else None
+    except ValueError:
+        return None
+    return None if known is None else (host[1:-1], int(port))
 
 
 def parse_uri(text: str) -> VehicleUri:

@@ -83,10 +83,10 @@ class Reaching:
 
     def restart(self, which: Bools, rng: np.random.Generator) -> None:
         """Another start and another goal for these drones."""
+        self.age[which] = 0  # before they are placed: of a task that moves its goals that depends on the age
         for drone in np.flatnonzero(which):
             start, heading = self._place(int(drone), rng)
             self.arena.put(int(drone), start, heading)
-        self.age[which] = 0
         self._before[which] = 0.0
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
@@ -174,9 +174,7 @@ class Following(Reaching):
     def _place(self, drone: int, rng: np.random.Generator) -> tuple[Floats, float]:
         self._phases[drone] = rng.uniform(-math.pi, math.pi, 3)
         self._rates[drone] = rng.uniform(0.5, 1.0, 3) * _WALK_RAD_S * rng.choice([-1.0, 1.0], 3)
-        ages = self.age.copy()
-        ages[drone] = 0
-        self._walk(ages)
+        self._walk(self.age)
         target = self.goals[drone]
         bearing = math.atan2(-target[1], -target[0]) + float(rng.uniform(-0.8, 0.8))  # starts on the side of the middle
         away = float(rng.uniform(1.2, 2.2))

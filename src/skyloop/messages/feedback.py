@@ -21,6 +21,9 @@ Vector = tuple[Finite, Finite, Finite]
 MAX_LINK_TEXT = 300  #: characters of a text about the link to the vehicle
 LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
 
+#: How the reason of a link begins whose vehicle still wakes up: it is connecting or up, and can't take off yet.
+WAKING_UP = "still waking up"
+
 NO_POSITION = "the vehicle does not report its position"
 #: What lets a vehicle know its position, for people who read the line above.
 POSITION_SOURCES = (
@@ -62,13 +65,18 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     owner_priority: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None  #: 0 is the highest
     lease: Count = 0  #: number of the lease in force; 0 for none
     failsafe: Failsafe = Failsafe.NONE
-    link_reason: LinkText = ""  #: why the hop proxy–vehicle is as it is; empty while it is up
+    link_reason: LinkText = ""  #: why the hop proxy–vehicle is as it is; while it is up: see :attr:`waking_up`
     link_remedy: LinkText = ""  #: what a person can do about it
     others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
     start_position_m: Vector | None = None  #: where it took off last, in world axes [m]; None: that is not known
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far it is on its way back there
     skipped: Count = 0  #: samples before this one that the proxy left out, as the subscriber asked for fewer
     outcome: Outcome | None = None  #: what became of the newest intent; None: a proxy that does not tell
+
+    @property
+    def waking_up(self) -> bool:
+        """Whether the vehicle was started just now and can't take off yet; ``link_reason`` says what it waits for."""
+        return self.link_reason.startswith(WAKING_UP)
 
     @property
     def origin(self) -> EarthOrigin | None:

@@ -29,7 +29,7 @@ class VehicleOverview(msgspec.Struct, frozen=True, array_like=True, kw_only=True
     altitude_m: Finite | None = None  #: height above the ground below [m]
     yaw_rad: Finite | None = None  #: counter-clockwise from x [rad]
     vehicle_link: LinkState = LinkState.CONNECTING  #: the hop proxy–vehicle
-    link_reason: LinkText = ""  #: why it is as it is; empty while it is up
+    link_reason: LinkText = ""  #: why it is as it is; while it is up, what a vehicle waits for that still wakes up
     link_remedy: LinkText = ""  #: what a person can do about it
     owner: str | None = None  #: name of the application that holds the authority
     owner_priority: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None  #: 0 is the highest

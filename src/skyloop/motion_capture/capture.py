@@ -128,7 +128,7 @@ class MotionCapture:
             return
         self._ended.set()
         self._source.close()
-        if self._watch.ident is not None:
+        if self._watch.ident is not None and self._watch is not threading.current_thread():  # of an inline callback
             self._watch.join()
         for listener in list(self._listeners):
             listener.cancel()
@@ -155,7 +155,7 @@ class MotionCapture:
         """
         track = self._track(name)
         with self._changed:
-            track.look(monotonic_ns())  # the watching thread may be late
+            track.look(monotonic_ns() - self.latency_ns)  # the watching thread may be late
             return track.pose
 
     def state(self, name: str) -> TrackState:
@@ -344,7 +344,7 @@ class MotionCapture:
         while not self._ended.wait(LOOK_S):
             for track in self._tracks.values():
                 with self._changed:
-                    track.look(monotonic_ns())
+                    track.look(monotonic_ns() - self.latency_ns)  # a pose that comes now is as old as that
                 self._report(track)
 
     def _report(self, track: Track) -> None:

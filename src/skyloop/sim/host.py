@@ -83,6 +83,7 @@ class SimHost:
             charge=self.options.battery,
             wind=self.wind,
         )
+        self.stepping = threading.Lock()  #: held by the thread that steps the world: one that ends may be in a step
         self._lock = threading.Lock()
         self._observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}  # replaced as a whole, never changed
         self._stepper: Stepper | None = None
@@ -241,10 +242,6 @@ class _RealTimeStepper:
     def __init__(self, host: SimHost) -> None:
         self._host = host
         self._simulation = host.simulation
-        options = host.options
-        self._pacer = Pacer(self._simulation.step, speed=options.speed, most_lag_s=options.most_lag_s)
-        self._slowness = SlownessWatch(monotonic_ns())
-        self._begun_s = self._simulation.time_s
         self._publisher = ReportPublisher(host, self._start_pipeline)
         self._stop = threading.Event()
         self._publishing = threading.Lock()
@@ -266,8 +263,16 @@ class _RealTimeStepper:
             self._publisher.pipeline.forget(cameras)
 
     def _run(self) -> None:
+        with self._host.stepping:
+            self._step_on()
+
+    def _step_on(self) -> None:
+        options = self._host.options
+        self._pacer = Pacer(self._simulation.step, speed=options.speed, most_lag_s=options.most_lag_s)
+        self._slowness = SlownessWatch(monotonic_ns())
+        self._begun_s = self._simulation.time_s
         try:
-            least_s = STEP_S if self._host.options.autopilot is not None else TICK_S  # firmware needs even steps
+            least_s = STEP_S if options.autopilot is not None else TICK_S  # firmware needs even steps
             while not self._stop.wait(max(self._pacer.run_due(), least_s)):
                 with self._publishing:
                     self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))

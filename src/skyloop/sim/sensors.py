@@ -88,6 +88,12 @@ class Sensors:
         np.add(self._estimate, self._bias[9:], out=self._estimate)
         np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
 
+    def put(self, drone: int) -> None:
+        """Measure a drone that was moved and is at rest: its last estimate was of another place."""
+        height = self._bodies.position[2, drone] - self._half_height[drone]
+        self._estimate[:, drone] = self._bias[9:, drone]
+        self._estimate[0, drone] += height
+
     def inertial(self, step: int) -> Floats:
         """Return the inertial sensors' values at the end of a step, shape (9, n).
 

@@ -282,6 +282,7 @@ class Simulation:
                 raise UsageError(f"drone {drone} is {self._autopilot.states[drone]}: only one that flies can be put")
             self._bodies.put(drone, place, wrap_angle(yaw_rad), GRAVITY_M_S2)
             self._collisions.moved(drone)
+            self._sensors.put(drone)
             altitude = position_m[2] - self.parameters[drone].half_height_m
             self._autopilot.hover_here(drone, altitude, self.time_s)
 

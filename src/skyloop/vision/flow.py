@@ -92,6 +92,8 @@ class GroundTracker:
         ):
             self.forget()
             return None
+        if self._grey is not None and self._grey.shape != grey.shape:
+            self.forget()  # another size: its corners are elsewhere
         began = self._grey is None
         self._track(grey)
         below, good = self._below(self._corners, at_capture, intrinsics)

@@ -20,6 +20,8 @@ from skyloop.vision.opencv import opencv
 Array = NDArray[np.float64]
 _WIDEST = 1e-9  # z over distance below this: beside or behind the camera
 _STEEPEST = 3.0  # x/z, 72°: an ideal camera that saw more would show little else than its edges
+_DISTANCES = np.linspace(0.0, 20.0, 20_001)  # of x/z, at which a distortion is looked at
+_RETURN_PX = 0.01
 _ITERATIONS = (40, 1e-10)  # of the inverse of a distortion
 
 
@@ -32,7 +34,7 @@ def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
 
     Returns:
         Pixels (n, 2); NaN for points that the model can't show: beside or behind a pinhole, or beyond the angle at
-        which a fisheye's polynomial turns back.
+        which the polynomial of the lens turns back.
 
     Raises:
         UsageError: The shape is another one, or the model is unknown.
@@ -47,6 +49,8 @@ def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
         seen = given[before].reshape(-1, 1, 3)
         found, _ = cv.projectPoints(seen, none, none, intrinsics.matrix, _distortion(intrinsics))
         pixels[before] = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+        flat = given[:, :2] / np.where(before, given[:, 2], np.nan)[:, None]
+        pixels[np.hypot(flat[:, 0], flat[:, 1]) > _fold(intrinsics.distortion)] = np.nan
     return pixels
 
 
@@ -162,7 +166,23 @@ def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
         flat = cv.undistortPointsIter(given, matrix, distortion, None, None, criteria)
     else:
         flat = cv.undistortPoints(given, matrix, distortion, criteria=criteria)
-    return np.asarray(flat, dtype=np.float64).reshape(-1, 2)
+    found = np.asarray(flat, dtype=np.float64).reshape(-1, 2)
+    # Beyond the fold of a lens the iteration ends anywhere: what does not come back was not seen there.
+    back = project(np.column_stack([found, np.ones(len(found))]), intrinsics)
+    found[~(np.abs(back - pixels).max(axis=1) < _RETURN_PX)] = np.nan
+    return found
+
+
+@lru_cache(maxsize=64)
+def _fold(distortion: tuple[float, ...]) -> float:
+    """Return the distance from the axis, for f = 1, from which on a pinhole's distortion brings pixels back."""
+    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * 8)[:8]
+    if not any(distortion):
+        return np.inf
+    square = _DISTANCES**2
+    above, below = 1 + square * (k1 + square * (k2 + square * k3)), 1 + square * (k4 + square * (k5 + square * k6))
+    steps = np.diff(_DISTANCES * above / below)
+    return float(_DISTANCES[np.argmax(steps <= 0.0)]) if (steps <= 0.0).any() else np.inf
 
 
 def _bent(points: Array, intrinsics: Intrinsics) -> Array:

@@ -1,6 +1,7 @@
 """Stands in for Betaflight's program: its command line, its motors and its state, without anything that flies.
 
 STANDIN_PORTS in the environment: its ports for motors, state and MSP. Its motors are those of the other stand-ins.
+STANDIN_DEAF: a folder. A start that finds a file in it removes one, and listens without ever answering.
 """
 
 import os
@@ -39,6 +40,10 @@ def command_line() -> None:
 
 
 time.sleep(0.2)
+for deaf in Path(os.environ.get("STANDIN_DEAF", os.devnull)).glob("*"):
+    deaf.unlink()
+    deaf_server = socket.create_server(("127.0.0.1", msp_port))
+    time.sleep(600)
 threading.Thread(target=command_line, daemon=True).start()
 link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 link.bind(("127.0.0.1", state_port))

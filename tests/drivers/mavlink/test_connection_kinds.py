@@ -9,12 +9,14 @@ import sys
 import tty
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 
 import pytest
 
 from skyloop.drivers.mavlink.link import MavlinkConnection, SerialPort, open_connection
-from skyloop.drivers.mavlink.options import Address, ConnectionKind
+from skyloop.drivers.mavlink.options import Address, ConnectionKind, options_of
 from skyloop.drivers.mavlink.protocol import Packet
+from skyloop.drivers.uri import parse_uri
 from skyloop.errors import MissingExtraError
 from skyloop.transport.testing import wait_until
 
@@ -46,6 +48,44 @@ def line() -> Iterator[tuple[int, str]]:
     yield far, os.ttyname(near)
     os.close(near)
     os.close(far)
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="there is no IPv6 here")
+@pytest.mark.parametrize(("family", "local"), [(socket.AF_INET6, "::1"), (socket.AF_INET, LOCAL)])
+def test_a_port_of_ipv6_hears_and_answers_vehicles_of_both_kinds(family: int, local: str) -> None:
+    address = options_of(parse_uri("mavlink://udpin:[::]:14550")).address
+    assert str(address) == "udpin:[::]:14550"
+    try:
+        ours = open_connection(replace(address, number=0))
+    except OSError as error:
+        pytest.skip(f"there is no IPv6 here: {error}")
+    with closing(ours), socket.socket(family, socket.SOCK_DGRAM) as vehicle:
+        with socket.socket(fileno=os.dup(ours.fileno())) as same:
+            port = same.getsockname()[1]
+        vehicle.bind((local, 0))
+        vehicle.sendto(b"heartbeat", (local, port))
+        assert select.select([ours], [], [], 5.0)[0]
+        [(data, peer)] = ours.receive()
+        assert (data, peer) == (b"heartbeat", (local, vehicle.getsockname()[1]))
+        ours.send(Packet(b"answer", peer))
+        vehicle.settimeout(5.0)
+        assert vehicle.recv(100) == b"answer"
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="there is no IPv6 here")
+def test_one_that_speaks_first_reaches_a_host_of_ipv6() -> None:
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as vehicle:
+        try:
+            vehicle.bind(("::1", 0))
+        except OSError as error:
+            pytest.skip(f"there is no IPv6 here: {error}")
+        vehicle.settimeout(5.0)
+        with closing(open_connection(Address(ConnectionKind.UDP_OUT, "::1", vehicle.getsockname()[1]))) as ours:
+            ours.send(Packet(b"first", None))
+            data, source = vehicle.recvfrom(100)
+            assert data == b"first"
+            vehicle.sendto(b"answer", source)
+            assert came(ours) == b"answer"
 
 
 def test_a_port_that_listens_answers_whom_it_heard() -> None:

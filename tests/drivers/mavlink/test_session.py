@@ -254,6 +254,52 @@ def test_texts_and_health_become_events() -> None:
     assert "the vehicle knows where it is" in told
 
 
+def test_an_autopilot_of_another_component_is_named_and_can_be_chosen() -> None:
+    vehicle = Vehicle(ARDUPILOT)
+    vehicle.codec = Codec(1, 42)
+    bench = Bench(vehicle)
+    for _ in range(3):
+        bench.hear(vehicle.heartbeat())
+    assert [event.text for event in bench.sink.events] == [
+        "an autopilot answers as component 42 of system 1, not as component 1: it is ignored; ?component=42 chooses it"
+    ]
+    given = Bench(vehicle, options("mavlink://udpin:127.0.0.1:14540?parameters=no&component=42")).found()
+    assert given.sink.link_state is LinkState.UP
+    given.go_on(1.1)
+    assert {each.target_component for each in given.heard_of("COMMAND_LONG")} == {42}
+
+
+def test_one_that_still_wakes_up_says_so_once() -> None:
+    """A real ArduCopter can't be armed for 42 s after its start: there were two events a second."""
+    vehicle = Vehicle(ARDUPILOT)
+    vehicle.ready = False
+    bench = Bench(vehicle).found()
+    assert bench.sink.links[-1] == (LinkState.UP, "still waking up: its own checks before arming do not pass yet")
+    links, events = len(bench.sink.links), len(bench.sink.events)
+    for _ in range(10):
+        bench.go_on(0.5)
+        bench.hear(*chunks_of("PreArm: Waiting for Nav Checks", 2, 0))
+        with pytest.raises(DriverError, match="the vehicle is still waking up"):
+            bench.session.command(Takeoff(), bench.clock())
+    assert len(bench.sink.links) == links
+    assert [event.text for event in list(bench.sink.events)[events:]] == ["PreArm: Waiting for Nav Checks"]
+    vehicle.ready = True
+    bench.go_on(0.1)
+    assert bench.sink.links[-1] == (LinkState.UP, "")
+    vehicle.ready = False  # it was awake: this is something else
+    bench.go_on(0.5)
+    bench.hear(*chunks_of("PreArm: Compass not healthy", 2, 0), *chunks_of("PreArm: Compass not healthy", 2, 0))
+    assert bench.sink.links[-1] == (LinkState.UP, "")
+    assert [event.text for event in bench.sink.events].count("PreArm: Compass not healthy") == 2
+
+
+def test_one_that_was_started_long_ago_and_can_not_be_armed_does_not_wake_up() -> None:
+    vehicle = Vehicle(ARDUPILOT)
+    vehicle.ready, vehicle.boot_ms = False, 3_600_000
+    bench = Bench(vehicle).found()
+    assert bench.sink.links[-1] == (LinkState.UP, "")
+
+
 def test_a_plane_is_seen_and_the_whole_recording_is_taken() -> None:
     data, at, frames = recorded("mavlink/arduplane-flight.tlog").read_bytes(), 0, 0
     session, sink = MavlinkSession(options(), 0), RecordingSink()

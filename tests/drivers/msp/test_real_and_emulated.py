@@ -99,6 +99,25 @@ class Line:
         self._socket.close()
 
 
+#: What Betaflight 4.6.0's own simulation answers of the requests without arguments that only read.
+ANSWERED: Final = (
+    *(1, 2, 3, 4, 5, 32, 34, 36, 38, 40, 42, 44, 50, 52, 54, 56, 58, 64, 70, 75, 79, 80, 82, 90, 92, 94, 96),
+    *(101, 102, 104, 105, 108, 109, 110, 111, 112, 116, 117, 119, 124, 125, 126, 128, 129, 130, 131, 133, 139, 140),
+    *(142, 143, 144, 145, 150, 160, 187, 238, 240),
+)
+
+
+def test_what_a_configurator_asks_is_answered(vehicle: Vehicle) -> None:
+    """The emulated one refused 40 of these requests."""
+    line = Line(vehicle)
+    try:
+        lengths = {function: len(line.ask(function)) for function in ANSWERED}
+    finally:
+        line.close()
+    assert [function for function, length in lengths.items() if not length] == []
+    assert (lengths[70], lengths[112], lengths[92]) == (13, 15, 49)
+
+
 def test_what_the_driver_relies_on(vehicle: Vehicle) -> None:
     driver, sink = MspDriver(parse_uri(vehicle.address)), RecordingSink()
     driver.open(sink)

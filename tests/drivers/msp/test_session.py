@@ -495,3 +495,18 @@ def test_a_climb_that_is_lost_before_the_lift_off_ends_the_take_off() -> None:
     bench.poses = False
     bench.until(lambda: bool(bench.texts("no_takeoff")), 2.0)
     assert "no longer measured" in bench.texts("no_takeoff")[0]
+
+
+def test_one_that_was_started_just_now_says_what_it_waits_for() -> None:
+    """``connect()`` returned seconds before it could be armed, and nothing said so."""
+    bench = Bench(BoardSettings(boot_s=5.0))
+    bench.until(lambda: bench.sink.newest is not None, 2.0)
+    state, reason = bench.sink.links[-1]
+    assert state is LinkState.UP
+    assert reason.startswith("still waking up: the flight controller can't be armed yet (")
+    told = len(bench.sink.links)
+    bench.until(lambda: bench.sink.links[-1] == (LinkState.UP, ""), 6.0)
+    assert len(bench.sink.links) == told + 1
+    stays = Bench(BoardSettings(boot_s=5.0, flags=bit("MSP")))
+    stays.until(lambda: stays.sink.newest is not None, 2.0)
+    assert stays.sink.links[-1] == (LinkState.UP, ""), "what keeps it from being armed does not pass by itself"

@@ -83,8 +83,81 @@ def test_home_is_where_somebody_puts_it_and_heights_are_above_it(kind: Kind) -> 
     assert it.autopilot.home == pytest.approx((0, 0, 0), abs=0.1)
 
 
-@BOTH
-def test_no_mission_is_taken_and_none_is_there(kind: Kind) -> None:
+def test_an_arducopter_keeps_a_mission_whose_first_item_is_home() -> None:
+    """DroneKit's documented ``cmds.download(); cmds.wait_ready()`` waited for item 0 in vain."""
+    it = ready(Kind.ARDUCOPTER)
+    assert answered(it, m.MAVLink_mission_request_list_message(1, 1), "MISSION_COUNT").count == 1
+    home = answered(it, m.MAVLink_mission_request_message(1, 1, 0), "MISSION_ITEM")
+    assert (home.seq, home.frame, home.command, home.z) == (0, 0, 16, pytest.approx(HOME_M))
+    exact = answered(it, m.MAVLink_mission_request_int_message(1, 1, 0), "MISSION_ITEM_INT")
+    assert (exact.x, exact.y) == geodetic((0.0, 0.0, 0.0))[:2]
+    assert it.command(m.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, -35.0, 149.0, 600.0) == 0
+    moved = answered(it, m.MAVLink_mission_request_message(1, 1, 0), "MISSION_ITEM")
+    assert (moved.x, moved.y, moved.z) == (-35.0, 149.0, 600.0)
+
+    assert answered(it, m.MAVLink_mission_count_message(1, 1, 3), "MISSION_REQUEST").seq == 0
+    for n in range(3):
+        item = m.MAVLink_mission_item_int_message(1, 1, n, 3, 16, 0, 1, n, 0, 0, 0, 470000000 + n, 85000000, 10.0 * n)
+        if n == 1:
+            wrong = m.MAVLink_mission_item_int_message(1, 1, 2, 3, 16, 0, 1, 0, 0, 0, 0, 0, 0, 0)
+            assert answered(it, wrong, "MISSION_ACK").type == 13, "out of sequence"
+        if n < 2:
+            assert answered(it, item, "MISSION_REQUEST").seq == n + 1
+        else:
+            assert answered(it, item, "MISSION_ACK").type == 0
+    assert answered(it, m.MAVLink_mission_request_list_message(1, 1), "MISSION_COUNT").count == 3
+    last = answered(it, m.MAVLink_mission_request_int_message(1, 1, 2), "MISSION_ITEM_INT")
+    assert (last.x, last.z, last.param1, last.frame) == (470000002, 20.0, 2.0, 3)
+    assert answered(it, m.MAVLink_mission_request_message(1, 1, 0), "MISSION_ITEM").x == -35.0, "home is home"
+    assert answered(it, m.MAVLink_mission_set_current_message(1, 1, 2), "MISSION_CURRENT").seq == 2
+    assert answered(it, m.MAVLink_mission_request_message(1, 1, 3), "MISSION_ACK").type == 13
+    assert answered(it, m.MAVLink_mission_count_message(1, 1, 10_000), "MISSION_ACK").type == 4, "no space"
+    assert answered(it, m.MAVLink_mission_clear_all_message(1, 1), "MISSION_ACK").type == 0
+    assert answered(it, m.MAVLink_mission_request_list_message(1, 1), "MISSION_COUNT").count == 1
+    fence = m.MAVLink_mission_count_message(1, 1, 4, mission_type=1)
+    assert (answered(it, fence, "MISSION_ACK").type, it.of("MISSION_ACK")[0].mission_type) == (3, 1)
+    item = m.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, 0, 1, 0, 0, 0, 0, 0, 0, 5)
+    assert answered(it, item, "MISSION_ACK").type == 1, "nobody asked for it"
+    assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == 0
+    told = it.of("AUTOPILOT_VERSION")[0].capabilities
+    assert told & 0x25 == 0x25, "missions, also in whole numbers, and files"
+    assert not told & (0x4000 | 0x8000), "fences, rally points"
+
+
+def test_an_arducopter_has_channels_a_banner_and_can_be_rebooted() -> None:
+    it = ready(Kind.ARDUCOPTER)
+    it.go_on(3.5)
+
+    def channels() -> list[int]:
+        assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_RC_CHANNELS) == 0
+        (told,) = it.of("RC_CHANNELS")
+        assert told.chancount == 16
+        return [getattr(told, f"chan{n}_raw") for n in range(1, 19)]
+
+    assert channels() == [1500, 1500, 1000, *[1500] * 13, 0xFFFF, 0xFFFF]
+    it.say(m.MAVLink_rc_channels_override_message(1, 1, 0xFFFF, 1010, 1200, *[0xFFFF] * 5))
+    assert channels()[:4] == [1500, 1010, 1200, 1500]
+    it.say(m.MAVLink_rc_channels_override_message(1, 1, 0xFFFF, 0, *[0xFFFF] * 6))
+    assert channels()[:4] == [1500, 1500, 1200, 1500], "0 gives one back"
+    it.go_on(3.5)
+    assert channels()[2] == 1000, "it was silent since"
+    it.texts()
+    assert it.command(m.MAV_CMD_DO_SEND_BANNER) == 0
+    assert it.texts()[0].startswith("ArduCopter V4.7.0-dev")
+    it.up()
+    assert it.command(m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == 4, "it is armed"
+    assert it.mode(9) == 0
+    it.until(lambda: not it.autopilot.armed, 30.0)
+    assert it.command(m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == 0
+    it.go_on(0.5)
+    assert it.autopilot.time_s < 0.6
+    assert not it.autopilot.ready, "it boots"
+    it.go_on(1.5)
+    assert (it.mode(4), it.arm()) == (0, 0)
+
+
+def test_a_px4_takes_no_mission_and_has_none() -> None:
+    kind = Kind.PX4
     it = ready(kind)
     assert answered(it, m.MAVLink_mission_request_list_message(1, 1), "MISSION_COUNT").count == 0
     assert answered(it, m.MAVLink_mission_count_message(1, 1, 5), "MISSION_ACK").type == 3, "unsupported"

@@ -82,6 +82,15 @@ def test_a_lost_chunk_is_shown() -> None:
     assert whole_texts([messages[0], messages[2]]) == ["a" * 50 + "…" + "c" * 10]
 
 
+def test_a_chunk_that_comes_twice_or_late_makes_no_other_text() -> None:
+    """A STATUSTEXT in chunks came as two events."""
+    first, last = travelled(chunks_of("a" * 50 + "b" * 10, 4, 9))
+    assert whole_texts([first, last, last, first]) == ["a" * 50 + "b" * 10]
+    assert whole_texts([last, first, last]) == ["…" + "b" * 10]
+    again = travelled(chunks_of("c" * 50 + "d" * 10, 4, 9))
+    assert whole_texts([first, last, *again]) == ["a" * 50 + "b" * 10, "c" * 50 + "d" * 10], "after a new start"
+
+
 def test_texts_that_never_end_are_given_out_and_not_kept() -> None:
     texts = Texts()
     told = [whole for n in range(1, 40) for whole in texts.on_message(travelled(chunks_of("x" * 60, 4, n))[0])]

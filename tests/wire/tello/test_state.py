@@ -65,6 +65,8 @@ def test_a_pad_that_is_seen() -> None:
     assert state.pad is not None
     assert (state.pad.number, state.pad.place_cm, state.pad.angles_deg) == (3, (12, -7, 80), (1, -2, 30))
     assert parse(b"mid:-2;x:0;y:0;z:0;mpry:0,0,0;").pad is None
+    for mid in (b"0", b"9", b"257", b"2.5"):
+        assert parse(b"mid:" + mid + b";x:0;y:0;z:0;mpry:0,0,0;").pad is None, "pads are 1 to 8"
     nowhere = parse(b"mid:8;x:-100;y:-100;z:-100;mpry:0,0,0;").pad
     assert nowhere is not None
     assert nowhere.place_cm is None

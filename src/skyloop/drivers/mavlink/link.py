@@ -58,10 +58,13 @@ class UdpListener:
 
     def __init__(self, address: Address) -> None:
         self.dropped = 0
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._six = ":" in address.place
+        self._socket = socket.socket(socket.AF_INET6 if self._six else socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
-            self._socket.bind((address.place, address.number))
+            if self._six:
+                self._socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # vehicles of IPv4 are heard too
+            self._socket.bind(self._to_socket((address.place, address.number)))
         except OSError:
             self._socket.close()
             raise
@@ -75,7 +78,8 @@ class UdpListener:
         came: list[tuple[bytes, Peer]] = []
         for _ in range(BURST):
             try:
-                came.append(self._socket.recvfrom(MAX_DATAGRAM))
+                data, source = self._socket.recvfrom(MAX_DATAGRAM)
+                came.append((data, _peer_of(source)))
             except BlockingIOError:
                 break
             except ConnectionError:  # nobody listens where we sent to: it may come back
@@ -88,13 +92,32 @@ class UdpListener:
             self.dropped += 1  # no vehicle was received yet
             return
         try:
-            self._socket.sendto(packet.data, packet.peer)
+            self._socket.sendto(packet.data, self._to_socket(packet.peer))
         except BlockingIOError:
             self.dropped += 1
 
     def close(self) -> None:
         """Close the port."""
         self._socket.close()
+
+    def _to_socket(self, peer: tuple[str, int]) -> tuple[str, int] | tuple[str, int, int, int]:
+        host, port = peer
+        if not self._six:
+            return peer
+        host, _, scope = host.partition("%")
+        number = int(scope) if scope.isdecimal() else socket.if_nametoindex(scope) if scope else 0
+        return (host if ":" in host or not host else f"{_OF_IPV4}{host}"), port, 0, number
+
+
+_OF_IPV4: Final = "::ffff:"  #: how a socket of IPv6 shows addresses of IPv4 (RFC 4291, section 2.5.5.2)
+
+
+def _peer_of(source: tuple[str, int] | tuple[str, int, int, int]) -> tuple[str, int]:
+    """Return who sent a datagram as an address would have it: of IPv4 plain, of one link with its interface."""
+    host, port = source[:2]
+    if len(source) == 4 and source[3] and "%" not in host:
+        host = f"{host}%{source[3]}"
+    return host.removeprefix(_OF_IPV4), port
 
 
 class UdpSender(UdpListener):
@@ -105,9 +128,9 @@ class UdpSender(UdpListener):
     """
 
     def __init__(self, address: Address) -> None:
-        found = socket.getaddrinfo(address.place, address.number, socket.AF_INET, socket.SOCK_DGRAM)
-        self._to: tuple[str, int] = str(found[0][4][0]), address.number
-        super().__init__(Address(ConnectionKind.UDP_IN, "", 0))
+        family, *_, found = socket.getaddrinfo(address.place, address.number, 0, socket.SOCK_DGRAM)[0]
+        self._to = _peer_of((str(found[0]), *found[1:]))
+        super().__init__(Address(ConnectionKind.UDP_IN, "::" if family == socket.AF_INET6 else "", 0))
 
     def send(self, packet: Packet) -> None:
         """Send a datagram to the peer, or to the address until something was received."""

@@ -14,14 +14,13 @@ from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.mavlink.options import Peer, PoseMessage
 from skyloop.drivers.mavlink.telemetry import Telemetry
 from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
-from skyloop.messages import EventKind, Severity
+from skyloop.messages import EventKind, Severity, Value
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.wire.mavlink.axes import angles_of, swap, to_wire, yaw_between
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import Autopilot
 
-AUTOPILOT_COMPONENT: Final = 1
 MOVED_NS: Final = nanoseconds(0.3)  #: a vehicle that is silent for so long may go on from another port
 MOST_OTHERS: Final = 16  #: other vehicles that are reported; a hostile sender can make up any number
 _NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
@@ -45,10 +44,12 @@ class VehicleSelector:
     Args:
         system: Its system id; None: the first one found, and after that only that system.
         peer: Its address and port; None: any.
+        component: Its component id.
     """
 
-    def __init__(self, system: int | None, peer: tuple[str, int] | None) -> None:
+    def __init__(self, system: int | None, peer: tuple[str, int] | None, component: int = 1) -> None:
         self.system = system
+        self._component = component
         self.chosen: VehicleIdentity | None = None
         self._wanted_peer = peer
         self._reported: set[VehicleIdentity] = set()
@@ -73,6 +74,8 @@ class VehicleSelector:
                 return [VehicleEvent(EventKind.VEHICLE_MESSAGE, text, data={"reason": "moved"})]
         if message.get_type() != "HEARTBEAT" or not _is_vehicle(message):
             return []
+        if found.component != self._component:
+            return self._report_component(found)
         suits = self.system in (None, found.system) and self._wanted_peer in (None, peer)
         if self.chosen is None and suits:
             self.chosen, self.system, self._received_ns = found, found.system, now_ns
@@ -119,13 +122,21 @@ class VehicleSelector:
             )
         ]
 
+    def _report_component(self, found: VehicleIdentity) -> list[VehicleEvent]:
+        if found in self._reported or len(self._reported) >= MOST_OTHERS:
+            return []
+        self._reported.add(found)
+        text = (
+            f"an autopilot answers as component {found.component} of system {found.system}, not as component "
+            f"{self._component}: it is ignored; ?component={found.component} chooses it"
+        )
+        data: dict[str, Value] = {"reason": "component", "system": found.system, "component": found.component}
+        return [VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data)]
+
 
 def _is_vehicle(heartbeat: Message) -> bool:
     return bool(
-        heartbeat.get_srcComponent() == AUTOPILOT_COMPONENT
-        and heartbeat.get_srcSystem() != 0
-        and heartbeat.autopilot != _NO_AUTOPILOT
-        and heartbeat.type != _GROUND_STATION
+        heartbeat.get_srcSystem() != 0 and heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.type != _GROUND_STATION
     )
 
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
-from skyloop.drivers.uri import VehicleUri
+from skyloop.drivers.uri import VehicleUri, host_and_port
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.files import expand, read_bytes
 
@@ -63,9 +63,8 @@ _EXAMPLES: Final = (
     "it looks like mavlink://udpin:127.0.0.1:14540, mavlink://udpout:127.0.0.1:14580, mavlink://tcp:127.0.0.1:5760 or "
     "mavlink://serial:/dev/ttyACM0:921600"
 )
-_HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 KNOWN: Final = {
-    *("sysid", "peer", "own_sysid", "rate", "parameters", "signing_key", "origin", "world_origin", "pose"),
+    *("sysid", "component", "peer", "own_sysid", "rate", "parameters", "signing_key", "origin", "world_origin", "pose"),
     *(limit.option for limit in OWN_LIMITS),
     *("camera", "camera_name", "camera_width", "camera_height", "camera_fps", "camera_facing", "camera_stream"),
     *INTRINSICS_OPTIONS,
@@ -103,7 +102,8 @@ class Address:
     number: int
 
     def __str__(self) -> str:
-        return f"{self.kind.value}:{self.place}:{self.number}"
+        place = f"[{self.place}]" if ":" in self.place and self.kind is not ConnectionKind.SERIAL else self.place
+        return f"{self.kind.value}:{place}:{self.number}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +125,7 @@ class MavlinkOptions:
 
     address: Address
     system: int | None = None  #: of the vehicle; None: the first one found
+    component: int = 1  #: of its autopilot: MAV_COMP_ID_AUTOPILOT1 is what autopilots are
     peer: tuple[str, int] | None = None  #: where the vehicle sends from; None: the address of its first packet
     own_system: int = 255
     rate_hz: float = 50.0  #: of attitude, position and velocity
@@ -159,6 +160,7 @@ def options_of(uri: VehicleUri) -> MavlinkOptions:
     return MavlinkOptions(
         address=address_of(uri),
         system=system,
+        component=uri.whole("component", 1, minimum=1, maximum=255),
         peer=_peer(uri),
         own_system=own,
         rate_hz=uri.number("rate", 50.0, minimum=1.0, maximum=200.0),
@@ -179,15 +181,18 @@ def address_of(uri: VehicleUri) -> Address:
         UsageError: It names no known kind of connection, or no host, device or port.
     """
     word, _, rest = uri.place.partition(":")
-    place, colon, number = rest.rpartition(":")
     if word not in [kind.value for kind in ConnectionKind]:
         raise UsageError(f"{uri}: {word!r} is none of {', '.join(ConnectionKind)}: {_EXAMPLES}")
     kind = ConnectionKind(word)
-    if kind is ConnectionKind.SERIAL and (not colon or not number.isdecimal()):
+    if kind is not ConnectionKind.SERIAL:
+        found = host_and_port(rest)
+        if found is None:
+            raise UsageError(f"{uri} names no place: {_EXAMPLES}")
+        return Address(kind, *found)
+    place, colon, number = rest.rpartition(":")
+    if not colon or not number.isdecimal():
         place, number = rest, str(DEFAULT_BAUD)
-    good = bool(place) if kind is ConnectionKind.SERIAL else bool(_HOST.match(place))
-    highest = 10_000_000 if kind is ConnectionKind.SERIAL else 65_535
-    if not good or not number.isdecimal() or not 1 <= int(number) <= highest:
+    if not place or not 1 <= int(number) <= 10_000_000:
         raise UsageError(f"{uri} names no place: {_EXAMPLES}")
     return Address(kind, place, int(number))
 
@@ -196,10 +201,10 @@ def _peer(uri: VehicleUri) -> tuple[str, int] | None:
     given = uri.options.get("peer")
     if given is None:
         return None
-    host, _, port = given.rpartition(":")
-    if not _HOST.match(host) or not port.isdecimal() or not 1 <= int(port) <= 65_535:
-        raise UsageError(f"{uri}: peer is {given!r}; it looks like peer=127.0.0.1:14580")
-    return host, int(port)
+    found = host_and_port(given)
+    if found is None:
+        raise UsageError(f"{uri}: peer is {given!r}; it looks like peer=127.0.0.1:14580 or peer=[fe80::1]:14580")
+    return found
 
 
 def _key(uri: VehicleUri) -> bytes | None:

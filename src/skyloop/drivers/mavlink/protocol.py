@@ -26,7 +26,8 @@ from skyloop.drivers.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, VehicleEvent, VehicleSession
 from skyloop.errors import DriverError
-from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Severity, Value
+from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Severity, Takeoff, Value
+from skyloop.messages.feedback import WAKING_UP
 from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.parameter_values import BYTEWISE
@@ -39,9 +40,11 @@ DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
 LOST_NS: Final = nanoseconds(2.5)
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle without any data by then is reported as lost
 PARAMETERS_NS: Final = nanoseconds(25.0)  #: the list may take so long, then the link is up without it
+WAKING_MS: Final = 60_000  #: of its own clock: one that can't be armed so soon after its start still wakes up
 IDENTITY_NS: Final = nanoseconds(2.0)  #: a vehicle that is found again says by then that it is the same
 QUIET_ATTITUDE_S: Final = 0.5  #: without it, other messages make feedback
 VERSION_PACE_S: Final = 1.0
+_WAKING: Final = f"{WAKING_UP}: its own checks before arming do not pass yet"
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
 _STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps show their order
@@ -104,7 +107,7 @@ class MavlinkSession(VehicleSession):
         self.dropped = 0  #: packets that the connection did not send, for want of room
         self._axes = WorldAxes(options.world_origin)
         self._extra = extra
-        self._selector = VehicleSelector(options.system, options.peer)
+        self._selector = VehicleSelector(options.system, options.peer, options.component)
         self._health = HealthMonitor()
         self._intervals = MessageIntervals({})
         self._out: list[Message] = []
@@ -118,6 +121,8 @@ class MavlinkSession(VehicleSession):
         self._known_as: Message | None = None  # the version told before the link was lost, until it is told again
         self._heard_by_it = True  # False: nothing shows yet that it reads what is sent
         self._said: tuple[int | None, bool, int] | None = None  # mode, whether it is armed, MAV_STATE, when last looked
+        self._waking = False  # it was started just now and can't be armed yet
+        self._prearm = ""  # the last reason that it gave
         self._unsupported_reason = "no data from it"
         #: Pressed for whatever answers: it outlives what is known of the vehicle.
         self._stop = MotorStop(lambda event: self._publish_event(event))
@@ -160,6 +165,8 @@ class MavlinkSession(VehicleSession):
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
             return action  # nothing comes of it; pilots on the ground send it all the time
+        if self._waking and isinstance(action, Takeoff):
+            raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))
         applied = self.setpoints.apply(action, self.vehicle_state(now_ns), now_ns, alone=alone, new=new)
         self._keep(action, now_ns)
         due_ns = self.setpoints.due_ns(now_ns)
@@ -263,8 +270,10 @@ class MavlinkSession(VehicleSession):
                 self._out += answers
                 self.due_ns = 0  # a late answer would be a wrong time, by which the vehicle dates poses from outside
         elif kind == "STATUSTEXT":
-            for event in self._health.on_text(message):
+            for event in self._health.on_text(message, quiet=self._waking):
                 self._publish_event(event)
+                if event.data["reason"] == "prearm":
+                    self._prearm = event.text
                 if self.setpoints is not None and event.data["reason"] == "prearm":
                     self.setpoints.on_prearm_reason(event.text)
         elif kind == "AUTOPILOT_VERSION":
@@ -359,6 +368,9 @@ class MavlinkSession(VehicleSession):
         for event in self._health.update(self.telemetry, vehicle, now_ns):
             self._publish_event(event)
         exchange = self.parameters
+        was_waking, self._waking = self._waking, self._wakes_up(vehicle, now_ns)
+        if self._waking is not was_waking and self.link_state is LinkState.UP:
+            self._report_link(LinkState.UP, _WAKING if self._waking else "")
         if self._known_as is not None and now_ns - self._found_ns > IDENTITY_NS:
             self._read_again(now_ns)  # it does not say which one it is
         if self.link_state is not LinkState.DEGRADED or self._silent(now_ns):
@@ -367,7 +379,15 @@ class MavlinkSession(VehicleSession):
             return
         waited = now_ns - self._found_ns > PARAMETERS_NS
         if not self.options.parameters or exchange.complete or exchange.given_up or waited:
-            self._set_link_state(LinkState.UP)
+            self._set_link_state(LinkState.UP, _WAKING if self._waking else "")
+
+    def _wakes_up(self, vehicle: VehicleState | None, now_ns: int) -> bool:
+        """Return whether it was started just now and has not been ready since."""
+        attitude = self.telemetry.newest("ATTITUDE", now_ns, QUIET_ATTITUDE_S)
+        if vehicle is None or attitude is None:
+            return self._waking
+        soon = attitude.time_boot_ms < WAKING_MS and not self._health.was_ready
+        return vehicle.ready is False and not vehicle.armed and soon
 
     def _silent(self, now_ns: int) -> bool:
         return self._received_ns is None or now_ns - self._received_ns >= DEGRADED_NS
@@ -394,6 +414,7 @@ class MavlinkSession(VehicleSession):
 
     def _lose(self, reason: str, now_ns: int) -> None:
         self._received_ns = self._said = None
+        self._waking, self._prearm = False, ""
         self._unheard = self.telemetry.armed()
         self._selector.forget()
         self._axes.forget()

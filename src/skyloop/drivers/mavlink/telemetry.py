@@ -404,15 +404,30 @@ class HealthMonitor:
     def __init__(self) -> None:
         self._texts = Texts()
         self._reported: dict[str, bool] = {}
+        self._reasons: set[str] = set()  # why it can't be armed, as told while it wakes up
 
-    def on_text(self, message: Message) -> list[VehicleEvent]:
-        """Handle a ``STATUSTEXT``; return whole texts, marked where they say why it can't be armed."""
+    @property
+    def was_ready(self) -> bool:
+        """Whether it could be armed once."""
+        return "was_ready" in self._reported
+
+    def on_text(self, message: Message, *, quiet: bool = False) -> list[VehicleEvent]:
+        """Handle a ``STATUSTEXT``; return whole texts, marked where they say why it can't be armed.
+
+        Args:
+            message: The text, or a chunk of it.
+            quiet: Whether a reason why it can't be armed is told once only: the vehicle repeats it as it wakes up.
+        """
         events = []
         for severity, text in self._texts.on_message(message):
             if severity >= DEBUG:
                 continue
             weight = Severity.ERROR if severity <= 3 else Severity.WARNING if severity == 4 else Severity.INFO
             reason = "prearm" if text.lower().startswith(_PREARM_WORDS) else "text"
+            if quiet and reason == "prearm":
+                if text in self._reasons:
+                    continue
+                self._reasons.add(text)
             data: dict[str, Value] = {"reason": reason, "mav_severity": severity}
             events.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, weight, data))
         return events
@@ -420,6 +435,8 @@ class HealthMonitor:
     def update(self, telemetry: Telemetry, vehicle: VehicleState | None, now_ns: int) -> list[VehicleEvent]:
         """Return what changed since the last call."""
         ready = None if vehicle is None else vehicle.ready
+        if ready:
+            self._reported["was_ready"] = True
         events = self._changed("ready", ready, "the vehicle is ready to be armed", "the vehicle can't be armed now")
         gps = telemetry.newest("GPS_RAW_INT", now_ns, SLOW_S)
         if gps is not None:

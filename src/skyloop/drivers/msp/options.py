@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Final
 
 from skyloop.drivers.base import reject_unknown_options
-from skyloop.drivers.uri import VehicleUri
+from skyloop.drivers.uri import VehicleUri, host_and_port
 from skyloop.errors import UsageError
 
 DEFAULT_BAUD: Final = 115_200
 DEFAULT_RATE_HZ: Final = 50.0
 KNOWN: Final = {"baud", "rate", "override"}
-_HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _EXAMPLES: Final = "it looks like msp:///dev/ttyACM0?baud=115200 or msp://tcp:127.0.0.1:5761"
 
 
@@ -52,7 +50,7 @@ def options_of(uri: VehicleUri) -> MspOptions:
     if "baud" in uri.options:
         raise UsageError(f"{uri}: baud is for a serial port, such as msp:///dev/ttyACM0?baud=115200")
     word, _, rest = uri.place.partition(":")
-    host, _, number = rest.rpartition(":")
-    if word != "tcp" or not _HOST.match(host) or not number.isdecimal() or not 1 <= int(number) <= 65_535:
+    found = host_and_port(rest)
+    if word != "tcp" or found is None:
         raise UsageError(f"{uri} names no place: {_EXAMPLES}")
-    return MspOptions(host, int(number), rate_hz=rate, override=override)
+    return MspOptions(*found, rate_hz=rate, override=override)

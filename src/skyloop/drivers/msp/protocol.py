@@ -15,12 +15,13 @@ from skyloop.drivers.msp.identification import Identification
 from skyloop.drivers.msp.motion import MotionEstimate
 from skyloop.drivers.msp.options import MspOptions
 from skyloop.drivers.msp.requests import Questions, Telemetry
-from skyloop.drivers.msp.setpoints import Phase, Report, SetpointController
+from skyloop.drivers.msp.setpoints import PASSING, Phase, Report, SetpointController
 from skyloop.drivers.msp.telemetry import Reported, feedback_of
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
 from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.feedback import WAKING_UP
 from skyloop.wire.msp import messages as msp
 from skyloop.wire.msp.frames import Direction, Frame, Parser, encode
 from skyloop.wire.msp.messages import BETAFLIGHT, INAV, Function, Sensor
@@ -35,6 +36,7 @@ STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older one is taken for lost
 COUNT_NS: Final = nanoseconds(1.0)  #: over which acknowledged sticks are counted
 LEAST_STICKS_HZ: Final = 25.0  #: fewer are warned of
 BUNDLING_API: Final = (1, 42)  #: of Betaflight: it knows MULTIPLE
+WAKING_NS: Final = nanoseconds(8.0)  #: what passes by itself after its start keeps it from being armed for no longer
 AGAIN_NS: Final = nanoseconds(1.0)  #: between two tries to find out who it is
 
 ATTITUDE_HZ: Final = 50.0
@@ -77,6 +79,8 @@ class MspSession(VehicleSession):
         self._acknowledged = 0
         self._counted_ns = now_ns
         self._slow = False
+        self._wakes_until_ns: int | None = None  # None: its state is not known yet; 0: it was ready since
+        self._woke = False  # it was still waking up when last looked
         self._may_steer = False  # its state is known: what is sent does not disarm a flying one
         self._armed_throttle: float | None = None
         self._set_link_state(LinkState.CONNECTING, f"waiting for the flight controller on {options}")
@@ -228,13 +232,27 @@ class MspSession(VehicleSession):
     def _publish(self, now_ns: int) -> None:
         if self.setpoints.report.armed is None or self.reported.altitude is None:
             return  # what it does is not known yet
-        if self.link_state is not LinkState.UP:
-            self._set_link_state(LinkState.UP)
+        wakes = self._wakes_up(now_ns)
+        if self.link_state is not LinkState.UP or wakes is not self._woke:
+            names = ", ".join(self.setpoints.report.hindrances)
+            why = f"{WAKING_UP}: the flight controller can't be armed yet ({names})" if wakes else ""
+            self._woke = wakes
+            self._report_link(LinkState.UP, why)
         motion = self.motion.at(now_ns)
         self.setpoints.on_motion(motion)
         flight = self.setpoints.flight_state()
         feedback = feedback_of(self.reported, motion, flight, now_ns, self._native())
         self._pending.append(lambda sink: sink.feedback(feedback))
+
+    def _wakes_up(self, now_ns: int) -> bool:
+        """Return whether it was found just now, and only what passes by itself keeps it from being armed."""
+        report = self.setpoints.report
+        if self._wakes_until_ns is None:
+            self._wakes_until_ns = now_ns + WAKING_NS
+        passing = bool(report.hindrances) and PASSING.issuperset(report.hindrances)
+        if report.armed or not passing or self.options.override or now_ns >= self._wakes_until_ns:
+            self._wakes_until_ns = 0
+        return bool(self._wakes_until_ns)
 
     def _native(self) -> dict[str, Value]:
         setpoints, reported, setup = self.setpoints, self.reported, self.setup
@@ -386,7 +404,7 @@ class MspSession(VehicleSession):
         """
         del now_ns
         self._received_ns = self._asked_ns = self._identification = None
-        self._known, self._refused_variant = False, ""
+        self._known, self._refused_variant, self._wakes_until_ns = False, "", None
         self._questions.clear()
         if self._telemetry is not None:
             self._telemetry.forget()

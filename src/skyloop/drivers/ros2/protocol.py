@@ -30,7 +30,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.wire.ros2.conversions import intrinsics_of, nanoseconds_of, pixels_of
+from skyloop.wire.ros2.conversions import intrinsics_of, nanoseconds_of, pixels_of, skew_of
 
 PERIOD_S: Final = 0.05  #: a velocity is repeated so often, as robots stop when none comes
 AIRBORNE_M: Final = 0.1  #: a robot that flies is off the ground above this height of its odometry
@@ -121,7 +121,14 @@ class RobotSession:
 
     def on_info(self, message: Any) -> None:
         """Keep the camera's intrinsics for the next frame."""
-        self._intrinsics = intrinsics_of(message)
+        try:
+            self._intrinsics = intrinsics_of(message)
+        except DecodeError as error:
+            self._intrinsics = None
+            self._complain(f"the camera's intrinsics can't be used: {error}")
+        skew = skew_of(message)
+        if skew and self._intrinsics is not None:
+            self._complain(f"the camera's pixels have a skew of {skew:g} px, which is left out: calibrate without it")
 
     def on_image(self, message: Any) -> None:
         """Publish a frame, decoded as far as it needs to be."""

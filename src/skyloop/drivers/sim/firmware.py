@@ -33,6 +33,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
+from skyloop.messages.feedback import WAKING_UP
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.rotor_dynamics import rotors_of
@@ -54,6 +55,7 @@ _SEVERITIES: Final = {
     FirmwareEventKind.SILENT: Severity.ERROR,
     FirmwareEventKind.DIED: Severity.ERROR,
     FirmwareEventKind.FAILED: Severity.ERROR,
+    FirmwareEventKind.DEAF: Severity.INFO,
 }
 _KEPT_REPORTS: Final = 64
 _POSE_STD_M: Final = 0.001
@@ -83,6 +85,7 @@ class FirmwareFlight:
         self._drone = 0
         self._firmware: CoupledFirmware | None = None
         self._inner: Driver | None = None
+        self._found = False  # its driver has heard it since it was started
         self._linked = False  # whether the firmware's driver is to be open
         self._reports: deque[Report] = deque(maxlen=_KEPT_REPORTS)
 
@@ -125,10 +128,14 @@ class FirmwareFlight:
             folder /= f"drone{drone + 1}"  # each has settings of its own
         instruments = rotors_of(host.simulation.parameters[drone]).instruments
         self._firmware = firmware = make_firmware(self.kind, self._happened, instruments=instruments, folder=folder)
-        self._linked = True
-        sink.link(LinkState.CONNECTING, f"{_NAMES[self.kind]} is being started")
+        self._linked, self._found = True, False
+        sink.link(LinkState.CONNECTING, self._starting)
         firmware.start()
         host.simulation.fly_by(drone, firmware)
+
+    @property
+    def _starting(self) -> str:
+        return f"{WAKING_UP}: {_NAMES[self.kind]} is being started"
 
     def close(self) -> None:
         """Stop the rotors, and end the driver and the firmware. Idempotent."""
@@ -173,6 +180,20 @@ class FirmwareFlight:
             sink.event(EventKind.VEHICLE_MESSAGE, event.text, _SEVERITIES[event.kind], reason=f"firmware_{event.kind}")
         if event.kind is FirmwareEventKind.STARTED:
             self._open_driver()
+        elif event.kind is FirmwareEventKind.FAILED and sink is not None and not self._found:
+            sink.link(LinkState.LOST, event.text, "set what it names right: it is tried again")
+
+    def link(self, state: LinkState, reason: str) -> tuple[LinkState, str, str]:
+        """Return what the link of the firmware's driver means for the drone: reason and remedy speak of what is inside.
+
+        The driver takes the firmware for a vehicle that somebody else starts, at an address that a person gave.
+        """
+        self._found = self._found or state in (LinkState.UP, LinkState.DEGRADED)
+        if not self._found:
+            return LinkState.CONNECTING, self._starting, ""
+        remedy = f"{_NAMES[self.kind]} runs within this drone, and is started again if it ended: wait, or look at its "
+        remedy += "output in firmware.log, which autopilot_folder=… keeps"
+        return state, reason, remedy if state in (LinkState.CONNECTING, LinkState.LOST) else ""
 
     # Flying ----------------------------------------------------------------------------------------------------
 
@@ -257,8 +278,8 @@ class _InnerSink:
     def wants_stream(self, camera: str) -> bool:  # noqa: ARG002
         return False
 
-    def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        self._sink.link(state, reason, remedy)
+    def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:  # noqa: ARG002
+        self._sink.link(*self._flight.link(state, reason))
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
         self._sink.event(kind, text, severity, **data)

@@ -6,7 +6,6 @@ by some per cent. Nothing is known of the lens of the camera that looks down.
 
 from __future__ import annotations
 
-import select
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
@@ -21,6 +20,7 @@ from skyloop.drivers.tello.link import receiving_socket
 from skyloop.drivers.tello.options import TelloOptions
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_link import MAX_DATAGRAM
+from skyloop.files import wait_readable
 from skyloop.messages import CameraInfo, Intrinsics
 from skyloop.messages.encoded import H264
 from skyloop.pyav import new_decoder, require_pyav
@@ -134,7 +134,7 @@ class VideoStream:
             OSError: Nothing came for :data:`SILENT_S`.
         """
         frames: list[Coded] = []
-        if select.select([self._socket], [], [], POLL_S)[0]:
+        if wait_readable(self._socket, POLL_S):
             self._drain(frames)
         if self._clock() - self._received_ns > nanoseconds(SILENT_S):
             raise TimeoutError(f"no video came for {SILENT_S:g} s")

@@ -211,4 +211,4 @@ class FilePlayer:
 
 def _bgr(image: DecodedImage) -> NDArray[np.uint8]:
     """Shape (h, w, 3), C-contiguous."""
-    return np.ascontiguousarray(image.frame.to_ndarray(format="bgr24"), dtype=np.uint8)
+    return np.ascontiguousarray(np.rot90(image.frame.to_ndarray(format="bgr24"), image.turns), dtype=np.uint8)

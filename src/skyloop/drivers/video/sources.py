@@ -5,8 +5,10 @@ All open at construction, and raise :class:`skyloop.errors.UsageError` or :class
 
 from __future__ import annotations
 
+import itertools
 import stat
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
@@ -26,6 +28,7 @@ FFmpegError = av.error.FFmpegError
 CHUNK: Final = 1 << 16
 SNIFF: Final = 1 << 18  #: a PaVE stream that was torn open somewhere shows its next header well within this
 DEFAULT_FPS: Final = 30.0
+_TURNED: Final = frozenset({"mov", "mp4", "matroska", "webm"})  #: formats that can say that a picture is to be turned
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +40,7 @@ class DecodedImage:
     coded: Unit | None = None  #: what it was decoded from, if that is handed on as it came
     number: int = 0  #: of what it was decoded from, in the stream
     reason: str = ""  #: why what it was decoded from is not handed on, of a stream that is
+    turns: int = 0  #: quarter turns counter-clockwise that make it upright
 
 
 class Source(Protocol):
@@ -106,12 +110,15 @@ class ContainerSource:
         limit_memory(self._stream.codec_context)
         self._stream.thread_type = "AUTO"
         self.width, self.height = self._stream.codec_context.width, self._stream.codec_context.height
+        self.turns = _quarter_turns(name) if _TURNED & {*self._container.format.name.split(",")} else 0
+        if self.turns % 2:
+            self.width, self.height = self.height, self.width
         self.fps = float(self._stream.average_rate or self._stream.guessed_rate or DEFAULT_FPS)
         if not (self.width and self.height):
             self._container.close()
             raise FileFormatError(f"{name}: its frame size is missing: it is damaged or cut off")
         self._units = Units(self._stream, self._stream.codec_context)
-        if not self._units.reason and not self._stream.codec_context.has_b_frames:
+        if not self._units.reason and not self._stream.codec_context.has_b_frames and not self.turns:
             self.stream = H264
 
     def images(self) -> Iterator[DecodedImage]:
@@ -132,7 +139,8 @@ class ContainerSource:
                     continue
                 stamp_s = image.time if image.time is not None else stamp_s + 1.0 / self.fps
                 at, unit = coded.pop(image.pts, (0, None))
-                yield DecodedImage(stamp_s, image, unit, at, self._units.reason if self.stream else "")
+                reason = self._units.reason if self.stream else ""
+                yield DecodedImage(stamp_s, image, unit, at, reason, self.turns)
 
     def _packets(self) -> Iterator[av.Packet[av.VideoStream]]:
         try:
@@ -147,6 +155,18 @@ class ContainerSource:
     def _error(self, what: str, error: Exception) -> Exception:
         cause = getattr(error, "strerror", None) or str(error)
         return FileFormatError(f"{self._name} {what} as a video: {cause}")
+
+
+def _quarter_turns(name: str) -> int:
+    """Return how often a file's pictures are turned counter-clockwise to be upright.
+
+    A phone held upright films as if it lay on its side, and says so in the container, by a matrix that comes with the
+    pictures.
+    """
+    with suppress(FFmpegError, OSError, ValueError), av.open(name) as container:
+        for image in itertools.islice(container.decode(container.streams.video[0]), 1):
+            return round(getattr(image, "rotation", 0) / 90) % 4
+    return 0
 
 
 class PaveSource:

@@ -21,6 +21,7 @@ from skyloop.emulators.mavlink.autopilot import (
 from skyloop.emulators.mavlink.links import Port
 from skyloop.emulators.mavlink.manoeuvres import Turn
 from skyloop.emulators.mavlink.parameters import ParameterTable
+from skyloop.emulators.mavlink.places import geodetic
 from skyloop.emulators.mavlink.services import (
     MISSION_ACCEPTED,
     MISSION_ERROR,
@@ -28,6 +29,7 @@ from skyloop.emulators.mavlink.services import (
     MISSION_INVALID_Y,
     MISSION_INVALID_Z,
     MISSION_UNSUPPORTED,
+    Mission,
     mission_ack,
 )
 from skyloop.emulators.mavlink.setpoints import (
@@ -57,6 +59,9 @@ RTL_LOWEST_M: Final = 0.3
 RTL_LEAST_SLOPE: Final = 0.5
 _GUIDED_ITEM: Final = 2  #: "current" of a mission item that is a position to go to now
 _ALTITUDE_ITEM: Final = 3
+CHANNELS: Final = 16
+_OVERRIDDEN: Final = 8
+_IGNORED: Final = 0xFFFF  #: a channel that an override leaves as it is
 _NOT_ARMABLE: Final = ("LAND", "BRAKE", "AUTO", "RTL")
 _PILOT: Final = ("LOITER", "ALT_HOLD", "STABILIZE", "POSHOLD")
 _WORDS: Final = {
@@ -72,7 +77,7 @@ class ArduCopter(Autopilot):
     """An emulated ArduCopter."""
 
     AUTOPILOT = Number.ARDUPILOT
-    CAPABILITIES = 0xFBEF & ~0xD224  # files, missions, fences, rally points and terrain are not emulated
+    CAPABILITIES = 0xFBEF & ~0xD200  # fences, rally points and terrain are not emulated; of files there are none
     VERSION = 4 << 24 | 7 << 16
     RATES: ClassVar[dict[int, float]] = {m.MAVLINK_MSG_ID_HEARTBEAT: 1.0, m.MAVLINK_MSG_ID_TIMESYNC: 0.2}
     FRAMES = frozenset({WORLD, WORLD_OFFSET, BODY, BODY_OFFSET})
@@ -86,6 +91,7 @@ class ArduCopter(Autopilot):
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, system, boot_s, gps)
         self.parameters = ParameterTable(parameters.ARDUCOPTER, bytewise=False)
+        self.mission = Mission()
         self.mode = "STABILIZE"
         self._rising = False
         self._paused = False
@@ -94,10 +100,13 @@ class ArduCopter(Autopilot):
         self._target: Target | AttitudeTarget | None = None
         self._target_s = 0.0
         self._stick: tuple[float, float, float, float] | None = None  # forward, left, up, yaw
-        self._stick_s = 0.0
+        self._stick_s = -STICK_TIMEOUT_S
+        self._overrides: dict[int, int] = {}  # by channel from 0 [µs]
         self._commands |= {
             m.MAV_CMD_CONDITION_YAW: self._condition_yaw,
             m.MAV_CMD_DO_PAUSE_CONTINUE: self._pause_or_continue,
+            m.MAV_CMD_DO_SEND_BANNER: self._send_banner,
+            m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
         }
 
     @property
@@ -165,6 +174,12 @@ class ArduCopter(Autopilot):
         if message.get_type() == "MANUAL_CONTROL":
             shares = (message.x / 1000, -message.y / 1000, (message.z - 500) / 500, -message.r / 1000)
         else:
+            for n in range(_OVERRIDDEN):
+                width = getattr(message, f"chan{n + 1}_raw", _IGNORED)
+                if width == 0:
+                    self._overrides.pop(n, None)
+                elif width != _IGNORED:
+                    self._overrides[n] = width
             raw = (message.chan2_raw, message.chan1_raw, message.chan3_raw, message.chan4_raw)
             forward, right, throttle, turn = ((each - 1500) / 500 if 900 < each < 2200 else 0.0 for each in raw)
             shares = (-forward, -right, throttle, -turn)
@@ -348,14 +363,37 @@ class ArduCopter(Autopilot):
         self._paused = not order
         return ACCEPTED
 
+    def _send_banner(self, arguments: Arguments) -> int:  # noqa: ARG002  it has none
+        major, minor = self.VERSION >> 24, self.VERSION >> 16 & 0xFF
+        for text in (f"ArduCopter V{major}.{minor}.0-dev (emulated by Skyloop)", "Frame: QUAD/X"):
+            self.send_text(text, INFO)
+        return ACCEPTED
+
+    def _reboot(self, arguments: Arguments) -> int:
+        if self.armed or whole(arguments[0]) not in (1, 3):
+            return FAILED
+        self._set_mode("STABILIZE")
+        self._stick, self._overrides, self.failsafe = None, {}, False
+        self._restart()  # mission and parameters stay
+        return ACCEPTED
+
+    @property
+    def channels(self) -> list[int] | None:
+        """Pulse widths of its remote control [µs]: sticks in the middle, the throttle down, and what overrides them."""
+        fresh = self.time_s - self._stick_s < STICK_TIMEOUT_S
+        usual = [1500, 1500, 1000, *[1500] * (CHANNELS - 3)]
+        return [self._overrides.get(n, width) if fresh else width for n, width in enumerate(usual)]
+
     def _own(self, port: Port, message: Message) -> bool:
-        """Handle a position to go to that comes as an item of a mission."""
-        if message.get_type() not in ("MISSION_ITEM", "MISSION_ITEM_INT") or message.mission_type != 0:
-            return False
-        if message.current not in (_GUIDED_ITEM, _ALTITUDE_ITEM):
-            return False
-        port.send(mission_ack(message, self._guided_item(message)))
-        return True
+        """Handle its mission, and a position to go to that comes as an item of one."""
+        item = message.get_type() in ("MISSION_ITEM", "MISSION_ITEM_INT") and message.mission_type == 0
+        if item and message.current in (_GUIDED_ITEM, _ALTITUDE_ITEM):
+            port.send(mission_ack(message, self._guided_item(message)))
+            return True
+        found = self.mission.answers(message, geodetic(self.home))
+        for answer in found or ():
+            port.send(answer)
+        return found is not None
 
     def _guided_item(self, message: Message) -> int:
         scale = 1e7 if message.get_type() == "MISSION_ITEM_INT" else 1.0

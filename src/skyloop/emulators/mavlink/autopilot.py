@@ -40,6 +40,13 @@ AFTER_LANDING_S: Final = 2.0
 POSES_S: Final = 1.0  #: poses from outside must come for so long, without GPS
 POSE_GAP_S: Final = 0.5
 _GCS: Final = 6  #: MAV_TYPE
+#: What the old way to ask for all messages does not change.
+_ON_REQUEST: Final = (
+    m.MAVLINK_MSG_ID_HEARTBEAT,
+    m.MAVLINK_MSG_ID_TIMESYNC,
+    m.MAVLINK_MSG_ID_HOME_POSITION,
+    m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+)
 _COPIES: Final = 1 << 32
 _NOT_GIVEN: Final = 0x7FFFFFFF  #: of a position in COMMAND_INT, as NaN is in COMMAND_LONG
 
@@ -280,6 +287,19 @@ class Autopilot(ABC):
             for answer in answers(message):
                 port.send(answer)
 
+    def _restart(self) -> None:
+        """Boot again, as if it were switched on now."""
+        self._begun_s = self._gcs_s = None
+        self.home, self._home_given = (0.0, 0.0, 0.0), False
+        self._pose_s, self._posing_s = -math.inf, math.inf
+        for port in self.ports:
+            port.streams.reset()
+
+    @property
+    def channels(self) -> list[int] | None:
+        """Pulse widths of its remote control [µs]; None: it reports none."""
+        return None
+
     def _own(self, port: Port, message: Message) -> bool:  # noqa: ARG002
         """Handle a message that only one of the autopilots answers. Return whether it was such a one."""
         return False
@@ -305,7 +325,7 @@ class Autopilot(ABC):
         """Handle the old way to ask for messages: all of them at one rate."""
         rate = min(50, message.req_message_rate) if message.start_stop else 0
         for number in MAKERS:
-            if number not in (m.MAVLINK_MSG_ID_HEARTBEAT, m.MAVLINK_MSG_ID_TIMESYNC):
+            if number not in _ON_REQUEST:
                 port.streams.set_interval(number, 1e6 / rate if rate else -1)
 
     # Commands ----------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Answers to requests for missions, files and logs, of which the emulations have none. Pure."""
+"""Answers to requests for missions, files and logs: an ArduCopter keeps a mission, and flies none. Pure."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from skyloop.wire.mavlink.codec import dialect as m
 MISSION_ACCEPTED: Final = 0
 MISSION_ERROR: Final = 1
 MISSION_UNSUPPORTED: Final = 3
+MISSION_NO_SPACE: Final = 4
+MISSION_INVALID_SEQUENCE: Final = 13
+MOST_ITEMS: Final = 500
+_SCALE: Final = 1e7  #: of latitude and longitude in MISSION_ITEM_INT
+_HOME_FRAME: Final = 0  #: MAV_FRAME_GLOBAL, with altitudes above mean sea level
 MISSION_INVALID_X: Final = 10
 MISSION_INVALID_Y: Final = 11
 MISSION_INVALID_Z: Final = 12
@@ -38,6 +43,82 @@ def mission_ack(message: Message, result: int) -> Message:
     """Return a ``MISSION_ACK`` to the sender of a message."""
     kind = getattr(message, "mission_type", 0)
     return m.MAVLink_mission_ack_message(message.get_srcSystem(), message.get_srcComponent(), result, kind)
+
+
+class Mission:
+    """A mission as ArduCopter keeps it: item 0 is home, whatever is uploaded there.
+
+    Attributes:
+        current: The number of the item that would be flown next.
+    """
+
+    def __init__(self) -> None:
+        self.current = 0
+        self._items: list[Message] = []  # from number 1 on
+        self._coming: list[Message] = []
+        self._wanted = 0  # of an upload under way; 0: there is none
+
+    def answers(self, message: Message, home: tuple[int, int, int]) -> list[Message] | None:
+        """Return the answers to a message; None for one that is not about a mission.
+
+        Args:
+            message: Whatever came.
+            home: Latitude and longitude [1e-7 degrees], altitude above mean sea level [mm].
+        """
+        kind = message.get_type()
+        if getattr(message, "mission_type", 0) != 0:
+            return None
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        if kind == "MISSION_REQUEST_LIST":
+            return [m.MAVLink_mission_count_message(*sender, len(self._items) + 1, 0)]
+        if kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
+            if not 0 <= message.seq <= len(self._items):
+                return [mission_ack(message, MISSION_INVALID_SEQUENCE)]
+            return [self._item(message.seq, sender, home, whole=kind == "MISSION_REQUEST_INT")]
+        if kind == "MISSION_COUNT":
+            self._coming, self._wanted = [], 0
+            if message.count > MOST_ITEMS:
+                return [mission_ack(message, MISSION_NO_SPACE)]
+            if not message.count:
+                self._items = []
+                return [mission_ack(message, MISSION_ACCEPTED)]
+            self._wanted = message.count
+            return [m.MAVLink_mission_request_message(*sender, 0, 0)]
+        if kind in ("MISSION_ITEM", "MISSION_ITEM_INT") and self._wanted:
+            return self._take(message, sender)
+        if kind == "MISSION_CLEAR_ALL":
+            self._items, self._wanted, self.current = [], 0, 0
+            return [mission_ack(message, MISSION_ACCEPTED)]
+        if kind == "MISSION_SET_CURRENT":
+            if not 0 <= message.seq <= len(self._items):
+                return []
+            self.current = message.seq
+            return [m.MAVLink_mission_current_message(self.current)]
+        return None
+
+    def _take(self, message: Message, sender: tuple[int, int]) -> list[Message]:
+        if message.seq != len(self._coming):
+            return [mission_ack(message, MISSION_INVALID_SEQUENCE)]
+        self._coming.append(message)
+        if len(self._coming) < self._wanted:
+            return [m.MAVLink_mission_request_message(*sender, len(self._coming), 0)]
+        self._items, self._coming, self._wanted, self.current = self._coming[1:], [], 0, 0
+        return [mission_ack(message, MISSION_ACCEPTED)]
+
+    def _item(self, number: int, sender: tuple[int, int], home: tuple[int, int, int], *, whole: bool) -> Message:
+        if number == 0:
+            latitude, longitude, altitude_m = home[0] / _SCALE, home[1] / _SCALE, home[2] / 1000.0
+            first = _HOME_FRAME, m.MAV_CMD_NAV_WAYPOINT, 0, 1, 0.0, 0.0, 0.0, 0.0
+        else:
+            kept = self._items[number - 1]
+            scale = _SCALE if kept.get_type() == "MISSION_ITEM_INT" else 1.0
+            latitude, longitude, altitude_m = kept.x / scale, kept.y / scale, kept.z
+            rest = kept.param1, kept.param2, kept.param3, kept.param4
+            first = kept.frame, kept.command, int(number == self.current), kept.autocontinue, *rest
+        if whole:
+            place = round(latitude * _SCALE), round(longitude * _SCALE), altitude_m
+            return m.MAVLink_mission_item_int_message(*sender, number, *first, *place, 0)
+        return m.MAVLink_mission_item_message(*sender, number, *first, latitude, longitude, altitude_m, 0)
 
 
 def answers(message: Message) -> Iterable[Message]:

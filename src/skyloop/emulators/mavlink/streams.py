@@ -20,6 +20,11 @@ class Streams:
         self._periods = {number: 1.0 / rate for number, rate in rates.items()}
         self._due = dict.fromkeys(self._periods, 0.0)
 
+    def reset(self) -> None:
+        """Begin anew: the autopilot was switched on again, and its clock with it."""
+        self._periods = {number: 1.0 / rate for number, rate in self._usual.items()}
+        self._due = dict.fromkeys(self._periods, 0.0)
+
     def set_interval(self, number: int, interval_us: float) -> None:
         """Set a message's interval, as ``SET_MESSAGE_INTERVAL`` has it: -1 stops it, 0 is its usual rate."""
         if interval_us < 0:

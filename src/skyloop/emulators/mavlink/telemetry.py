@@ -57,8 +57,11 @@ class AutopilotState(Protocol):
     def ready(self) -> bool: ...
     @property
     def settled(self) -> bool: ...
+    @property
+    def channels(self) -> list[int] | None: ...
 
 
+_MOST_CHANNELS: Final = 18
 Maker = Callable[[AutopilotState], Message | None]
 
 
@@ -179,6 +182,19 @@ def _current_mode(a: AutopilotState) -> Message:
     return m.MAVLink_current_mode_message(0, a.custom_mode, a.custom_mode)
 
 
+def _channels(a: AutopilotState) -> Message | None:
+    widths = a.channels
+    if widths is None:
+        return None
+    padded = widths + [0xFFFF] * (_MOST_CHANNELS - len(widths))
+    return m.MAVLink_rc_channels_message(a.boot_ms, len(widths), *padded, 255)
+
+
+def _mission(a: AutopilotState) -> Message | None:
+    mission = getattr(a, "mission", None)  # of an ArduCopter
+    return None if mission is None else m.MAVLink_mission_current_message(mission.current)
+
+
 def _sync(a: AutopilotState) -> Message:
     return m.MAVLink_timesync_message(0, a.boot_ns)
 
@@ -203,5 +219,7 @@ MAKERS: Final[dict[int, Maker]] = {
     m.MAVLINK_MSG_ID_ALTITUDE: _altitude,
     m.MAVLINK_MSG_ID_SYSTEM_TIME: _time,
     m.MAVLINK_MSG_ID_CURRENT_MODE: _current_mode,
+    m.MAVLINK_MSG_ID_RC_CHANNELS: _channels,
+    m.MAVLINK_MSG_ID_MISSION_CURRENT: _mission,
     m.MAVLINK_MSG_ID_TIMESYNC: _sync,
 }

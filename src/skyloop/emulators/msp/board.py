@@ -16,6 +16,7 @@ from skyloop.emulators.msp.settings import (
     CELLS,
     CHANNELS,
     HOVER_THROTTLE,
+    RECORDED,
     THRUST_POWER,
     BoardSettings,
 )
@@ -155,7 +156,12 @@ class Board:
             Function.BATTERY_STATE: lambda: self._battery().state(),
             Function.ANALOG: lambda: self._battery().analog(),
         }
-        return makers[function]() if function in makers else None
+        if function in makers:
+            return makers[function]()
+        if function not in RECORDED:
+            return None
+        length, begin = RECORDED[function]
+        return bytes.fromhex(begin).ljust(length, b"\0")
 
     # State ---------------------------------------------------------------------------------------------------------
 

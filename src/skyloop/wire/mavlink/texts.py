@@ -24,14 +24,22 @@ class Texts:
 
     def __init__(self) -> None:
         self._open: dict[tuple[int, int], tuple[int, dict[int, str]]] = {}
+        self._ended: dict[tuple[int, int], dict[int, str]] = {}
 
     def on_message(self, message: Message) -> list[tuple[int, str]]:
-        """The texts that are complete with this message, with their severities (0 emergency to 7 debug)."""
+        """The texts that are complete with this message, with their severities (0 emergency to 7 debug).
+
+        A chunk that comes twice, or after the last one of its text, makes no other text.
+        """
         text = _printable(message.text)
         number = message.id
         if not number:
             return [(message.severity, text.strip())] if text.strip() else []
         key = message.get_srcComponent(), number
+        if key in self._ended:
+            if self._ended[key].get(message.chunk_seq, text) == text:
+                return []
+            del self._ended[key]  # the vehicle was started anew, and counts its texts from the beginning
         _, chunks = self._open.setdefault(key, (message.severity, {}))
         ended: list[tuple[int, str]] = []
         chunks[message.chunk_seq] = text
@@ -43,6 +51,9 @@ class Texts:
 
     def _end(self, key: tuple[int, int]) -> tuple[int, str]:
         severity, chunks = self._open.pop(key)
+        self._ended[key] = chunks
+        while len(self._ended) > _MOST_OPEN:
+            del self._ended[next(iter(self._ended))]
         pieces = [chunks.get(at, "…") for at in range(max(chunks) + 1)]
         return severity, "".join(pieces).strip()
 

@@ -193,35 +193,114 @@ def camera_model(intrinsics: Intrinsics | None) -> CameraModel:
     )
 
 
+#: How many coefficients OpenCV's pinhole distortions have: fewer are filled up with zeros, which mean the same.
+_LENGTHS: Final = (0, 4, 5, 8, 12, 14)
+_FISHEYES: Final = ("equidistant", "fisheye")
+_PINHOLES: Final = ("", "plumb_bob", "rational_polynomial", "thin_prism", "pinhole")
+
+
 def intrinsics_of(info: Any) -> Intrinsics | None:
-    """Return the intrinsics of a ``sensor_msgs/CameraInfo``; None if it has none that make sense."""
+    """Return the intrinsics of a ``sensor_msgs/CameraInfo``; None for a camera that is not calibrated.
+
+    Raises:
+        DecodeError: Its distortion is none that is known here.
+    """
     k = [float(each) for each in info.k]
-    d = tuple(float(each) for each in info.d)
-    if not (all(map(math.isfinite, (*k, *d))) and k[0] > 0.0 and k[4] > 0.0 and len(d) <= 14):
+    d = [float(each) for each in info.d]
+    if not (all(map(math.isfinite, (*k, *d))) and k[0] > 0.0 and k[4] > 0.0):
         return None
-    fisheye = info.distortion_model in ("equidistant", "fisheye")
-    return Intrinsics(k[0], k[4], k[2], k[5], d if any(d) else (), "fisheye" if fisheye else "pinhole")
+    fisheye = info.distortion_model in _FISHEYES
+    while d and d[-1] == 0.0:
+        del d[-1]
+    if d and not fisheye and info.distortion_model not in _PINHOLES:
+        known = ", ".join((*_PINHOLES[1:], *_FISHEYES))
+        raise DecodeError(f"a lens of the model {info.distortion_model!r} is not known, only {known}")
+    most = 4 if fisheye else _LENGTHS[-1]
+    if len(d) > most:
+        raise DecodeError(
+            f"a lens of the model {info.distortion_model!r} has {most} coefficients at most, got {len(d)}"
+        )
+    wanted = (4 if d else 0) if fisheye else next(length for length in _LENGTHS if length >= len(d))
+    d += [0.0] * (wanted - len(d))
+    return Intrinsics(k[0], k[4], k[2], k[5], tuple(d), "fisheye" if fisheye else "pinhole")
+
+
+def skew_of(info: Any) -> float:
+    """Return the skew of a ``sensor_msgs/CameraInfo`` [px]: :class:`Intrinsics` has none."""
+    skew = float(info.k[1])
+    return skew if math.isfinite(skew) else 0.0
+
+
+#: Encodings that OpenCV converts to BGR: rows and bytes of a row for a height and width in pixels, and its name for it.
+#: Of a Bayer pattern ROS names the first two pixels of a row, OpenCV the second and third of the second row.
+_CONVERTED: Final[dict[str, tuple[float, int, str]]] = {
+    "yuv422": (1, 2, "YUV2BGR_UYVY"),
+    "uyvy": (1, 2, "YUV2BGR_UYVY"),
+    "yuv422_yuy2": (1, 2, "YUV2BGR_YUY2"),
+    "yuyv": (1, 2, "YUV2BGR_YUY2"),
+    "nv12": (1.5, 1, "YUV2BGR_NV12"),
+    "nv21": (1.5, 1, "YUV2BGR_NV21"),
+    **{
+        f"bayer_{first}{bits}": (1, bits // 8, f"Bayer{name}2BGR")
+        for first, name in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB"))
+        for bits in (8, 16)
+    },
+}
+_WIDE: Final = "mono16"
+ENCODINGS: Final = (*_PIXELS, _WIDE, *_CONVERTED)
 
 
 def pixels_of(image: Any) -> tuple[NDArray[np.uint8], Encoding]:
     """Return the pixels of a ``sensor_msgs/Image``: C-contiguous uint8, without padding, and how they are to be read.
 
+    Of 16 bits the upper eight are taken.
+
     Raises:
-        DecodeError: Its encoding is none that is known here, or its size does not fit its data.
+        DecodeError: Its encoding is none that is known here, its size does not fit its data, or OpenCV is missing.
     """
-    known = _PIXELS.get(image.encoding)
-    if known is None:
-        raise DecodeError(f"images of encoding {image.encoding!r} are not read, only {', '.join(_PIXELS)}")
-    channels, order, encoding = known
+    given = image.encoding if image.encoding in _PIXELS else str(image.encoding).lower()
+    if given in _PIXELS:
+        channels, order, encoding = _PIXELS[given]
+        rows, width = _rows(image, 1, channels), int(image.width)
+        if order is None:
+            shape = (len(rows), width, channels) if channels > 1 else (len(rows), width)
+            return np.ascontiguousarray(rows).reshape(shape), encoding
+        return np.ascontiguousarray(rows.reshape(len(rows), width, channels)[:, :, order]), encoding
+    if given == _WIDE:
+        return np.ascontiguousarray(_upper(_rows(image, 1, 2), image)), Encoding.MONO8
+    if given not in _CONVERTED:
+        raise DecodeError(f"images of encoding {image.encoding!r} are not read, only {', '.join(ENCODINGS)}")
+    high, wide, name = _CONVERTED[given]
+    rows = _rows(image, high, wide)
+    if given.endswith("16"):
+        rows = _upper(rows, image)
+    elif wide == 2:
+        rows = rows.reshape(len(rows), int(image.width), 2)
+    try:
+        import cv2
+    except ImportError as error:
+        raise DecodeError(
+            f"images of encoding {image.encoding!r} need OpenCV: pip install opencv-python-headless"
+        ) from error
+    try:
+        found = cv2.cvtColor(np.ascontiguousarray(rows), getattr(cv2, f"COLOR_{name}"))
+    except cv2.error as error:  # an odd width or height, of which this encoding has no halves
+        raise DecodeError(f"an image of {image.width}×{image.height} {image.encoding} can't be converted") from error
+    return np.ascontiguousarray(found, dtype=np.uint8), Encoding.BGR8
+
+
+def _rows(image: Any, high: float, wide: int) -> NDArray[np.uint8]:
+    """Return the rows of an image without their padding: ``high`` rows a row of pixels, ``wide`` bytes a pixel."""
     height, width, step = int(image.height), int(image.width), int(image.step)
     data = np.frombuffer(image.data, np.uint8)
-    row = width * channels
-    if not (height > 0 and width > 0 and step >= row and data.size == height * step):
+    rows, row = math.ceil(height * high), width * wide
+    if not (height > 0 and width > 0 and step >= row and data.size == rows * step):
         raise DecodeError(
             f"an image of {width}×{height} {image.encoding} with step {step} can't have {data.size} bytes"
         )
-    rows = data.reshape(height, step)[:, :row]
-    if order is None:
-        shape = (height, width, channels) if channels > 1 else (height, width)
-        return np.ascontiguousarray(rows).reshape(shape), encoding
-    return np.ascontiguousarray(rows.reshape(height, width, channels)[:, :, order]), encoding
+    return data.reshape(rows, step)[:, :row]
+
+
+def _upper(rows: NDArray[np.uint8], image: Any) -> NDArray[np.uint8]:
+    """Return the upper bytes of rows of 16-bit numbers."""
+    return rows[:, 0 if getattr(image, "is_bigendian", 0) else 1 :: 2]

@@ -109,8 +109,11 @@ def _state(fields: dict[str, float | Vector]) -> State:
     )
 
 
+PADS: Final = range(1, 9)  #: the numbers of the pads that there are
+
+
 def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector | None) -> Pad | None:
-    if number is None or not number > 0:
+    if number is None or number not in PADS:  # -1 and 0: none is in view; some firmware says 257 then
         return None
     angles = fields.get("mpry")
     nowhere = (float(NOWHERE_CM),) * 3

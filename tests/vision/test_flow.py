@@ -1,0 +1,24 @@
+"""The ground in a downward camera's frames."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skyloop.messages import CameraInfo, Feedback, FlightState, Intrinsics
+from skyloop.vision.flow import GroundTracker
+
+
+def test_another_size_of_the_frames_begins_anew() -> None:
+    """A camera that changes its resolution in flight ended what held the place by it."""
+    noise = np.random.default_rng(1).integers(0, 255, (60, 80), np.uint8)
+    camera = CameraInfo("bottom", 320, 240, 30.0, rotation=(0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0))
+    tracker = GroundTracker(camera)
+    level = Feedback(
+        captured_ns=0, state=FlightState.HOVERING, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, altitude_m=1.0
+    )
+    for scale in (4, 4, 8, 8, 4, 4):
+        image = noise.repeat(scale, axis=0).repeat(scale, axis=1)
+        lens = Intrinsics(60.0 * scale, 60.0 * scale, 40.0 * scale, 30.0 * scale)
+        found = tracker.see(image, level, lens)
+    assert found is not None
+    assert np.abs(found[0]).max() < 0.01, "it has not moved"
