@@ -86,11 +86,13 @@ def fly(
 
 
 def make(controller_class: type[Controller], drone: Drone) -> Controller:
-    """Make the user's controller.
+    """Make the user's controller, and say which of its methods looks like a misspelt callback.
 
     Raises:
         UsageError: The class can't be made as one is here.
     """
+    from skyloop.control.controller import misspelt
+
     name = controller_class.__name__
     try:
         inspect.signature(controller_class).bind(drone)
@@ -101,6 +103,8 @@ def make(controller_class: type[Controller], drone: Drone) -> Controller:
     controller = controller_class(drone)
     if getattr(controller, "drone", None) is not drone:
         raise UsageError(f"{name}.__init__ must begin with super().__init__(drone)")
+    for note in misspelt(controller_class):
+        say(f"note: {note}")
     return controller
 
 
@@ -138,6 +142,7 @@ def run(
             return flight.run_reloading(seconds, reloader, lambda found: make(found, drone))
     except KeyboardInterrupt:
         say("stopped by Ctrl-C")
+        flight.report_notes()
     return True
 
 
