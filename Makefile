@@ -27,11 +27,12 @@ $(VENV)/.installed: pyproject.toml
 	@echo "Installing Skyloop into $(VENV): a minute or two, once"
 	@(while sleep 2; do printf .; done) & trap "kill $$!" EXIT; $(PYTHON) -m venv $(VENV)
 	@echo
-	$(subst --quiet ,,$(PIP)) --editable '.[sim,fast,vision,cockpit]'
+	$(subst --quiet ,,$(PIP)) --editable '.[sim,vision,cockpit]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.txt requirements-dev.lock
-	$(PIP) --editable '.[all]' --requirement requirements-dev.txt
+	@echo "Installing what the tests need into $(VENV): some minutes, once"
+	$(subst --quiet ,,$(PIP)) --editable '.[all]' --requirement requirements-dev.txt
 	@touch $@
 
 demo: $(VENV)/.installed
@@ -86,7 +87,7 @@ lock: $(VENV)/.installed-dev
 	mv .lock.new requirements-dev.lock
 
 $(VENV)/.installed-docs: $(VENV)/.installed-dev requirements-docs.txt
-	$(PIP) --requirement requirements-docs.txt
+	$(subst --quiet ,,$(PIP)) --requirement requirements-docs.txt
 	@touch $@
 
 # A warning is an error, such as a link that leads nowhere.

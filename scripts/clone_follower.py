@@ -1,6 +1,6 @@
 """Clones a controller: the marker follower teaches a network that sees pictures and state, and the network flies.
 
-    pip install 'skyloop[all]' torch onnx
+    skyloop install all && pip install torch onnx
     python -m scripts.clone_follower clone                                   # into this folder
     python -m scripts.clone_follower clone --rounds 1 --flights 1 --epochs 1 # does it work here?
 

@@ -8,7 +8,7 @@
     │   ├── FileFormatError               a file cannot be understood; names the file and the place
     │   └── NameTakenError                the name is in use; says by whom
     ├── DecodeError (also ValueError)     received bytes are no valid packet, of Skyloop or a vehicle
-    ├── MissingExtraError (also ImportError)   an optional part is not installed; names the ``pip install``
+    ├── MissingExtraError (also ImportError)   an optional part is not installed; names the ``skyloop install``
     ├── UnsupportedError                  this platform or this vehicle cannot do what was asked
     ├── RefusedError                      the other end understood and refused; carries ``code`` and its reason
     │   ├── AuthorityError                commanding or writing without holding the authority
@@ -137,25 +137,35 @@ class DecodeError(SkyloopError, ValueError):
     """
 
 
+def install_command(*extras: str) -> str:
+    """Return the command that installs optional parts, in a checkout as from a wheel.
+
+    Args:
+        extras: Their names.
+    """
+    return f"skyloop install {' '.join(extras)}"
+
+
 class MissingExtraError(SkyloopError, ImportError):
-    """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``pip install``."""
+    """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``skyloop install``."""
 
     def __init__(self, what: str, extra: str, *, cause: str = "") -> None:
         """Compose the message.
 
         Args:
             what: What needs the optional part.
-            extra: Name of the extra, as in ``skyloop[extra]``.
+            extra: Name of the extra, as ``skyloop install`` takes it; of several, with spaces between.
             cause: Why the import failed, if known.
         """
+        self.what = what
         self.extra = extra
-        self._arguments = (what, extra, cause)
+        self.cause = cause
+        part = "an optional part that is" if " " not in extra else "optional parts that are"
         detail = f" ({cause})" if cause else ""
-        super().__init__(f"{what} needs an optional part that is not installed{detail}: pip install 'skyloop[{extra}]'")
+        super().__init__(f"{what} needs {part} not installed{detail}: {install_command(extra)}")
 
     def __reduce__(self) -> tuple[object, ...]:
-        what, extra, cause = self._arguments
-        return partial(type(self), cause=cause), (what, extra)
+        return partial(type(self), cause=self.cause), (self.what, self.extra)
 
 
 class UnsupportedError(SkyloopError):

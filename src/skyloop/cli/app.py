@@ -15,7 +15,7 @@ from skyloop.cli import wording
 from skyloop.cli.commands import COMMANDS, Entry
 from skyloop.cli.naming import with_place
 from skyloop.cli.plain_help import Command, Group, WithBehaviours, width
-from skyloop.errors import ParameterError, SkyloopError
+from skyloop.errors import MissingExtraError, ParameterError, SkyloopError
 
 _log = logging.getLogger(__name__)
 VERBOSE: Final = "--verbose"  #: works before and behind any command
@@ -97,6 +97,10 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _log.debug("the command failed", exc_info=error)
+        if isinstance(error, MissingExtraError):
+            from skyloop.cli.install import with_all_missing
+
+            error = with_all_missing(error, arguments)
         print(f"{name}: {wording.of(error)}", file=sys.stderr)
         sys.exit(USAGE_ERROR if isinstance(error, ValueError | ParameterError) else FAILED)
     sys.exit(code if isinstance(code, int) else 0)
