@@ -90,18 +90,20 @@ class UnknownNameError(UsageError, KeyError):
         message: The error's text.
     """
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: str, known: Iterable[str], *, where: str = "") -> None:
         """Compose the message, with suggestions from the known names.
 
         Args:
             kind: What was looked up, for example ``camera``.
             name: The name that was given.
             known: Names that exist.
+            where: Where they were looked up, behind the name: ``on the network``.
         """
         choices = sorted(set(known))
         self.kind = kind
         self.name = name
         self.known = choices
+        self.where = where
         self.suggestions: list[str] = difflib.get_close_matches(name, choices, n=3, cutoff=0.5)
         if self.suggestions:
             hint = "did you mean " + " or ".join(repr(s) for s in self.suggestions) + "?"
@@ -110,7 +112,7 @@ class UnknownNameError(UsageError, KeyError):
             hint = f"known: {shown}"
         else:
             hint = "none is known here"
-        self.message = f"no {kind} named {name!r}; {hint}"
+        self.message = f"no {kind} named {name!r}{f' {where}' if where else ''}; {hint}"
         super().__init__(self.message)
 
     @property
@@ -119,7 +121,7 @@ class UnknownNameError(UsageError, KeyError):
         return self.message
 
     def __reduce__(self) -> tuple[object, ...]:  # errors of worker processes come back pickled
-        return type(self), (self.kind, self.name, self.known), {"hint": self.hint}
+        return partial(type(self), where=self.where), (self.kind, self.name, self.known), {"hint": self.hint}
 
 
 class FileFormatError(UsageError):

@@ -15,6 +15,7 @@ from skyloop.cli import wording
 from skyloop.cli.commands import COMMANDS, Entry
 from skyloop.cli.naming import with_place
 from skyloop.cli.plain_help import Command, Group, WithBehaviours, width
+from skyloop.cli.text import coloured
 from skyloop.errors import MissingExtraError, ParameterError, SkyloopError
 
 _log = logging.getLogger(__name__)
@@ -93,7 +94,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
         print(f"{name}: nothing was done", file=sys.stderr)
         sys.exit(FAILED)
     except wording.WordError as error:
-        print(wording.of_word(error, name), file=sys.stderr)
+        print(coloured(wording.of_word(error, name), sys.stderr), file=sys.stderr)
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _log.debug("the command failed", exc_info=error)
@@ -101,7 +102,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
             from skyloop.cli.install import with_all_missing
 
             error = with_all_missing(error, arguments)
-        print(f"{name}: {wording.of(error)}", file=sys.stderr)
+        print(coloured(f"{name}: {wording.of(error)}", sys.stderr), file=sys.stderr)
         sys.exit(USAGE_ERROR if isinstance(error, ValueError | ParameterError) else FAILED)
     sys.exit(code if isinstance(code, int) else 0)
 

@@ -15,6 +15,7 @@ from skyloop.cli.completion import python_files
 from skyloop.cli.flight import Flight
 from skyloop.cli.flight_progress import FlightProgress
 from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, OptionalNameArgument, join_network, one_drone
+from skyloop.cli.text import coloured
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -169,4 +170,4 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG00
 
 def say(text: str) -> None:
     """Print a line on standard error."""
-    typer.echo(text, err=True)
+    typer.echo("\n".join(coloured(line, sys.stderr) for line in text.splitlines()), err=True)
