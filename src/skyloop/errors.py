@@ -156,15 +156,14 @@ class MissingExtraError(SkyloopError, ImportError):
 
         Args:
             what: What needs the optional part.
-            extra: Name of the extra, as ``skyloop install`` takes it; of several, with spaces between.
+            extra: Name of the extra, as ``skyloop install`` takes it.
             cause: Why the import failed, if known.
         """
         self.what = what
         self.extra = extra
         self.cause = cause
-        part = "an optional part that is" if " " not in extra else "optional parts that are"
         detail = f" ({cause})" if cause else ""
-        super().__init__(f"{what} needs {part} not installed{detail}: {install_command(extra)}")
+        super().__init__(f"{what} needs an optional part that is not installed{detail}: {install_command(extra)}")
 
     def __reduce__(self) -> tuple[object, ...]:
         return partial(type(self), cause=self.cause), (self.what, self.extra)

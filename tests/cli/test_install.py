@@ -13,7 +13,7 @@ import pytest
 from skyloop.cli import install
 from skyloop.cli.app import build
 from skyloop.cli.app import run as run_app
-from skyloop.errors import MissingExtraError, SkyloopError, UnknownNameError, UnsupportedError
+from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UnknownNameError, UnsupportedError
 from tests.cli.conftest import Run
 from tests.docs.pages import ROOT
 
@@ -96,18 +96,20 @@ def test_all_missing_parts_are_named_at_once(
     """The demo told of one part after the other, each after an installation."""
     monkeypatch.setattr(install, "_is_there", lambda module: module == "PIL")
     error = MissingExtraError("the simulator", "sim", cause="No module named 'cv2'")
+    told: list[str] = []
+    for raised in (error, LinkError(f"its proxy ended; its output:\n{error}")):
 
-    def demo(*_: object, **__: object) -> None:
-        raise error
+        def demo(*_: object, raised: Exception = raised, **__: object) -> None:
+            raise raised
 
-    with pytest.raises(SystemExit) as ended:
-        run_app(demo, ["demo", "--seconds", "3"])  # type: ignore[arg-type]
-    assert ended.value.code == 1
-    told = "skyloop: the simulator needs optional parts that are not installed (No module named 'cv2'): "
-    assert capsys.readouterr().err == f"{told}skyloop install sim vision cockpit\n"
-    alone = install.with_all_missing(error, ["record", "alpha"])
-    assert alone is error
-    assert str(alone).endswith("an optional part that is not installed (No module named 'cv2'): skyloop install sim")
+        with pytest.raises(SystemExit) as ended:
+            run_app(demo, ["demo", "--seconds", "3"])  # type: ignore[arg-type]
+        assert ended.value.code == 1
+        told.append(capsys.readouterr().err)
+    lacking = "the simulator needs an optional part that is not installed (No module named 'cv2')"
+    assert told[0] == f"skyloop: {lacking}: skyloop install sim vision cockpit\n"
+    assert told[1].endswith(f"\n{lacking}: skyloop install sim vision cockpit\n")
+    assert install.with_all_missing(str(error), ["record", "alpha"]) == str(error)
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 

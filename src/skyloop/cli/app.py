@@ -16,7 +16,7 @@ from skyloop.cli.commands import COMMANDS, Entry
 from skyloop.cli.naming import with_place
 from skyloop.cli.plain_help import Command, Group, WithBehaviours, width
 from skyloop.cli.text import coloured
-from skyloop.errors import MissingExtraError, ParameterError, SkyloopError
+from skyloop.errors import ParameterError, SkyloopError, install_command
 
 _log = logging.getLogger(__name__)
 VERBOSE: Final = "--verbose"  #: works before and behind any command
@@ -98,11 +98,12 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _log.debug("the command failed", exc_info=error)
-        if isinstance(error, MissingExtraError):
+        told = wording.of(error)
+        if install_command("") in told:  # its own, or of a proxy that it started
             from skyloop.cli.install import with_all_missing
 
-            error = with_all_missing(error, arguments)
-        print(coloured(f"{name}: {wording.of(error)}", sys.stderr), file=sys.stderr)
+            told = with_all_missing(told, arguments)
+        print(coloured(f"{name}: {told}", sys.stderr), file=sys.stderr)
         sys.exit(USAGE_ERROR if isinstance(error, ValueError | ParameterError) else FAILED)
     sys.exit(code if isinstance(code, int) else 0)
 

@@ -17,7 +17,7 @@ from typing import Annotated, Final
 
 import typer
 
-from skyloop.errors import MissingExtraError, SkyloopError, UnknownNameError, UnsupportedError
+from skyloop.errors import SkyloopError, UnknownNameError, UnsupportedError, install_command
 
 #: Each optional part: the extra's name, what it is for, and the modules that it needs.
 EXTRAS: Final = (
@@ -131,16 +131,14 @@ def _is_there(module: str) -> bool:
         return False
 
 
-def with_all_missing(error: MissingExtraError, words: Sequence[str]) -> MissingExtraError:
+def with_all_missing(told: str, words: Sequence[str]) -> str:
     """Return an error that names all parts that a command lacks, not only the one that it met first.
 
     Args:
-        error: As it was raised.
+        told: The error, which ends with how to install a part.
         words: The command line.
     """
     plain = [word for word in words if not word.startswith("-")]
     needed: Collection[str] = NEEDS.get(" ".join(plain[:2])) or NEEDS.get(" ".join(plain[:1]), ())
-    others = [part for part in missing(needed) if part != error.extra]
-    if not others:
-        return error
-    return MissingExtraError(error.what, " ".join((error.extra, *others)), cause=error.cause)
+    before, command, first = told.rpartition(install_command(""))
+    return before + command + " ".join((first, *(part for part in missing(needed) if part != first)))
