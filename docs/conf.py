@@ -65,7 +65,7 @@ suppress_warnings = ["ref.python"]  # `Drone` is in skyloop and in skyloop.aio
 
 html_theme = "furo"
 html_title = "Skyloop"
-html_favicon = "pictures/icon.svg"
+html_favicon = "../src/skyloop/cockpit/static/icon.svg"
 html_search_scorer = str(ROOT / "docs" / "search_scorer.js")
 html_show_sphinx = False
 html_copy_source = False
