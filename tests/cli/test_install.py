@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import pickle
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -44,7 +46,7 @@ def test_several_parts_are_installed_into_this_environment_each_requirement_once
         return SimpleNamespace(returncode=0)
 
     monkeypatch.setattr(subprocess, "run", called)
-    monkeypatch.setattr(install.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     assert run("install", "sim", "vision").code == 0
     assert run("install", "--anew", "msp").code == 0
     assert calls[0][:4] == [sys.executable, "-m", "pip", "install"]
@@ -73,10 +75,10 @@ def test_what_can_not_be_installed_is_told(run: Run, monkeypatch: pytest.MonkeyP
 
 
 def test_an_environment_without_pip_takes_uv(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(install.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(install.shutil, "which", lambda name: "/bin/uv")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(shutil, "which", lambda name: "/bin/uv")
     assert install._installer(False)[:3] == ["uv", "pip", "install"]
-    monkeypatch.setattr(install.shutil, "which", lambda name: None)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(UnsupportedError, match="has no pip, and there is no uv"):
         install._installer(False)
 

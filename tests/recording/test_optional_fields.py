@@ -74,7 +74,9 @@ def actions() -> dict[str, AnyAction]:
 
 def recorded() -> dict[str, Any]:
     """A full sample of everything that is recorded."""
-    full = {name: one for name, one in SAMPLES.items() if type(one) in TYPES.values() and "minimal" not in name}
+    full: dict[str, Any] = {
+        name: one for name, one in SAMPLES.items() if type(one) in TYPES.values() and "minimal" not in name
+    }
     full |= {
         f"applied {name}": Applied(8, 7, 2, BEGIN_NS, BEGIN_NS + 1, action, action)
         for name, action in actions().items()
