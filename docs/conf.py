@@ -175,8 +175,10 @@ _MENDED = (
     (re.compile(r'role="heading">'), 'role="heading" aria-level="2">'),
     (re.compile(r"<pre>"), '<pre tabindex="0">'),  # its lines may be wider than the page
     (re.compile(r'<div class="table-wrapper( [^"]*)?">'), r'<div class="table-wrapper\1" tabindex="0">'),
-    (re.compile(r'<dl>(?=\s*<dd><em class="sig-param">)'), '<dl role="none">'),  # the lines of a long signature
-    (re.compile(r'<dd>(?=<em class="sig-param">)'), '<dd role="none">'),
+    (  # the lines of a long signature are no list
+        re.compile(r'<dl>\s*((?:<dd><em class="sig-param">(?:(?!</?d[ld]>).)*</dd>\s*)+)</dl>', re.DOTALL),
+        lambda found: '<div style="margin-left: 2rem">' + re.sub("<(/?)dd>", r"<\1div>", found[1]) + "</div>",
+    ),
     (re.compile(r'<aside class="sidebar-drawer">'), '<aside class="sidebar-drawer" aria-label="Pages">'),
     (re.compile(r'<aside class="toc-drawer( [^"]*)?">'), r'<aside class="toc-drawer\1" aria-label="On this page">'),
 )
