@@ -30,7 +30,7 @@ $(VENV)/.installed: pyproject.toml
 	@echo "Installing Skyloop into $(VENV): a minute or two, once"
 	@(while sleep 2; do printf .; done) & trap "kill $$!" EXIT; $(PYTHON) -m venv $(VENV)
 	@echo
-	$(PIP) --editable '.[sim,fast,vision,cockpit]'
+	$(PIP) --editable '.[sim,vision,cockpit]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.txt requirements-dev.lock

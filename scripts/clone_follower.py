@@ -1,6 +1,6 @@
 """Clones a controller: the marker follower teaches a network that sees pictures and state, and the network flies.
 
-    pip install 'skyloop[all]' torch onnx
+    skyloop install all && pip install torch onnx
     python -m scripts.clone_follower clone                                   # into this folder
     python -m scripts.clone_follower clone --rounds 1 --flights 1 --epochs 1 # does it work here?
 
@@ -14,17 +14,23 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from concurrent.futures import ProcessPoolExecutor
+from importlib.util import find_spec
 from itertools import repeat
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+if missing := [name for name in ("av", "cv2", "pyarrow", "torch", "onnx") if find_spec(name) is None]:
+    sys.exit(f"this needs {', '.join(missing)}: skyloop install all, and pip install torch onnx")
+
 import av
 import cv2
-import numpy as np
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 import skyloop
 from skyloop.clock import nanoseconds

@@ -1,6 +1,6 @@
-"""The reference of the command line, made from the commands themselves: the site's page of it, in reStructuredText.
+"""The reference of the command line, made from the commands themselves: the site's pages of them, in reStructuredText.
 
-python scripts/command_reference.py    # prints it; `make docs` puts it into the site
+python scripts/command_reference.py    # prints it; `make docs` puts them into the site
 """
 
 from __future__ import annotations
@@ -20,17 +20,36 @@ _OPTION: Final = re.compile(r"(?<![\w-])(--?[a-zA-Z][\w-]*)")
 _MARKUP: Final = re.compile(r"([\\*`|_<>])")
 
 
-def reference() -> str:
-    """Return the sections of all commands, by what one wants to do."""
+def pages() -> Iterator[tuple[str, str]]:
+    """Yield the name and the text of each command's page, by what one wants to do."""
     group = get_command(build())
     root = _context(group, "skyloop", None)
+    for name in COMMANDS:
+        text = "\n".join(_command(group.commands[name], name, root, "="))  # type: ignore[attr-defined]
+        yield f"skyloop-{name}", text + "\n"
+
+
+def overview(folder: str) -> str:
+    """Return the commands by what one wants to do, with links to their pages.
+
+    Args:
+        folder: Of those pages, as seen from the page that lists them.
+    """
     lines: list[str] = []
     for task in Task:
+        mine = {name: entry for name, entry in COMMANDS.items() if entry.task is task}
         lines += _title(task.value, "-")
-        for name, entry in COMMANDS.items():
-            if entry.task is task:
-                lines += _command(group.commands[name], name, root, "~")  # type: ignore[attr-defined]
+        lines += [
+            f"- :doc:`skyloop {name} <{folder}/skyloop-{name}>`: {_prose(entry.summary)}"
+            for name, entry in mine.items()
+        ]
+        lines += ["", ".. toctree::", "   :hidden:", "", *(f"   {folder}/skyloop-{name}" for name in mine), ""]
     return "\n".join(lines)
+
+
+def reference() -> str:
+    """Return the pages of all commands, one after the other."""
+    return "\n".join(text for _, text in pages())
 
 
 def _command(command: Any, name: str, parent: Any, underline: str) -> Iterator[str]:
@@ -49,9 +68,9 @@ def _command(command: Any, name: str, parent: Any, underline: str) -> Iterator[s
             if words not in _HELP:
                 yield from (f".. option:: {words}", "", f"   {_prose(meaning)}", "")
     for sub, inner in getattr(command, "commands", {}).items():
-        yield from _command(inner, sub, context, "^")
+        yield from _command(inner, sub, context, "-")
     for word, other in getattr(command, "behaviours", {}).items():
-        yield from _command(other, f"{name} {word}", parent, "^")
+        yield from _command(other, f"{name} {word}", parent, "-")
 
 
 def _context(command: Any, name: str, parent: Any) -> Any:

@@ -8,7 +8,7 @@
     │   ├── FileFormatError               a file cannot be understood; names the file and the place
     │   └── NameTakenError                the name is in use; says by whom
     ├── DecodeError (also ValueError)     received bytes are no valid packet, of Skyloop or a vehicle
-    ├── MissingExtraError (also ImportError)   an optional part is not installed; names the ``pip install``
+    ├── MissingExtraError (also ImportError)   an optional part is not installed; names the ``skyloop install``
     ├── UnsupportedError                  this platform or this vehicle cannot do what was asked
     ├── RefusedError                      the other end understood and refused; carries ``code`` and its reason
     │   ├── AuthorityError                commanding or writing without holding the authority
@@ -98,18 +98,20 @@ class UnknownNameError(UsageError, KeyError):
         message: The error's text.
     """
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: str, known: Iterable[str], *, where: str = "") -> None:
         """Compose the message, with suggestions from the known names.
 
         Args:
             kind: What was looked up, for example ``camera``.
             name: The name that was given.
             known: Names that exist.
+            where: Where they were looked up, behind the name: ``on the network``.
         """
         choices = sorted(set(known))
         self.kind = kind
         self.name = name
         self.known = choices
+        self.where = where
         self.suggestions: list[str] = difflib.get_close_matches(name, choices, n=3, cutoff=0.5)
         if self.suggestions:
             hint = "did you mean " + " or ".join(repr(s) for s in self.suggestions) + "?"
@@ -118,7 +120,7 @@ class UnknownNameError(UsageError, KeyError):
             hint = f"known: {shown}"
         else:
             hint = "none is known here"
-        self.message = f"no {kind} named {name!r}; {hint}"
+        self.message = f"no {kind} named {name!r}{f' {where}' if where else ''}; {hint}"
         super().__init__(self.message)
 
     @property
@@ -127,7 +129,7 @@ class UnknownNameError(UsageError, KeyError):
         return self.message
 
     def __reduce__(self) -> tuple[object, ...]:  # errors of worker processes come back pickled
-        return type(self), (self.kind, self.name, self.known), {"hint": self.hint}
+        return partial(type(self), where=self.where), (self.kind, self.name, self.known), {"hint": self.hint}
 
 
 class FileFormatError(UsageError):
@@ -145,25 +147,34 @@ class DecodeError(SkyloopError, ValueError):
     """
 
 
+def install_command(*extras: str) -> str:
+    """Return the command that installs optional parts, in a checkout as from a wheel.
+
+    Args:
+        extras: Their names.
+    """
+    return f"skyloop install {' '.join(extras)}"
+
+
 class MissingExtraError(SkyloopError, ImportError):
-    """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``pip install``."""
+    """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``skyloop install``."""
 
     def __init__(self, what: str, extra: str, *, cause: str = "") -> None:
         """Compose the message.
 
         Args:
             what: What needs the optional part.
-            extra: Name of the extra, as in ``skyloop[extra]``.
+            extra: Name of the extra, as ``skyloop install`` takes it.
             cause: Why the import failed, if known.
         """
+        self.what = what
         self.extra = extra
-        self._arguments = (what, extra, cause)
+        self.cause = cause
         detail = f" ({cause})" if cause else ""
-        super().__init__(f"{what} needs an optional part that is not installed{detail}: pip install 'skyloop[{extra}]'")
+        super().__init__(f"{what} needs an optional part that is not installed{detail}: {install_command(extra)}")
 
     def __reduce__(self) -> tuple[object, ...]:
-        what, extra, cause = self._arguments
-        return partial(type(self), cause=cause), (what, extra)
+        return partial(type(self), cause=self.cause), (self.what, self.extra)
 
 
 class UnsupportedError(SkyloopError):

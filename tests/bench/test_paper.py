@@ -34,7 +34,7 @@ def paper(*options: str) -> subprocess.CompletedProcess[str]:
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory, sockets: None) -> Path:
     """The folder of one flight."""
-    pytest.importorskip("matplotlib", reason="needs matplotlib: pip install 'skyloop[bench]'")
+    pytest.importorskip("matplotlib", reason="needs matplotlib: skyloop install bench")
     folder = tmp_path_factory.mktemp("paper") / "out"
     done = paper("--minutes", str(MINUTES), "--headless", "--seed", "3", "--output", str(folder))
     assert done.returncode == 0, done.stdout + done.stderr
@@ -88,7 +88,7 @@ def test_delays_and_path_are_those_of_a_flight(flown: Path) -> None:
 
 @pytest.mark.process
 def test_a_drone_that_was_put_down_takes_off_again_and_ctrl_c_ends_in_good_order(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="needs matplotlib: pip install 'skyloop[bench]'")
+    pytest.importorskip("matplotlib", reason="needs matplotlib: skyloop install bench")
     with Running("paper", "--minutes", "1", "--headless", "--output", str(tmp_path / "out")) as demo:
         name = demo.until(r"is\s+up\s+as\s+(\S+)\s", 40)[1]
         demo.until("flying through", 40)

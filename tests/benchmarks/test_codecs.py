@@ -73,6 +73,6 @@ def test_without_pyav_h264_is_left_out_with_the_reason(monkeypatch: pytest.Monke
     shares: list[float] = []
     results = codecs.measure_here(0.01, shares.append)
     assert [row.what.split(",")[0] for row in results.rows] == ["UVLC"] * 4 + ["navdata"]
-    assert "skyloop[video]" in results.skipped["H.264"]
+    assert "skyloop install video" in results.skipped["H.264"]
     assert "left out" in tables.codecs_table(results).rows[-1][1]
     assert shares == sorted(shares)

@@ -56,6 +56,7 @@ def sockets() -> Iterator[Path]:
     """A directory of sockets for this module alone; with a short path, as those of sockets must be."""
     with tempfile.TemporaryDirectory(prefix="skyloop-") as folder, pytest.MonkeyPatch.context() as patch:
         patch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
+        patch.setattr("skyloop.transport.local.names_of_others", dict)  # whoever else works on this machine
         yield Path(folder) / "run"
 
 

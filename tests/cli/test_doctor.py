@@ -71,7 +71,7 @@ def test_a_part_that_is_not_installed_is_no_fault_and_is_told_with_what_installs
     lacking(monkeypatch, "uvicorn", ModuleNotFoundError("No module named 'uvicorn'", name="uvicorn"))
     ended = run("doctor")
     assert ended.code == 0
-    assert "– page in the browser [cockpit]: uvicorn not installed\n  → pip install 'skyloop[cockpit]'" in ended.out
+    assert "– page in the browser [cockpit]: uvicorn not installed\n  → skyloop install cockpit" in ended.out
 
 
 def test_a_check_that_needs_a_part_that_is_not_installed_is_no_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

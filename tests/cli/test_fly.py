@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from skyloop.cli.fly import make
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from tests.cli.conftest import Run
+from tests.client.scripted import flown, scripted
 from tests.processes.conftest import Process
 from tests.recordings import recorded
 
@@ -245,3 +247,28 @@ def test_what_failed_because_of_another_error_shows_both_without_skyloops_lines(
     assert "is not a vehicle's address" in text
     assert "RuntimeError: so it went" in text
     assert "skyloop/drivers" not in text
+
+
+def test_what_failed_begins_with_the_line_of_the_user() -> None:
+    """Their own line comes first, not that of the library which they called, nor the loop that called them."""
+
+    def on_frame() -> object:
+        return json.loads("{")
+
+    try:
+        on_frame()
+    except ValueError as error:
+        first, second, *rest = what_failed(error).splitlines()
+    assert first.startswith("test_fly.py, line ")
+    assert first.endswith('in on_frame: return json.loads("{")')
+    assert second.startswith("  json.decoder.JSONDecodeError: Expecting property name")
+    assert "Traceback (most recent call last):" in rest
+
+
+def test_a_misspelt_callback_is_told_before_the_take_off(capsys: pytest.CaptureFixture[str]) -> None:
+    class Mine(skyloop.Controller):
+        def onframe(self, frame: skyloop.Frame) -> None: ...
+
+    with scripted() as proxy, flown(proxy) as drone:
+        make(Mine, drone)
+    assert capsys.readouterr().err == "note: Mine.onframe is called by nobody: is on_frame meant?\n"

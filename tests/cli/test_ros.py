@@ -16,7 +16,7 @@ def test_without_rclpy_it_says_what_to_install(run: Run, monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, "rclpy", None)
     ended = run("ros", "alpha")
     assert ended.code == 1
-    assert "pip install 'skyloop[ros]'" in ended.err
+    assert "skyloop install ros" in ended.err
 
 
 def test_options(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,4 +82,4 @@ def test_without_the_extra_the_error_names_it(run: Run, alpha: Process, monkeypa
     monkeypatch.setitem(sys.modules, "rerun", None)
     ended = run("view", "alpha", "--rerun", "--save", "x.rrd")
     assert ended.code == 1
-    assert "pip install 'skyloop[rerun]'" in ended.err
+    assert "skyloop install rerun" in ended.err

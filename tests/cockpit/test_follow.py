@@ -215,7 +215,7 @@ def test_without_opencv_the_refusal_names_the_extra(client: TestClient, monkeypa
     monkeypatch.setattr(follow_session, "opencv", missing)
     with marker(client) as pilot:
         pilot.say("follow_select", camera="front")
-        assert "pip install 'skyloop[vision]'" in refused(pilot, "follow_select")
+        assert "skyloop install vision" in refused(pilot, "follow_select")
 
 
 @contextmanager

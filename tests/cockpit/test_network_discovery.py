@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("zenoh", reason="needs Zenoh: pip install 'skyloop[network]'")
+pytest.importorskip("zenoh", reason="needs Zenoh: skyloop install network")
 
 import skyloop
 from skyloop.cockpit.discovery import Found, LocalFinder, NetworkFinder

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 pytestmark = pytest.mark.process
-pytest.importorskip("av", reason="H.264 needs: pip install 'skyloop[video]'")
+pytest.importorskip("av", reason="H.264 needs: skyloop install video")
 
 NO_DECODER: Final = "delete window.VideoDecoder"
 BROKEN: Final = "VideoDecoder.prototype.decode = () => { throw new Error('broken') }"

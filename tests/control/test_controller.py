@@ -9,8 +9,9 @@ import pytest
 
 from skyloop.client import AuthorityStatus, Drone, Frame
 from skyloop.control import Controller, RunSummary
+from skyloop.control.controller import misspelt
 from skyloop.errors import AuthorityError, UnknownNameError, UsageError
-from skyloop.messages import Feedback, FlightState, Hover, Velocity
+from skyloop.messages import EventKind, Feedback, FlightState, Hover, Velocity
 from skyloop.transport.base import video
 from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
 
@@ -219,3 +220,90 @@ def test_a_camera_of_ones_choice(proxy: ScriptedProxy, drone: Drone) -> None:
 def test_summary_in_words() -> None:
     summary = RunSummary(30, 64, 2, 1, 3, 2.04, "time")
     assert str(summary) == "2.0 s until time: 30 frames (2 dropped), 64 feedback samples (1 dropped), 3 overruns"
+
+
+class Misspelt(Controller):
+    def onframe(self, frame: Frame) -> None: ...
+
+    def on_feedbacks(self, feedback: Feedback) -> None: ...
+
+
+class Empty(Controller):
+    def once(self) -> None: ...
+
+
+class Steering(Controller):
+    def on_feedback(self, feedback: Feedback) -> None:
+        self.drone.velocity(forward=0.1)
+
+
+def test_a_misspelt_callback_is_named(drone: Drone) -> None:
+    summary = Misspelt(drone).run(seconds=0)
+    assert summary.notes == (
+        "Misspelt.onframe is called by nobody: is on_frame meant?",
+        "Misspelt.on_feedbacks is called by nobody: is on_feedback meant?",
+    )
+    assert str(summary).splitlines()[1] == f"note: {summary.notes[0]}"
+    nothing = "Empty has none of on_feedback, on_frame, on_result: nothing was called"
+    assert Empty(drone).run(seconds=0).notes == (nothing,)
+    assert list(misspelt(Controller)) == list(misspelt(Looking)) == list(misspelt(Noting)) == []
+
+
+@pytest.mark.parametrize("state", [FlightState.LANDED, FlightState.FLYING])
+def test_a_forgotten_take_off_is_named(proxy: ScriptedProxy, drone: Drone, state: FlightState) -> None:
+    proxy.state = state
+    drone.wait(lambda feedback: feedback.state is state, WAIT_S)
+    notes = Steering(drone).run(seconds=WAIT_S, until=lambda: Velocity(forward=0.1) in proxy.actions()).notes
+    if state is FlightState.FLYING:
+        assert notes == ()
+    else:
+        assert notes == ("it never took off: set-points went to a drone on the ground; call drone.takeoff() before",)
+
+
+def test_limited_set_points_are_told_by_limit_and_number(proxy: ScriptedProxy, drone: Drone) -> None:
+    def limited(asked: float, app: str = drone._core.app, limit: str = "limits.yaw_rate") -> None:
+        proxy.event(EventKind.COMMAND_CLAMPED, "limited", app, limit=limit, asked=asked, applied=1.75)
+
+    def known(asked: float) -> bool:
+        return any(event.data.get("asked") == asked for event in drone.recent_events())
+
+    limited(50.0)  # before the run, which it is not about
+    drone.wait(lambda _: known(50.0), WAIT_S)
+
+    class Turning(Controller):
+        sent = False
+
+        def on_feedback(self, feedback: Feedback) -> None:
+            if not self.sent:
+                self.sent = True
+                limited(97.0)
+                limited(7.0, "another")
+                limited(99.0)
+                limited(3.0, limit="limits.speed")
+
+    assert Turning(drone).run(seconds=WAIT_S, until=lambda: known(3.0)).notes == (
+        "limits.yaw_rate limited set-points 2 times: 1.75 instead of 99",
+        "limits.speed limited set-points: 1.75 instead of 3",
+    )
+
+
+class Detector:
+    def why_nothing(self) -> str:
+        return "nothing was found"
+
+
+def test_detectors_that_found_nothing_are_asked_wherever_the_controller_has_them(
+    drone: Drone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Own(Controller):
+        detector = Detector()
+
+        def __init__(self, drone: Drone) -> None:
+            super().__init__(drone)
+            self.another = Detector()
+
+        def on_frame(self, frame: Frame) -> None: ...
+
+    monkeypatch.setitem(globals(), "of_the_module", Own.detector)
+    assert Looking(drone).run(seconds=0).notes == ("nothing was found",)
+    assert Own(drone).run(seconds=0).notes == ("nothing was found",) * 2

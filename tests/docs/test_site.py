@@ -10,7 +10,7 @@ import pytest
 
 import skyloop
 from skyloop.cli.commands import COMMANDS
-from tests.docs.pages import ROOT
+from tests.docs.pages import ROOT, blocks
 
 DOCS = ROOT / "docs"
 REFERENCE = {path.stem: path.read_text() for path in (DOCS / "api").glob("*.rst")}
@@ -24,7 +24,7 @@ def listed() -> list[str]:
 
 
 def test_the_navigation_has_each_page_once() -> None:
-    pages = [path for suffix in ("md", "rst") for path in DOCS.rglob(f"*.{suffix}")]
+    pages = [path for path in (*DOCS.rglob("*.md"), *DOCS.rglob("*.rst")) if path.parent.name != "generated"]
     names = [str(path.relative_to(DOCS).with_suffix("")) for path in pages]
     assert sorted(listed()) == sorted(name for name in names if name != "index")
 
@@ -51,3 +51,34 @@ def test_the_reference_has_each_command_with_its_options() -> None:
     assert "   skyloop land [OPTIONS] NAME..." in sections["land"]
     assert "Show this message" not in text
     assert str(Path.home()) not in text, "it is the same on each machine"
+
+
+INDEX = (DOCS / "index.md").read_text()
+
+
+def test_the_first_page_shows_a_flight_before_the_first_program() -> None:
+    first = INDEX.index("![")
+    assert INDEX[first:].partition("(")[2].startswith("pictures/examples/follow_marker.webp)")
+    assert first < INDEX.index("```python")
+
+
+@pytest.mark.parametrize("page", ["index.md", *(f"start/{path.name}" for path in (DOCS / "start").glob("*.md"))])
+def test_the_first_programs_fit_beside_the_navigation(page: str) -> None:
+    """The key line of the first page's program was cut at the right edge, in a window of 1280 px."""
+    for block in blocks("python"):
+        if block.page == DOCS / page:
+            assert max(map(len, block.code.splitlines())) <= 88, str(block)
+
+
+def test_the_guides_are_in_groups() -> None:
+    trees = [re.findall(r"^[\w/-]+$", tree, re.MULTILINE) for tree in _TOCTREE.findall(INDEX)]
+    guides = [tree for tree in trees if not any(page.startswith(("api/", "start/")) for page in tree)]
+    assert max(map(len, guides)) <= 11
+
+
+def test_remedies_come_first_in_the_search() -> None:
+    """A search for "lost connection" found 37 pages, and Troubleshooting not among the first eight."""
+    scorer = (DOCS / "search_scorer.js").read_text()
+    assert "troubleshooting: 40" in scorer
+    symptoms = (DOCS / "troubleshooting.md").read_text().lower()
+    assert all(word in symptoms for word in ("lost connection", "does not take off", "no frame comes"))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
+import runpy
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -83,3 +85,11 @@ def film(path: Path) -> None:
         for _ in range(30):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
         container.mux(stream.encode())
+
+
+def test_the_worked_example_of_learning_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As printed it flew its lessons, and ended in a ModuleNotFoundError (issue 28, C7)."""
+    real = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None if name == "torch" else real(name, *rest))
+    with pytest.raises(SystemExit, match=r"needs torch.*: skyloop install all, and pip install torch onnx"):
+        runpy.run_path(str(ROOT / "scripts" / "clone_follower.py"), run_name="__main__")

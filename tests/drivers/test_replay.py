@@ -19,6 +19,7 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.replay import ReplayDriver
 from skyloop.drivers.replay.options import KNOWN
+from skyloop.drivers.replay.publisher import ReplayPublisher
 from skyloop.drivers.replay.source import ReplaySource, Timeline
 from skyloop.errors import ParameterError, UnknownNameError, UsageError
 from skyloop.logfile.layout import (
@@ -42,6 +43,7 @@ from skyloop.messages import (
     Hover,
     Land,
     LinkState,
+    Severity,
     Velocity,
 )
 from tests.docs.pages import rows, section
@@ -107,6 +109,18 @@ def test_the_recorded_commands_are_in_the_native_telemetry(flight: Path) -> None
     positions = [float(native["replay.position_s"]) for native in natives]  # type: ignore[arg-type]
     assert positions == sorted(positions)
     assert positions[-1] == pytest.approx(1.98, abs=0.03)
+
+
+def test_an_error_of_our_own_is_told_in_words(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise TypeError("float() argument must be a string or a real number, not 'NoneType'")
+
+    monkeypatch.setattr(ReplayPublisher, "feedback", fail)
+    with played(flight) as (_, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, WAIT_S)
+        (event,) = [event for event in sink.events if event.severity is Severity.ERROR]
+    assert event.text == sink.links[-1][1]
+    assert "can't be played beyond 0.0 s: an error in Skyloop, which the proxy's output has" in event.text
 
 
 def test_events_of_the_old_proxy_are_no_news_of_the_new_one(flight: Path) -> None:

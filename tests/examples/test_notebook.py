@@ -38,7 +38,7 @@ def test_it_is_kept_without_outputs(notebook: Any) -> None:
 def test_every_cell_runs(notebook: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     client = pytest.importorskip("nbclient", reason=f"needs nbclient: {HOW}")
     pytest.importorskip("ipykernel", reason=f"needs ipykernel: {HOW}")
-    pytest.importorskip("matplotlib", reason="needs matplotlib: pip install 'skyloop[bench]'")
+    pytest.importorskip("matplotlib", reason="needs matplotlib: skyloop install bench")
     for name in ("JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "IPYTHONDIR", "MPLCONFIGDIR"):
         monkeypatch.setenv(name, str(tmp_path / name.lower()))
     runner = client.NotebookClient(

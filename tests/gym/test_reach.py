@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("gymnasium", reason="needs Gymnasium: pip install 'skyloop[gym]'")
+pytest.importorskip("gymnasium", reason="needs Gymnasium: skyloop install gym")
 
 import gymnasium
 from gymnasium.utils.env_checker import check_env

@@ -15,7 +15,7 @@ from skyloop.transport.testing import wait_until
 from tests.motion_capture.moving import BODIES, frame_of, pose
 from tests.processes.conftest import Process
 
-pytest.importorskip("motioncapture", reason="needs the motioncapture package: pip install 'skyloop[mocap]'")
+pytest.importorskip("motioncapture", reason="needs the motioncapture package: skyloop install mocap")
 pytestmark = pytest.mark.process
 ENOUGH = 50
 QUALISYS_FRAMES_PORT = 6734  #: the UDP port of this host on which the package takes frames, whatever the address says

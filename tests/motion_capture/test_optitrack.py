@@ -18,7 +18,7 @@ from tests.motion_capture import natnet
 from tests.processes.conftest import Process
 from tests.recordings import recorded
 
-pytest.importorskip("motioncapture", reason="needs the motioncapture package: pip install 'skyloop[mocap]'")
+pytest.importorskip("motioncapture", reason="needs the motioncapture package: skyloop install mocap")
 pytestmark = pytest.mark.process
 ENOUGH = 200
 

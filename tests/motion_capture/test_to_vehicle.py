@@ -16,7 +16,7 @@ from skyloop.motion_capture import MotionCapture, parse_system
 from skyloop.motion_capture.worker import RawFrame
 from skyloop.transport.testing import wait_until
 
-pytest.importorskip("pymavlink", reason="needs pymavlink: pip install 'skyloop[mavlink]'")
+pytest.importorskip("pymavlink", reason="needs pymavlink: skyloop install mavlink")
 pytestmark = pytest.mark.process
 
 

@@ -338,7 +338,7 @@ def test_what_has_piled_up_is_one_frame_with_the_newest_pose() -> None:
 
 def test_the_reference_client_reads_what_our_codec_writes() -> None:
     """The client that the package carries is compiled from the reference implementation."""
-    pytest.importorskip("motioncapture", reason="needs the motioncapture package: pip install 'skyloop[mocap]'")
+    pytest.importorskip("motioncapture", reason="needs the motioncapture package: skyloop install mocap")
     try:
         socket.getprotobyname("tcp")
     except OSError:

@@ -39,7 +39,7 @@ class Look(skyloop.Controller):
 
 
 def test_all_frames_reach_a_processor_and_a_controller_in_order() -> None:
-    pytest.importorskip("av", reason="reading recorded video needs PyAV: pip install 'skyloop[video]'")
+    pytest.importorskip("av", reason="reading recorded video needs PyAV: skyloop install video")
     with skyloop.connect(f"video://{stream()}") as drone:
         with pytest.raises(UnsupportedError, match="record"):
             drone.takeoff()
@@ -57,7 +57,7 @@ def test_all_frames_reach_a_processor_and_a_controller_in_order() -> None:
 
 
 def test_its_h264_reaches_a_recorder_in_a_process_of_its_own_as_it_was(tmp_path: Path) -> None:
-    pytest.importorskip("av", reason="reading recorded video needs PyAV: pip install 'skyloop[video]'")
+    pytest.importorskip("av", reason="reading recorded video needs PyAV: skyloop install video")
     path = tmp_path / "flight.mcap"
     with (
         skyloop.connect(f"video://{stream()}?speed=4") as drone,

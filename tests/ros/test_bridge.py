@@ -187,7 +187,7 @@ def test_without_opencv_there_are_no_compressed_images(
     monkeypatch.setitem(__import__("sys").modules, "cv2", None)
     with Bridge(Settings(drones=("alpha-1",))):
         assert "front/image_raw/compressed" not in rclpy.nodes["skyloop"].publishers
-        assert any("skyloop[vision]" in line for line in rclpy.nodes["skyloop"].logger.lines)
+        assert any("skyloop install vision" in line for line in rclpy.nodes["skyloop"].logger.lines)
 
 
 # In ------------------------------------------------------------------------------------------------------------------

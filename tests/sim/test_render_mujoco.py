@@ -257,7 +257,11 @@ def test_an_unknown_renderer_is_refused() -> None:
 @pytest.mark.parametrize(
     ("given", "error", "words"),
     [
-        ("sys.modules['mujoco'] = None; os.environ['MUJOCO_GL'] = 'egl'", "MissingExtraError", "'skyloop[mujoco]'"),
+        (
+            "sys.modules['mujoco'] = None; os.environ['MUJOCO_GL'] = 'egl'",
+            "MissingExtraError",
+            "install mujoco",
+        ),
         ("os.environ.pop('MUJOCO_GL', 0); ctypes.util.find_library = lambda _: None", "UnsupportedError", "libegl1"),
     ],
     ids=["no mujoco", "no OpenGL"],

@@ -13,8 +13,8 @@ import pytest
 from skyloop.errors import LinkError, NameTakenError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.transport import local
 from skyloop.transport.local import LocalServer, dial, list_names
-from skyloop.transport.local.directory import find_directory
-from skyloop.transport.local.sockets import Socket
+from skyloop.transport.local.directory import directory_owner, find_directory, of_others
+from skyloop.transport.local.sockets import Socket, user_name
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 
 
@@ -208,3 +208,22 @@ def test_other_platforms_are_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     for use in (lambda: dial("alpha"), lambda: local.LocalServer):
         with pytest.raises(UnsupportedError, match=r"needs Linux .*over the network"):
             use()
+
+
+def test_proxies_of_other_users_are_known_by_name_though_they_can_not_be_reached() -> None:
+    """The kernel names all sockets; ``skyloop list`` said that none runs on this host."""
+    own = os.geteuid()
+    table = f"""Num       RefCount Protocol Flags    Type St Inode Path
+0000000000000000: 00000002 00000000 00010000 0005 01 11 /run/user/{own + 1}/skyloop/alpha.sock
+0000000000000000: 00000003 00000000 00000000 0005 03 12 /run/user/{own + 1}/skyloop/alpha.sock
+0000000000000000: 00000002 00000000 00010000 0005 01 13 /run/user/{own + 1}/skyloop/beta.sock
+0000000000000000: 00000002 00000000 00010000 0005 01 14 /run/user/{own + 1}/skyloop/fleet.host
+0000000000000000: 00000002 00000000 00010000 0005 01 15 /run/user/{own}/skyloop/mine.sock
+0000000000000000: 00000002 00000000 00010000 0001 01 16 /run/user/{own + 1}/pulse/native.sock
+0000000000000000: 00000002 00000000 00010000 0005 01 17 /gone/skyloop/nobodys.sock
+0000000000000000: 00000002 00000000 00000000 0002 01 18
+0000000000000000: 00000002 00000000 00000000 0002 01 19 @abstract/skyloop/x.sock
+"""
+    owners = {Path(f"/run/user/{number}/skyloop"): number for number in (own, own + 1)}
+    assert of_others(table, owners.get) == {user_name(own + 1): ["alpha", "beta"]}
+    assert directory_owner(Path("/proc/self/no/such")) == Path("/proc/self").stat().st_uid

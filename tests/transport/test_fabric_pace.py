@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-pytest.importorskip("zenoh", reason="needs the extra network: pip install 'skyloop[network]'")
+pytest.importorskip("zenoh", reason="needs the extra network: skyloop install network")
 
 from skyloop.transport.base import EVENTS, FEEDBACK, Peer
 from skyloop.transport.fabric import packets

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,6 +46,7 @@ from skyloop.transport.fabric import (
 from skyloop.transport.fabric.config import Part
 from skyloop.transport.fabric.delivery import ACKNOWLEDGE_AFTER, ACKNOWLEDGE_EVERY_S, AckPolicy, RecentPackets
 from skyloop.transport.fabric.discovery import FORGET_S, UnreachablePeers
+from skyloop.transport.fabric.session import _Pool
 from skyloop.transport.testing import header
 
 TOPICS = st.text(min_size=1, max_size=MAX_TOPIC).filter(lambda text: text.isprintable())
@@ -435,3 +438,43 @@ def test_a_session_that_does_not_know_a_node_is_retired_once_for_it(monkeypatch:
         assert not discovery.renew(session), "a young session searches by itself"
     finally:
         discovery.proxy_reached()
+
+
+def test_the_end_of_the_process_waits_for_a_session_that_is_being_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    closing, may_end = threading.Event(), threading.Event()
+
+    def close() -> None:
+        closing.set()
+        assert may_end.wait(10.0)
+
+    one = SimpleNamespace(
+        settings=None, part=Part.APP, retired=False, users=1, close=close, over=lambda now: True, idle_since=0.0
+    )
+    pool = _Pool()
+    pool._sessions.append(one)  # type: ignore[arg-type]
+    pool.release(one)  # type: ignore[arg-type]
+    assert closing.wait(10.0), "it is closed by the thread of the pool"
+    ending = threading.Thread(target=pool.close_all)
+    ending.start()
+    assert ending.is_alive()
+    may_end.set()
+    ending.join(10.0)
+    assert not ending.is_alive()
+    with pytest.raises(LinkError, match="process is ending"):
+        pool.acquire(FabricSettings(), Part.APP)
+
+
+@pytest.mark.process
+@pytest.mark.daily
+def test_a_process_may_end_while_a_session_is_being_closed() -> None:
+    """``skyloop watch`` ended with exit code 134 and "FATAL: exception not rethrown" (issue 28, C11)."""
+    pytest.importorskip("zenoh", reason="needs the extra network: skyloop install network")
+    program = (
+        "from skyloop.transport.fabric import FabricSettings, session\n"
+        "from skyloop.transport.fabric.config import Part\n"
+        "one = session.acquire(FabricSettings(multicast=False), Part.APP)\n"
+        "session.retire(one)\n"
+        "session.release(one)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")

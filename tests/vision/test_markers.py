@@ -140,3 +140,28 @@ def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(builtins, "__import__", refuse)
     with pytest.raises(MissingExtraError, match=r"skyloop\[vision\]"):
         MarkerDetector()
+
+
+def test_a_detector_of_the_wrong_dictionary_says_which_tags_it_saw() -> None:
+    """A beginner's valid but wrong dictionary: the flight ended well, and nobody said a word."""
+    image = np.full((240, 320, 3), 255, np.uint8)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250)
+    for at, number in ((40, 7), (200, 60)):
+        image[70:150, at : at + 80] = cv2.aruco.generateImageMarker(dictionary, number, 80)[:, :, None]
+    detector = MarkerDetector("4x4_50")
+    for _ in range(8 * 10):
+        assert detector.detect(image, INTRINSICS) == []
+    others = "7 of 6x6_50, 60 of 6x6_100"
+    nothing = "no marker of 4x4_50 was found in 80 images"
+    assert detector.why_nothing() == f"{nothing}, but others were, of other dictionaries: {others}"
+    right = MarkerDetector("6x6_250")
+    right.detect(image, INTRINSICS)
+    assert right.why_nothing() == ""
+
+
+def test_a_detector_that_sees_nothing_says_so_after_some_images() -> None:
+    detector, empty = MarkerDetector(), np.full((240, 320, 3), 90, np.uint8)
+    assert detector.why_nothing() == ""
+    for _ in range(100):
+        detector.detect(empty, INTRINSICS)
+    assert detector.why_nothing().startswith("no marker of 4x4_50 was found in 100 images, nor one of another")

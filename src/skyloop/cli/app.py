@@ -15,8 +15,8 @@ from skyloop.cli import wording
 from skyloop.cli.commands import COMMANDS, Entry
 from skyloop.cli.naming import with_place
 from skyloop.cli.plain_help import Command, Group, WithBehaviours, width
-from skyloop.cli.text import make_printable
-from skyloop.errors import ParameterError, SkyloopError
+from skyloop.cli.text import coloured, make_printable
+from skyloop.errors import ParameterError, SkyloopError, install_command
 
 _log = logging.getLogger(__name__)
 VERBOSE: Final = "--verbose"  #: works before and behind any command
@@ -95,11 +95,16 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
         print(f"{name}: nothing was done", file=sys.stderr)
         sys.exit(FAILED)
     except wording.WordError as error:
-        print(wording.of_word(error, name), file=sys.stderr)
+        print(coloured(wording.of_word(error, name), sys.stderr), file=sys.stderr)
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _log.debug("the command failed", exc_info=error)
-        print(f"{name}: {wording.of(error)}", file=sys.stderr)
+        told = wording.of(error)
+        if install_command("") in told:  # its own, or of a proxy that it started
+            from skyloop.cli.install import with_all_missing
+
+            told = with_all_missing(told, arguments)
+        print(coloured(f"{name}: {told}", sys.stderr), file=sys.stderr)
         sys.exit(USAGE_ERROR if isinstance(error, ValueError | ParameterError) else FAILED)
     sys.exit(code if isinstance(code, int) else 0)
 

@@ -127,6 +127,9 @@ COMMANDS: Final = {
         "What of this machine works, what to install",
         "doctor mavlink://tcp:127.0.0.1:5760",
     ),
+    "install": Entry(
+        Task.SET_UP, "install", "install", "Install optional parts of Skyloop", "install sim vision cockpit"
+    ),
     "param": Entry(
         Task.SET_UP,
         "param",

@@ -18,7 +18,7 @@ from rich.text import Text
 
 from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
 from skyloop.cli.fly_follow import status_line
-from skyloop.errors import MissingExtraError, UsageError
+from skyloop.errors import MissingExtraError, UsageError, install_command
 
 if TYPE_CHECKING:
     from skyloop.cli.follow_truth import FollowReport, TargetTruth
@@ -119,7 +119,7 @@ class _Demo:
 
         detector = None if looks else packaged_detector()
         if detector is None and not looks:
-            self.console.print("no detector: pip install 'skyloop\\[detect]' brings what it needs")
+            self.console.print(f"no detector: {install_command('detect')} brings what it needs")
         truth = TargetTruth(load_world(self.world, self.seed))
         report = FollowReport(LOOKS if detector is None else DETECTOR, distance_m)
         uri = "sim://?" + urlencode({"world": self.world, "seed": self.seed, "cameras": "front", "fps": 15})

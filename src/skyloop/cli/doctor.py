@@ -18,33 +18,10 @@ import typer
 from rich.console import Console
 
 from skyloop.cli.findings import Finding, Health, as_text
+from skyloop.cli.install import EXTRAS
+from skyloop.errors import install_command
 
 IMPORT_BUDGET_S: Final = 0.3
-
-#: Each optional part: the extra's name, what it is for, and the modules that it needs.
-EXTRAS: Final = (
-    ("sim", "simulator's cameras", ("cv2",)),
-    ("fast", "simulator's cameras, several times faster", ("numba", "cv2")),
-    ("mujoco", "simulator with meshes and shadows", ("mujoco", "cv2")),
-    ("vision", "markers and other vision", ("cv2", "PIL")),
-    ("detect", "detectors from an ONNX file", ("onnxruntime", "cv2", "scipy")),
-    ("video", "recorded video, H.264", ("av",)),
-    ("control", "poses and splines", ("scipy",)),
-    ("mavlink", "ArduCopter and PX4", ("pymavlink", "serial")),
-    ("msp", "Betaflight and INAV over a serial port", ("serial",)),
-    ("ros", "ROS 2", ("rclpy", "cv2")),
-    ("cockpit", "page in the browser", ("starlette", "uvicorn", "websockets", "cv2")),
-    ("record", "recordings", ("mcap", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
-    ("foxglove", "drones live in Foxglove", ("foxglove", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
-    ("rerun", "drones and recordings in Rerun", ("rerun", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
-    ("parquet", "tables as Parquet", ("pyarrow",)),
-    ("network", "network and its keys", ("zenoh", "cryptography", "cv2")),
-    ("metrics", "metrics for Prometheus", ("prometheus_client",)),
-    ("mocap", "motion capture", ("motioncapture", "scipy")),
-    ("gym", "reinforcement learning", ("gymnasium", "cv2")),
-    ("bench", "figures and diagrams", ("matplotlib",)),
-    ("ray", "processors on a Ray cluster", ("ray",)),
-)
 
 #: Ports that Skyloop listens at, or vehicles send to, and for what.
 PORTS: Final = (
@@ -162,7 +139,7 @@ def _import_time() -> Iterator[Finding]:
 
 def _extras() -> Iterator[Finding]:
     for extra, use, modules in EXTRAS:
-        what, install = f"{use} [{extra}]", f"pip install 'skyloop[{extra}]'"
+        what, install = f"{use} [{extra}]", install_command(extra)
         versions, missing, broken = [], [], []
         for module in modules:
             try:
@@ -172,7 +149,7 @@ def _extras() -> Iterator[Finding]:
             except ImportError as error:  # it is there, but something that it needs is not
                 broken.append(f"{module}: {error}")
         if broken:
-            yield Finding(what, Health.BAD, "; ".join(broken), f"{install} --force-reinstall")
+            yield Finding(what, Health.BAD, "; ".join(broken), f"{install} --anew")
         elif missing:
             yield Finding(what, Health.MISSING, f"{' and '.join(missing)} not installed", install)
         else:

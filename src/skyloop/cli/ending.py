@@ -136,11 +136,12 @@ def _chosen(
         return drones(names, others)
     if names or others:
         raise UsageError("--all is every drone: give it alone, or names")
-    from skyloop.client.connect import running_names
+    from skyloop.cli.listing import none_runs
+    from skyloop.client.connect import network_settings, running_names
 
     found = running_names()
     if not found:
-        raise LinkError("no drone is found: none runs on this host, or can be reached over the --network")
+        raise LinkError(f"no drone is found. {none_runs(network_settings())}")
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sysconfig
 import time
 import traceback
 from collections.abc import Callable, Iterable
@@ -52,6 +53,12 @@ class Flight:
             return False
         self._report(str(summary))
         return True
+
+    def report_notes(self) -> None:
+        """Show what looks like a mistake in the run, for one that ended without a summary."""
+        checks = self._controller._checks
+        for note in () if checks is None else checks.notes():
+            self._report(f"note: {note}")
 
     def run_reloading(self, seconds: float | None, reloader: Reloader, make: Make) -> bool:
         """Run the controller; a saved file takes over in flight, and one that failed hovers until it is saved again.
@@ -116,7 +123,7 @@ class Flight:
 
 
 def what_failed(error: Exception) -> str:
-    """Return what a person needs to mend an error: the traceback without Skyloop's own lines.
+    """Return what a person needs to mend an error: their own line, then the traceback without Skyloop's lines.
 
     An error that Skyloop raised on purpose with no line of the user in it is one line; any other is shown in full.
     """
@@ -124,9 +131,18 @@ def what_failed(error: Exception) -> str:
     trace = traceback.TracebackException.from_exception(error)
     if all(line.filename.startswith(home) for line in trace.stack):
         return f"skyloop: {error}" if isinstance(error, SkyloopError) else "".join(trace.format()).rstrip()
+    own = _own_line(trace.stack, home)
     part: traceback.TracebackException | None = trace
     while part is not None:
         theirs = [line for line in part.stack if not line.filename.startswith(home)]
         part.stack = traceback.StackSummary.from_list(theirs)
         part = part.__cause__ or part.__context__
-    return "".join(trace.format()).rstrip()
+    where = f"{Path(own.filename).name}, line {own.lineno}, in {own.name}: {own.line or ''}".rstrip(": ")
+    return f"{where}\n  {''.join(trace.format_exception_only()).rstrip()}\n\n{''.join(trace.format()).rstrip()}"
+
+
+def _own_line(stack: Iterable[traceback.FrameSummary], home: str) -> traceback.FrameSummary:
+    """Return the innermost line that is neither Skyloop's nor a library's, or else the innermost not Skyloop's."""
+    theirs = [line for line in stack if not line.filename.startswith(home)]
+    libraries = tuple({sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")})
+    return next((line for line in reversed(theirs) if not line.filename.startswith(libraries)), theirs[-1])

@@ -15,6 +15,7 @@ from skyloop.cli.completion import python_files
 from skyloop.cli.flight import Flight
 from skyloop.cli.flight_progress import FlightProgress
 from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, OptionalNameArgument, join_network, one_drone
+from skyloop.cli.text import coloured
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -86,11 +87,13 @@ def fly(
 
 
 def make(controller_class: type[Controller], drone: Drone) -> Controller:
-    """Make the user's controller.
+    """Make the user's controller, and say which of its methods looks like a misspelt callback.
 
     Raises:
         UsageError: The class can't be made as one is here.
     """
+    from skyloop.control.controller import misspelt
+
     name = controller_class.__name__
     try:
         inspect.signature(controller_class).bind(drone)
@@ -101,6 +104,8 @@ def make(controller_class: type[Controller], drone: Drone) -> Controller:
     controller = controller_class(drone)
     if getattr(controller, "drone", None) is not drone:
         raise UsageError(f"{name}.__init__ must begin with super().__init__(drone)")
+    for note in misspelt(controller_class):
+        say(f"note: {note}")
     return controller
 
 
@@ -138,6 +143,7 @@ def run(
             return flight.run_reloading(seconds, reloader, lambda found: make(found, drone))
     except KeyboardInterrupt:
         say("stopped by Ctrl-C")
+        flight.report_notes()
     return True
 
 
@@ -164,4 +170,4 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG00
 
 def say(text: str) -> None:
     """Print a line on standard error."""
-    typer.echo(text, err=True)
+    typer.echo("\n".join(coloured(line, sys.stderr) for line in text.splitlines()), err=True)

@@ -57,11 +57,34 @@ def list_proxies(
     if json:
         typer.echo(msgspec.json.encode(rows).decode())
     elif not rows:
-        also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
-        typer.echo(f"No proxy is running on this host{also}. Start one: skyloop proxy sim:// --name alpha")
+        typer.echo(none_runs(settings))
     else:
         for line in lines(rows):
             typer.echo(line)
+        if others := of_others():
+            typer.echo(others, err=True)
+
+
+def none_runs(settings: FabricSettings | None) -> str:
+    """Return, in words, that no proxy can be reached, and whose there are.
+
+    Args:
+        settings: Of the network, if it was searched.
+    """
+    also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
+    others = of_others()
+    ours = f"No proxy of yours is running on this host{also}" if others else f"No proxy is running on this host{also}"
+    return f"{ours}. {f'{others} ' if others else ''}Start one: skyloop proxy sim:// --name alpha"
+
+
+def of_others() -> str:
+    """Return, in words, which proxies other users run on this host; empty if there are none."""
+    from skyloop.transport.local import names_of_others
+
+    theirs = [f"{user} runs {', '.join(sorted(names))}" for user, names in sorted(names_of_others().items())]
+    if not theirs:
+        return ""
+    return f"{'; '.join(theirs)}: a user's proxies are closed to others, but for a group's (SKYLOOP_GROUP)."
 
 
 def running(settings: FabricSettings | None = None) -> list[Row]:

@@ -8,7 +8,7 @@ import os
 import sys
 import unicodedata
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TextIO
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,6 +21,10 @@ _PLAIN: Final = {
     **{"✓": "ok", "✗": "x", "→": "->", "←": "<-", "↑": "^", "↓": "v", "–": "-", "−": "-", "─": "-", "│": "|", "·": "."},
     **{"×": "x", "°": " deg", "µ": "u", "μ": "u", "±": "+-", "≤": "<=", "≥": ">=", "π": "pi", "ω": "w", "√": "sqrt"},
 }
+_RED: Final = 31
+_YELLOW: Final = 33
+#: What is coloured at the beginning of a line.
+_COLOURS: Final = {"skyloop: ": _RED, "the controller failed": _RED, "NOT ": _RED, "note: ": _YELLOW}
 
 
 def make_printable() -> None:
@@ -40,6 +44,23 @@ def _plain(error: UnicodeError) -> tuple[str, int]:
 
 def _unaccented(character: str) -> str:
     return unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
+
+
+def coloured(line: str, stream: TextIO) -> str:
+    """Return a line with a coloured beginning, if it has one that matters and the stream shows colours.
+
+    That is a terminal which is not dumb, where ``NO_COLOR`` is not set (https://no-color.org).
+
+    Args:
+        line: For people.
+        stream: Where it is written to.
+    """
+    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not stream.isatty():
+        return line
+    for beginning, colour in _COLOURS.items():
+        if line.startswith(beginning):
+            return f"\x1b[{colour}m{beginning}\x1b[0m{line[len(beginning) :]}"
+    return line
 
 
 def columns(rows: Iterable[tuple[str, ...]]) -> list[str]:

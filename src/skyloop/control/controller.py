@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.errors import AuthorityError, ClosedError, UsageError
-from skyloop.messages import Failsafe, LinkState
+from skyloop.messages import EventKind, Failsafe, LinkState
+from skyloop.messages.command import SET_POINTS
 
 if TYPE_CHECKING:
     from skyloop.client import AuthorityStatus, Drone, Frame
     from skyloop.client.results import Result
     from skyloop.client.telemetry import Mailboxes
-    from skyloop.messages import Feedback
+    from skyloop.messages import Event, Feedback
 
 Reason = Literal["time", "until", "stopped", "closed"]
 _LOOK_S = 0.1  #: how often ``until`` is evaluated while no sample arrives
+_SAMPLES: Final = ("on_feedback", "on_frame", "on_result")
+_CALLBACKS: Final = (*_SAMPLES, "on_authority", "on_reload")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +40,12 @@ class RunSummary:
     results: int = 0  #: calls of ``on_result``
     results_dropped: int = 0  #: results that newer ones replaced
     results_expired: int = 0  #: results that were older than ``result_max_age_s`` when they were taken from the queue
+    notes: tuple[str, ...] = ()  #: what looks like a mistake, in words: a take-off forgotten, a callback misspelt, …
 
     def __str__(self) -> str:
+        return "\n".join((self._counts(), *(f"note: {note}" for note in self.notes)))
+
+    def _counts(self) -> str:
         return (
             f"{self.seconds:.1f} s until {self.reason}: {self.frames} frames ({self.frames_dropped} dropped), "
             f"{self.feedback} feedback samples ({self.feedback_dropped} dropped), "
@@ -73,6 +82,7 @@ class Controller:
         self._stopped = threading.Event()
         self._ended = False  # for good
         self._inbox: Mailboxes | None = None
+        self._checks: _Checks | None = None  # of the newest run
 
     # To be overridden ------------------------------------------------------------------------------------------
 
@@ -141,7 +151,7 @@ class Controller:
             until: Evaluated before each round of callbacks, and every 0.1 s while no sample arrives.
 
         Returns:
-            What was called and dropped, and why the run ended.
+            What was called and dropped, why the run ended, and what looks like a mistake.
 
         Raises:
             UsageError: ``seconds`` is negative or NaN.
@@ -162,10 +172,11 @@ class Controller:
         )
         if not self._ended:
             self._stopped.clear()
+        checks = self._checks = _Checks(self)
         try:
             with inbox:
                 self._inbox = inbox
-                return _Run(self, inbox, self._stopped).go(seconds, until)
+                return _Run(self, inbox, self._stopped, checks).go(seconds, until)
         except BaseException as error:
             self.drone._core.let_go(f"{type(self).__name__} ended by {type(error).__name__}")
             raise
@@ -173,14 +184,90 @@ class Controller:
             self._inbox = None
 
 
+def misspelt(own: type[Controller]) -> Iterator[str]:
+    """Yield, in words, which methods of a controller look like a callback and are none, or that it has no callback.
+
+    Args:
+        own: The controller's class.
+    """
+    theirs = [
+        kind for kind in own.__mro__ if issubclass(kind, Controller) and not kind.__module__.startswith("skyloop.")
+    ]
+    if not theirs:
+        return
+    missing = {name.replace("_", ""): name for name in _CALLBACKS if getattr(own, name) is getattr(Controller, name)}
+    similar = False
+    for kind in theirs:
+        for name, value in vars(kind).items():
+            if not callable(value) or name.startswith("_") or name in _CALLBACKS:
+                continue
+            for match in get_close_matches(name.lower().replace("_", ""), missing, 1, 0.85):
+                similar = True
+                yield f"{own.__name__}.{name} is called by nobody: is {missing[match]} meant?"
+    if not similar and all(getattr(own, name) is getattr(Controller, name) for name in _SAMPLES):
+        yield f"{own.__name__} has none of {', '.join(_SAMPLES)}: nothing was called"
+
+
+class _Checks:
+    """What in a run looks like a beginner's mistake."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        core = controller.drone._core
+        self._state, self._commands = core.state, core.commands
+        self._first_intent = core.commands.intent
+        self._last_event = self._state.recent[-1] if self._state.recent else None
+        self._flew = self._steered = False
+
+    def look(self) -> None:
+        """Note whether the vehicle is in the air, and is sent set-points; called all the time."""
+        newest = self._state.newest
+        self._flew = self._flew or (newest is not None and newest.state.airborne)
+        if not self._steered and self._commands.intent > self._first_intent:
+            self._steered = isinstance(self._commands.newest, SET_POINTS)
+
+    def notes(self) -> Iterator[str]:
+        """Yield what should be told, in words."""
+        yield from misspelt(type(self._controller))
+        if self._steered and not self._flew:
+            yield "it never took off: set-points went to a drone on the ground; call drone.takeoff() before"
+        for found in self._detectors():
+            if note := found():
+                yield note
+        limited = [event for event in self._events() if event.kind is EventKind.COMMAND_CLAMPED]
+        for limit, times in Counter(event.data.get("limit") for event in limited).items():
+            last = next(event.data for event in reversed(limited) if event.data.get("limit") == limit)
+            asked, applied = last.get("asked"), last.get("applied")
+            often = "" if times == 1 else f" {times} times"
+            if isinstance(asked, float) and isinstance(applied, float):
+                yield f"{limit} limited set-points{often}: {applied:.3g} instead of {asked:.3g}"
+
+    def _detectors(self) -> Iterator[Callable[[], str]]:
+        """Yield what the controller's detectors say about having found nothing: its own, its class's, its file's."""
+        own = type(self._controller)
+        places = [vars(self._controller), *map(vars, own.__mro__), getattr(own.on_frame, "__globals__", {})]
+        found = {id(value): value for place in places for value in list(place.values()) if not isinstance(value, type)}
+        for value in found.values():
+            if callable(why := getattr(type(value), "why_nothing", None)):
+                yield why.__get__(value)
+
+    def _events(self) -> list[Event]:
+        """Return the events since the begin that concern this application."""
+        events = list(self._state.recent)
+        if self._last_event in events:
+            del events[: events.index(self._last_event) + 1]
+        return [event for event in events if event.app == self._controller.drone._core.app]
+
+
 class _Run:
     """One run of a controller."""
 
-    def __init__(self, controller: Controller, inbox: Mailboxes, stopped: threading.Event) -> None:
+    def __init__(self, controller: Controller, inbox: Mailboxes, stopped: threading.Event, checks: _Checks) -> None:
         self._controller = controller
         self._drone = controller.drone
         self._inbox = inbox
         self._stopped = stopped
+        self._checks = checks
         self._frames = 0
         self._feedback = 0
         self._results = 0
@@ -210,9 +297,11 @@ class _Run:
             self._results,
             self._inbox.results.pushed_out,
             self._inbox.results.expired,
+            tuple(self._checks.notes()),
         )
 
     def _over(self, deadline_ns: int | None, until: Callable[[], bool] | None) -> Reason | None:
+        self._checks.look()
         if self._stopped.is_set():
             return "stopped"
         if self._drone._core.ending or self._ended():

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from skyloop.client import Drone, Frame
 from skyloop.client.channels import Listener
+from skyloop.errors import install_command
 from skyloop.messages import CameraInfo
 from skyloop.ros.names import Frames
 from skyloop.ros.time import RosTime
@@ -44,7 +45,7 @@ class CameraPublisher:
         try:
             import cv2  # noqa: F401
         except ImportError:
-            node.get_logger().warning(f"no {topic}/image_raw/compressed: pip install 'skyloop[vision]' for JPEG")
+            node.get_logger().warning(f"no {topic}/image_raw/compressed: {install_command('vision')} for JPEG")
         else:
             self._compressed = node.create_publisher(
                 CompressedImage, f"{topic}/image_raw/compressed", qos_profile_sensor_data

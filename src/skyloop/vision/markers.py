@@ -8,8 +8,9 @@ fiducial markers under occlusion", Pattern Recognition 47(6), 2014); the pose is
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,15 @@ from skyloop.messages import Intrinsics
 from skyloop.vision.lens import normalised
 from skyloop.vision.opencv import marker_dictionary, opencv
 from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, rectangle
+
+#: The largest dictionary of each family, which holds the smaller ones' markers under the same ids.
+_FAMILIES: Final = (
+    *("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original"),
+    *("apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11", "aruco_mip_36h12"),
+)
+_SIZES: Final = (50, 100, 250, 1000)
+_OTHERS_EVERY: Final = 8  #: images; a try takes some 2 ms at 320×240, and only as long as nothing was found
+_FEW_IMAGES: Final = 30  #: of which nothing can be said
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -56,6 +66,24 @@ class MarkerDetector:
         self._detector = _make_detector(self._cv, dictionary)
         # The order and axes that SOLVEPNP_IPPE_SQUARE asks for: x right, y up, z out of the face.
         self._square = rectangle(self.size_m, self.size_m)
+        self._images = self._seen = 0
+        self._others: Counter[tuple[str, int]] = Counter()  # tags of other dictionaries, by family and id
+
+    def why_nothing(self) -> str:
+        """Return what a person should know who wonders why nothing was found.
+
+        Where no image had a marker, some of them are searched for those of other dictionaries meanwhile.
+
+        Returns:
+            In words; empty after few images, or if a marker was found in one of them.
+        """
+        if self._seen or self._images < _FEW_IMAGES:
+            return ""
+        nothing = f"no marker of {self.dictionary} was found in {self._images} images"
+        if not self._others:
+            return f"{nothing}, nor one of another dictionary: is it in view, lit, and printed with a white margin?"
+        tags = ", ".join(f"{number} of {_smallest(family, number)}" for family, number in sorted(self._others))
+        return f"{nothing}, but others were, of other dictionaries: {tags}"
 
     def detect(self, image: NDArray[np.uint8], intrinsics: Intrinsics | None = None) -> list[MarkerSighting]:
         """Detect all markers in an image.
@@ -73,13 +101,28 @@ class MarkerDetector:
         pixels, intrinsics = checked(image, intrinsics)
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
         quads, ids, _ = self._detector.detectMarkers(grey)
+        self._images += 1
         if ids is None:
+            if not self._seen and self._images % _OTHERS_EVERY == 0:
+                self._look_for_others(grey)
             return []
+        self._seen += 1
         found = [
             self._sighting(int(number), np.asarray(quad, dtype=np.float64).reshape(4, 2), intrinsics)
             for number, quad in zip(np.ravel(ids), quads, strict=True)
         ]
         return sorted((one for one in found if one is not None), key=lambda one: one.id)
+
+    def _look_for_others(self, grey: NDArray[np.uint8]) -> None:
+        """Look for the markers of one other family, each time of the next one."""
+        known = {name for name in dir(self._cv.aruco) if name.startswith("DICT_")}
+        families = [family for family in _FAMILIES if f"DICT_{family.upper()}" in known]
+        family = families[self._images // _OTHERS_EVERY % len(families)]
+        parameters = self._cv.aruco.DetectorParameters()
+        parameters.errorCorrectionRate = 0.0  # a square of the room must not pass for a tag
+        markers = marker_dictionary(self._cv, family)
+        _, ids, _ = self._cv.aruco.ArucoDetector(markers, parameters).detectMarkers(grey)
+        self._others.update((family, int(number)) for number in (() if ids is None else np.ravel(ids)))
 
     def _sighting(self, number: int, corners: Array, intrinsics: Intrinsics) -> MarkerSighting | None:
         """Return the marker's pose; None if no square in front of the camera explains the corners."""
@@ -92,6 +135,12 @@ class MarkerDetector:
         return MarkerSighting(
             id=number, corners=corners, position_m=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity
         )
+
+
+def _smallest(family: str, number: int) -> str:
+    """Return the smallest dictionary of a family that has a marker."""
+    kind, _, size = family.rpartition("_")
+    return f"{kind}_{next(one for one in _SIZES if number < one)}" if size == "1000" else family
 
 
 def _make_detector(cv: Any, dictionary: str) -> Any:

@@ -32,7 +32,7 @@ from tests.recording.live.conftest import WAIT_S, Fly
 from tests.recording.live.viewer import Viewer
 from tests.recording.streams import film
 
-pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: pip install 'skyloop[foxglove]'")
+pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: skyloop install foxglove")
 
 import itertools
 

@@ -245,9 +245,7 @@ def test_without_rerun_the_error_says_what_to_install(monkeypatch: pytest.Monkey
 
 # Rerun's own programs ------------------------------------------------------------------------------------------------
 
-real = pytest.mark.skipif(
-    not RERUN, reason="rerun-sdk is not installed: pip install 'skyloop[rerun]', or SKYLOOP_RERUN"
-)
+real = pytest.mark.skipif(not RERUN, reason="rerun-sdk is not installed: skyloop install rerun, or SKYLOOP_RERUN")
 
 
 def ran(*words: str | Path) -> str:

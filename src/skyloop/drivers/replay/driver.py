@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from typing import Final
 
@@ -28,6 +29,7 @@ from skyloop.messages import (
     Value,
 )
 
+_log = logging.getLogger(__name__)
 _CLOSE_S: Final = 2.0
 
 
@@ -137,8 +139,12 @@ class ReplayDriver(Driver):
         try:
             player.run(cameras)
         except Exception as error:  # noqa: BLE001  a damaged file's surprise must not end in silence
-            sink.event(EventKind.DRIVER_ERROR, f"{self.uri}: {error!r}", Severity.ERROR, where="replaying")
-            sink.link(LinkState.LOST, f"replaying failed: {error!r}")
+            _log.exception("%s can't be played on", self.uri)
+            why = str(error) if isinstance(error, SkyloopError) else "an error in Skyloop, which the proxy's output has"
+            at_s = self._playback.position_s if self._playback is not None else 0.0
+            text = f"this recording can't be played beyond {at_s:.1f} s: {why}"
+            sink.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="replaying")
+            sink.link(LinkState.LOST, text)
 
     def _read(self) -> tuple[Recording, DroneRecord]:
         recording = Recording.open(self.options.path)

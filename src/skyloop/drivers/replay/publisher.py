@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Final
 
@@ -209,5 +210,6 @@ def described(applied: Applied) -> dict[str, Value]:
 
 
 def numbers(action: AnyAction) -> tuple[float, ...]:
-    """Return an action's numbers in the order of its fields."""
-    return tuple(float(getattr(action, name)) for name in action.__struct_fields__)
+    """Return an action's numbers in the order of its fields; NaN for one that was left out, such as a place's yaw."""
+    given = (getattr(action, name) for name in action.__struct_fields__)
+    return tuple(math.nan if number is None else float(number) for number in given)

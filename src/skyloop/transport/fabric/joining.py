@@ -85,8 +85,8 @@ class ProxyWatch:
                 )
             if not found:
                 others = {other for other, _ in known} - {self._name}
-                where = f"proxy on the network ({self._session.settings.reach})"
-                raise UnknownNameError(where, self._name, others)
+                where = f"on the network ({self._session.settings.reach})"
+                raise UnknownNameError("proxy", self._name, others, where=where)
         return self._candidates()
 
     def _candidates(self) -> list[tuple[str, packets.ProxyInfo | None]]:

@@ -27,6 +27,7 @@ LINGER_S: Final = (
     2.0  #: a session without users stays open for so long, so that a reconnecting client finds it as it was
 )
 REOPEN_S: Final = 2.0  #: how long an address may take to be free again
+CLOSE_S: Final = 5.0  #: how long the end of the process waits for a session that is being closed
 _BORROWED: Final = 1000  # times to try again what another thread is just using …
 _BORROWED_S: Final = 0.001  # … after so long
 #: In Zenoh's errors: where in its sources one arose, and what it adds to an endpoint's address.
@@ -122,6 +123,8 @@ class _Pool:
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._sessions: list[Session] = []
+        self._closing = 0  # sessions that are not in the list any more, and are being closed
+        self._over = False  # the process ends
         self._reaper: threading.Thread | None = None
 
     def acquire(self, settings: FabricSettings, part: Part) -> Session:
@@ -133,6 +136,8 @@ class _Pool:
             MissingExtraError: The extra ``network`` is not installed.
         """
         with self._changed:
+            if self._over:
+                raise LinkError("the network can't be joined any more: this process is ending")
             for session in self._sessions:
                 same = (session.settings, session.part) == (settings, part)
                 if same and not session.retired and not session.zenoh.is_closed():
@@ -155,13 +160,13 @@ class _Pool:
             session.idle_since = time.monotonic() if linger else -LINGER_S
             at_once = not linger and session.users == 0
             if at_once:
-                self._sessions.remove(session)
+                self._take_out(session)
             elif self._reaper is None:
                 self._reaper = threading.Thread(target=self._reap, name="skyloop-fabric-sessions", daemon=True)
                 self._reaper.start()
             self._changed.notify()
         if at_once:
-            session.close()  # outside the lock, as it may wait for the network
+            self._close(session)
 
     def retire(self, session: Session) -> None:
         """Give new users another session from now on; this one ends with its last user."""
@@ -171,13 +176,31 @@ class _Pool:
     def close_all(self) -> None:
         """Close all sessions at the end of the process.
 
-        Zenoh's threads may not call into an interpreter that is gone.
+        Zenoh's threads may not call into an interpreter that is gone, and no thread of ours may be within Zenoh then:
+        when such a one comes back to Python, it is ended by an exception that native code does not let pass, and the
+        process is aborted with it ("FATAL: exception not rethrown").
         """
         with self._changed:
+            self._over = True
             for session in self._sessions:
                 session.close()
             self._sessions.clear()
-            self._changed.notify()
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: not self._closing, CLOSE_S)
+
+    def _take_out(self, session: Session) -> None:
+        """Begin to close a session; with the lock held. :meth:`_close` has to follow."""
+        self._sessions.remove(session)
+        self._closing += 1
+
+    def _close(self, session: Session) -> None:
+        """Close a session that was taken out, outside the lock, as it may wait for the network."""
+        try:
+            session.close()
+        finally:
+            with self._changed:
+                self._closing -= 1
+                self._changed.notify_all()
 
     def _reap(self) -> None:
         while True:
@@ -188,9 +211,9 @@ class _Pool:
                 now = time.monotonic()
                 over = [session for session in self._sessions if session.users == 0 and session.over(now)]
                 for session in over:
-                    self._sessions.remove(session)
+                    self._take_out(session)
             for session in over:
-                session.close()  # outside the lock, as it may wait for the network
+                self._close(session)
             with self._changed:
                 self._changed.wait(LINGER_S / 4)
 

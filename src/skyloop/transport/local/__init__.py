@@ -8,6 +8,7 @@ listed, and the other names here raise :class:`UnsupportedError` when used.
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skyloop.errors import Hint, UnsupportedError
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from skyloop.transport.local.directory import Proxy
     from skyloop.transport.local.server import LocalServer
 
-__all__ = ["LocalServer", "dial", "list_names"]
+__all__ = ["LocalServer", "dial", "list_names", "names_of_others"]
 
 
 def dial(name: str, *, group: str | None = None) -> Dialer:
@@ -60,6 +61,19 @@ def list_names(*, group: str | None = None) -> list[Proxy]:
     from skyloop.transport.local.directory import find_directory
 
     return find_directory(group).proxies()
+
+
+def names_of_others() -> dict[str, list[str]]:
+    """Return the names of the proxies on this host that other users run, by user. This user may not reach them."""
+    if sys.platform != "linux":
+        return {}
+    from skyloop.transport.local.directory import directory_owner, of_others
+
+    try:
+        table = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return {}
+    return of_others(table, directory_owner)
 
 
 def __getattr__(name: str) -> Any:

@@ -22,7 +22,7 @@ import socket
 import stat
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -264,6 +264,33 @@ def is_live(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         code = probe.connect_ex(os.fspath(path))
     return code not in (errno.ECONNREFUSED, errno.ENOENT)
+
+
+def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list[str]]:
+    """Return the names of the proxies that other users run on this host, by user: their sockets are closed to us.
+
+    Args:
+        table: What ``/proc/net/unix`` holds: the kernel names all sockets to everybody.
+        owner: Returns whose a directory is, as a number; None if that can't be known.
+    """
+    found: dict[str, list[str]] = {}
+    for line in table.splitlines():
+        path = Path(line[line.find("/") :]) if "/" in line else Path()
+        name = path.name.removesuffix(_SUFFIXES[PROXY])
+        if path.parent.name != "skyloop" or name == path.name or not NAME.fullmatch(name):
+            continue  # a directory of another name may be anybody's, of any program
+        user = owner(path.parent)
+        if user is not None and user != os.geteuid() and name not in found.setdefault(user_name(user), []):
+            found[user_name(user)].append(name)
+    return found
+
+
+def directory_owner(path: Path) -> int | None:
+    """Return whose a directory is: that of the nearest folder above it where it can't be seen itself."""
+    for folder in (path, *path.parents):
+        with contextlib.suppress(OSError):
+            return folder.lstat().st_uid
+    return None
 
 
 def owner_pid(path: Path) -> int | None:

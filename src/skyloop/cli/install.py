@@ -1,0 +1,144 @@
+"""``skyloop install``: installs optional parts into this environment, and knows which are there.
+
+An extra has no spelling for pip that is right in a checkout, for a wheel and for a release. Here what it consists of is
+read from the package's own metadata, which all three have.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from importlib.metadata import requires
+from typing import Annotated, Final
+
+import typer
+
+from skyloop.errors import SkyloopError, UnknownNameError, UnsupportedError, install_command
+
+#: Each optional part: the extra's name, what it is for, and the modules that it needs.
+EXTRAS: Final = (
+    ("sim", "simulator's cameras", ("cv2",)),
+    ("fast", "simulator's cameras, several times faster", ("numba", "cv2")),
+    ("mujoco", "simulator with meshes and shadows", ("mujoco", "cv2")),
+    ("vision", "markers and other vision", ("cv2", "PIL")),
+    ("detect", "detectors from an ONNX file", ("onnxruntime", "cv2", "scipy")),
+    ("video", "recorded video, H.264", ("av",)),
+    ("control", "poses and splines", ("scipy",)),
+    ("mavlink", "ArduCopter and PX4", ("pymavlink", "serial")),
+    ("msp", "Betaflight and INAV over a serial port", ("serial",)),
+    ("ros", "ROS 2", ("rclpy", "cv2")),
+    ("cockpit", "page in the browser", ("starlette", "uvicorn", "websockets", "cv2")),
+    ("record", "recordings", ("mcap", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
+    ("foxglove", "drones live in Foxglove", ("foxglove", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
+    ("rerun", "drones and recordings in Rerun", ("rerun", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
+    ("parquet", "tables as Parquet", ("pyarrow",)),
+    ("network", "network and its keys", ("zenoh", "cryptography", "cv2")),
+    ("metrics", "metrics for Prometheus", ("prometheus_client",)),
+    ("mocap", "motion capture", ("motioncapture", "scipy")),
+    ("gym", "reinforcement learning", ("gymnasium", "cv2")),
+    ("bench", "figures and diagrams", ("matplotlib",)),
+    ("ray", "processors on a Ray cluster", ("ray",)),
+)
+
+#: Commands that need several parts: who lacks one of them is told of all that are missing.
+NEEDS: Final = {
+    "demo": ("sim", "vision", "cockpit"),
+    "demo follow-anything": ("sim", "vision", "detect", "cockpit"),
+    "demo paper": ("sim", "cockpit", "record", "control", "bench"),
+    "fly": ("sim", "vision"),
+    "fly follow": ("vision", "detect"),
+    "detect": ("detect", "vision"),
+}
+_EXTRA: Final = re.compile(r"\s*(?:\band\s+)?\bextra\s*==\s*[\"']([\w-]+)[\"']")
+
+
+def install(
+    parts: Annotated[list[str], typer.Argument(metavar="PART...", help="Such as vision; all: nearly all of them")],
+    anew: Annotated[bool, typer.Option("--anew", help="Also what is there, as something of it is broken")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would be installed")] = False,
+) -> None:
+    """Install optional parts of Skyloop into the Python environment that runs this command.
+
+    skyloop doctor shows which parts there are, and which of them are missing.
+    """
+    wanted = requirements(parts)
+    if dry_run:
+        for requirement in wanted:
+            typer.echo(requirement)
+        return
+    if subprocess.run([*_installer(anew), *wanted]).returncode:
+        raise SkyloopError(f"{', '.join(parts)} can't be installed: see above")
+
+
+def requirements(parts: Iterable[str]) -> list[str]:
+    """Return what optional parts consist of, as pip takes it.
+
+    Args:
+        parts: Names of extras.
+
+    Raises:
+        UnknownNameError: There is no such part.
+        SkyloopError: Skyloop's own metadata is missing: it runs from a folder and was never installed.
+    """
+    table: dict[str, list[str]] = {}
+    for line in _metadata():
+        requirement, _, marker = line.partition(";")
+        for extra in _EXTRA.findall(marker):
+            rest = _EXTRA.sub("", marker).strip()
+            table.setdefault(extra, []).append(f"{requirement.strip()}; {rest}" if rest else requirement.strip())
+    found: dict[str, None] = {}
+    for part in parts:
+        if part not in table:
+            raise UnknownNameError("optional part", part, table)
+        found |= dict.fromkeys(table[part])
+    return list(found)
+
+
+def _metadata() -> list[str]:
+    try:
+        return requires("skyloop") or []
+    except ModuleNotFoundError:
+        raise SkyloopError(
+            "this Skyloop runs from a folder and was never installed: pip install -e FOLDER, then again"
+        ) from None
+
+
+def _installer(anew: bool) -> list[str]:
+    """Return how packages come into this environment: by its pip, or by uv where it has none."""
+    if importlib.util.find_spec("pip"):
+        return [sys.executable, "-m", "pip", "install", *(["--force-reinstall"] if anew else [])]
+    if shutil.which("uv"):
+        return ["uv", "pip", "install", "--python", sys.executable, *(["--reinstall"] if anew else [])]
+    raise UnsupportedError(f"{sys.prefix} has no pip, and there is no uv: install what --dry-run shows by other means")
+
+
+def missing(parts: Iterable[str]) -> Iterator[str]:
+    """Yield those of the parts that are not installed."""
+    modules = {extra: needed for extra, _, needed in EXTRAS}
+    for part in parts:
+        if not all(map(_is_there, modules.get(part, ()))):
+            yield part
+
+
+def _is_there(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # the package that it is in
+        return False
+
+
+def with_all_missing(told: str, words: Sequence[str]) -> str:
+    """Return an error that names all parts that a command lacks, not only the one that it met first.
+
+    Args:
+        told: The error, which ends with how to install a part.
+        words: The command line.
+    """
+    plain = [word for word in words if not word.startswith("-")]
+    needed: Collection[str] = NEEDS.get(" ".join(plain[:2])) or NEEDS.get(" ".join(plain[:1]), ())
+    before, command, first = told.rpartition(install_command(""))
+    return before + command + " ".join((first, *(part for part in missing(needed) if part != first)))
