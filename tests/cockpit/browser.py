@@ -60,8 +60,13 @@ class Deck:
         self.address = process.text.split("cockpit: ")[1].strip()
         return process
 
-    def page(self, *names: str, prepare: str = "", **options: Any) -> DronePage:
-        """The page with these drones opened, once it shows the last of them. ``prepare``: a script that runs first."""
+    def page(self, *names: str, prepare: str = "", panels: bool = True, **options: Any) -> DronePage:
+        """The page with these drones opened, once it shows the last of them. ``prepare``: a script that runs first.
+
+        With the panels beside the picture, as for a person who chose them, unless ``panels`` is false.
+        """
+        if panels:
+            prepare += "\nif (!localStorage.getItem('skyloop-panels')) localStorage.setItem('skyloop-panels', 'true');"
         page = self._new_page(prepare, options)
         shown = DronePage(page, names[-1])
         page.goto(f"{self.address}#{','.join(names)}")

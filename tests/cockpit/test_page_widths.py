@@ -1,0 +1,92 @@
+"""What stops and lands drones is on the screen: in each width and zoom, with long words, long names and with alarms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+import skyloop
+from tests.cockpit.browser import Deck, DronePage
+
+pytestmark = pytest.mark.process
+
+FINGER_PX = 44.0
+WIDTHS = (320, 390, 641, 768, 850, 947, 1024, 1440)
+#: A window of 1440 × 900 pixels and a tablet's of 1024 × 768, enlarged to 200, 300 and 400 %: what is left of them.
+ENLARGED = ((720, 450), (480, 300), (360, 225), (512, 384), (256, 192))
+LONG_NAME = "a-drone-with-a-name-as-long-as-names-can-be-1234"
+PSEUDO = "localStorage.setItem('skyloop-language', 'pseudo');"
+#: What is wrong with the controls that stop and land: outside of the window, covered, or smaller than ``least`` pixels.
+WRONG = """([drone, least]) => {
+  const pane = document.querySelector(`.pane[data-drone="${CSS.escape(drone)}"]`);
+  const [own, ...all] = document.querySelectorAll(".safety button");
+  const [land, stop] = [pane?.querySelector(".strip .land"), pane?.querySelector(".strip .stop")];
+  const wanted = [...all, ...(pane ? [land, stop?.checkVisibility() ? stop : own] : [])];
+  if (own.checkVisibility() && !wanted.includes(own)) wanted.push(own);
+  return wanted.flatMap((one) => {
+    if (!one?.checkVisibility({visibilityProperty: true, opacityProperty: true})) return [`${one?.textContent}: not shown`];
+    const box = one.getBoundingClientRect();
+    const found = [];
+    if (box.left < -0.5 || box.top < -0.5 || box.right > innerWidth + 0.5 || box.bottom > innerHeight + 0.5) found.push("outside");
+    if (box.width < least - 0.5 || box.height < least - 0.5) found.push("small");
+    for (const [x, y] of [[0.5, 0.5], [0.12, 0.2], [0.88, 0.2], [0.12, 0.8], [0.88, 0.8]]) {
+      const top = document.elementFromPoint(box.left + x * box.width, box.top + y * box.height);
+      if (!one.contains(top)) found.push(`covered by ${top?.tagName}.${top?.className}`);
+    }
+    return found.length ? [`${one.textContent} ${Math.round(box.left)},${Math.round(box.top)}+${Math.round(box.width)}×${Math.round(box.height)}: ${[...new Set(found)].join(", ")}`] : [];
+  });
+}"""
+WIDER = "document.documentElement.scrollWidth - innerWidth"
+
+
+def wrong(page: DronePage, drone: str, least: float = 24.0) -> Any:
+    return page.page.evaluate(WRONG, [drone, least])
+
+
+def resize(page: DronePage, width: int, height: int) -> None:
+    page.page.set_viewport_size({"width": width, "height": height})
+    page.page.evaluate("() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+
+
+def sweep(page: DronePage, drones: tuple[str, ...], least: float = 24.0) -> str:
+    """What is wrong at each size, scrolled to the top, to the middle and to the end of what is opened."""
+    found = []
+    for width, height in [*((width, 860) for width in WIDTHS), *ENLARGED]:
+        resize(page, width, height)
+        for drone in drones or ("",):
+            for block in ("start", "end") if drone else ("",):
+                if drone:
+                    script = "([name, block]) => document.querySelector(`.pane[data-drone=\"${name}\"]`).scrollIntoView({block})"
+                    page.page.evaluate(script, [drone, block])
+                    page.page.wait_for_timeout(16)
+                said = wrong(page, drone, least)
+                found += [f"{width}×{height} {drone} {block}: {one}" for one in said]
+        if page.page.evaluate(WIDER) > 0:
+            found.append(f"{width}×{height}: {page.page.evaluate(WIDER)} px beside the window")
+    return "\n".join(found)
+
+
+@pytest.mark.parametrize("panels", [False, True], ids=["picture", "panels"])
+def test_one_drone(deck: Deck, panels: bool) -> None:
+    deck.proxy("one")
+    page = deck.page("one", panels=panels)
+    page.take_control()
+    assert sweep(page, ("one",)) == ""
+
+
+def test_a_finger_a_long_name_and_alarms(deck: Deck) -> None:
+    deck.proxy(LONG_NAME)
+    page = deck.page(LONG_NAME, prepare=PSEUDO, panels=False, has_touch=True, viewport={"width": 1280, "height": 860})
+    with skyloop.connect(LONG_NAME, name="an-application-with-a-long-name-too") as drone:
+        drone.config["battery.warn"] = 1.0
+        page.until(lambda: page.pane.locator(".alarm").count() > 0, "an alarm")
+        assert sweep(page, (LONG_NAME,), FINGER_PX) == ""
+
+
+def test_two_drones_and_all_of_them(deck: Deck) -> None:
+    for name in ("left", "right"):
+        deck.proxy(name)
+    page = deck.page("left", "right")
+    assert sweep(page, ("left", "right")) == ""
+    assert sweep(deck.overview(has_touch=True), (), FINGER_PX) == ""
