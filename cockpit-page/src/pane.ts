@@ -27,6 +27,7 @@ import { Plots } from "./plots.js";
 import { Preflight } from "./preflight.js";
 import { ReplayBar } from "./replaybar.js";
 import { before, type Playback, playbackOf, type Timeline } from "./replaytime.js";
+import { titleOf } from "./row.js";
 import { isRecording, type Target } from "./safety.js";
 import type { SceneView } from "./scene.js";
 import { LastingSocket } from "./socket.js";
@@ -88,6 +89,7 @@ export class Pane {
   private readonly ended = h("p", { class: "banner ended-replay", role: "status", "data-tone": "quiet", hidden: true }, h("span", {}, t.pane.replayEnded), h("button", { type: "button", class: "small", onclick: () => this.host.close(this.name) }, t.modal.close));
   private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
   private readonly hud = new FlightHud();
+  private readonly title = h("h2");
   private readonly fly = h("button", { type: "button", class: "small fly", "aria-pressed": "false", onclick: () => this.host.fly(this) }, t.pane.flightMode);
   private readonly full = h("button", { type: "button", class: "full", "aria-label": t.pane.fullScreen, onclick: () => this.host.fillScreen() }, corners());
   private readonly panels = h("button", { type: "button", class: "small panels", "aria-pressed": "false", onclick: () => this.host.panels(this.panels.getAttribute("aria-pressed") !== "true") }, t.pane.panels);
@@ -268,7 +270,7 @@ export class Pane {
 
   private build(): HTMLElement {
     const close = h("button", { type: "button", class: "bare close", "aria-label": t.pane.close(this.name), onclick: () => this.host.close(this.name) }, "×");
-    const head = h("header", { class: "pane-head" }, h("h2", { title: this.name }, this.name), this.hud.element, this.endReplay, this.alarms.chip, this.pill, this.battery.element, this.full, this.panels, this.fly, close);
+    const head = h("header", { class: "pane-head" }, this.title, this.hud.element, this.endReplay, this.alarms.chip, this.pill, this.battery.element, this.full, this.panels, this.fly, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
     const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, h("div", { class: "said" }, this.kind, this.fresh.element, this.ended, this.alarms.element, this.notice), this.alarms.voice, body, this.thumbs.element, this.strip.element);
     element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
@@ -285,12 +287,13 @@ export class Pane {
         if (this.stage.followRefused(command, why)) return;
         this.notify(command ? `${words(command)}: ${why}` : why, "warn");
       },
-      route: (progress) => this.map.route.update(progress),
+      route: (progress) => (progress ? this.map.route.update(progress) : this.map.route.forget()),
       follow: (message) => (message ? this.stage.followed(message) : this.stage.forgetTarget()),
       done: (command, name, value) => {
         if (command === "set" && name !== undefined && value !== undefined && !this.writes.done(name)) for (const list of [this.parameters, this.controls.parameters]) list.done(name, value);
         if (command === "stop") this.notify(t.pane.stopShown, "bad");
         if (command === "goto") this.notify(t.pane.reached, "ok");
+        if (command === "given" && name !== undefined) this.notify(t.pane.handedOver(name), "ok");
       },
     };
   }
@@ -385,9 +388,13 @@ export class Pane {
     // What came before the link broke is not known any more; what is merely old is shown in grey.
     const live = this.connected && state?.links.application !== "lost" ? state : null;
     const over = recording && (live === null || live.links.vehicle === "closed");
+    const title = vehicle ? titleOf(vehicle) : this.name;
+    setText(this.title, title);
+    setAttribute(this.title, "title", title);
     setText(this.kind, vehicle ? vehicle.description || vehicle.vehicle : "");
     const flight = live ? named(t.states, live.flight) : t.pane.unknown;
-    setText(this.flight, over ? t.pane.over : live && isOld ? t.pane.was(flight) : flight);
+    const waking = live?.links.vehicle === "connecting" && live.flight === "unknown";
+    setText(this.flight, waking ? t.waking : over ? t.pane.over : live && isOld ? t.pane.was(flight) : flight);
     setTone(this.pill, live && !isOld && !over ? (FLIGHT_TONES[live.flight] ?? "quiet") : "quiet");
     this.battery.show(live?.battery ?? null, live?.alarms ?? []);
     this.hud.update(live, this.connected && !isOld, pilot?.round_trip_s ?? null);

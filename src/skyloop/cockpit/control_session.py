@@ -77,6 +77,7 @@ GONE_S: Final = (
     2.0  #: a page that receives nothing from the cockpit for so long flies nothing, and its control runs out
 )
 _REFUSE_AGAIN_S: Final = 1.0  # the same refusal of sticks, which come twenty times a second
+_OF_CONTROL: Final = (Refusal.FOREIGN_LEASE, Refusal.NO_AUTHORITY)  # of who has control the authority tells
 _DOWN: Final = frozenset({FlightState.LANDED})
 _TAKEOFF_NS: Final = 1_000_000_000  # a take-off that the proxy does not tell of by then is not wanted any more,
 _BEGUN_NS: Final = 6_000_000_000  # nor is one that the vehicle does not begin by then
@@ -370,6 +371,8 @@ class ControlSession:
     async def _answer(self, command: Answer) -> None:
         self._acknowledge(command)
         await self._takeover.answer(command, self._held())
+        if command.grant:
+            self._authority.handed_over()
         self._done(command.do)
 
     async def _release(self, command: Release) -> None:
@@ -527,18 +530,21 @@ class ControlSession:
             return
         self._takeover.on_event(event, pilot)
         ours = event.kind is EventKind.COMMAND_REFUSED and event.app == self.app
+        reason = event.data.get("reason")
         if ours and self._route is not None and self._route.is_under_way:
-            if event.data.get("reason") not in OF_ONE_PACKET:
+            if reason not in OF_ONE_PACKET:
                 self._stop_when_known(event)
             return
         if ours and self._follow.is_under_way:
-            if event.data.get("reason") not in (*OF_ONE_PACKET, Refusal.FOREIGN_LEASE, Refusal.NO_AUTHORITY):
+            if reason not in (*OF_ONE_PACKET, *_OF_CONTROL):
                 self._stop_when_known(event)  # of who has control the authority tells
             return
-        if not ours or self._refused_command == self._commands or event.data.get("reason") in OF_ONE_PACKET:
+        if not ours or self._refused_command == self._commands or reason in OF_ONE_PACKET:
             return  # its repeats are refused too: nothing new
         self._refused_command = self._commands
         self._awaited = None
+        if pilot.is_idle or (reason in _OF_CONTROL and pilot.authority.state != "held"):
+            return  # nothing of the page; and of who has control the authority tells
         self._refuse(self._last_command, event.text)
         if self._place.is_under_way:
             self._stop_when_known(event)

@@ -104,6 +104,11 @@ class PilotConnection(Drone):
         return outcome is not None and outcome.fate in OVERRULED and self._core.commands.may_ask
 
     @property
+    def is_idle(self) -> bool:
+        """Whether it asks for nothing: what is refused then is no command of the page."""
+        return isinstance(self._core.commands.newest, Idle)
+
+    @property
     def is_told(self) -> bool:
         """Whether the proxy tells what becomes of the newest command: it has arrived there."""
         newest, (_, intent) = self._state.newest, self._newest
