@@ -90,3 +90,68 @@ def test_two_drones_and_all_of_them(deck: Deck) -> None:
     page = deck.page("left", "right")
     assert sweep(page, ("left", "right")) == ""
     assert sweep(deck.overview(has_touch=True), (), FINGER_PX) == ""
+
+
+def share(page: DronePage, selector: str) -> float:
+    """How much of the window a part of the pane has."""
+    found, size = page.pane.locator(selector).first.bounding_box(), page.page.viewport_size
+    assert found is not None
+    assert size is not None
+    return found["width"] * found["height"] / (size["width"] * size["height"])
+
+
+def test_the_picture_is_first_and_the_panels_are_a_press_away(deck: Deck) -> None:
+    deck.proxy("first")
+    page = deck.page("first", panels=False, viewport={"width": 1440, "height": 900})
+    assert share(page, ".pictures") > 0.6
+    assert 0.01 < share(page, ".map-box") < 0.1, "the map is an inset"
+    assert not page.pane.locator(".deck.lists").is_visible()
+    page.pane.get_by_role("button", name="Enlarge the map").click()
+    assert share(page, ".map-box") > 0.5
+    page.pane.get_by_role("button", name="Enlarge the picture").click()
+    assert share(page, ".pictures") > 0.6
+    page.pane.get_by_role("button", name="Panels").click()
+    page.pane.locator(".deck.lists").wait_for()
+    page.page.reload()
+    page.pane.locator(".deck.lists").wait_for()
+    assert share(page, ".pictures") < 0.5, "it is remembered"
+    assert page.problems == []
+
+
+#: Fields and buttons of the route's table that are cut, or lie beside their place.
+CUT = """() => {
+  const place = document.querySelector(".route-body").getBoundingClientRect();
+  return [...document.querySelectorAll(".route-table :is(input, button)")].filter((one) => {
+    const box = one.getBoundingClientRect();
+    return box.width < 12 || box.left < place.left || box.right > place.right || box.right > innerWidth || one.scrollWidth > one.clientWidth + 2;
+  }).map((one) => one.getAttribute("aria-label"));
+}"""
+
+
+def test_a_route_fits_from_320_pixels_on(deck: Deck) -> None:
+    deck.proxy("route")
+    page = deck.page("route")
+    page.pane.get_by_role("button", name="Route", exact=True).click()
+    page.pane.locator(".map").focus()
+    page.press("ArrowRight", "Enter", "ArrowUp", "ArrowUp", "ArrowUp", "Enter")
+    page.until(lambda: page.pane.locator(".route-table input[data-field=x]").count() == 2, "two waypoints")
+    for width in (320, 640, 768, 1024, 1280, 1440):
+        resize(page, width, 900)
+        assert page.page.evaluate(CUT) == [], width
+
+
+def test_an_alarm_covers_nothing(deck: Deck) -> None:
+    deck.proxy("warned")
+    page = deck.page("warned", panels=False)
+    covered = """() => [...document.querySelectorAll(".pane :is(button, h2, .pill, .chip)")].filter((one) => {
+      const box = one.getBoundingClientRect();
+      if (!one.checkVisibility({visibilityProperty: true}) || !box.width || box.top < 0 || box.bottom > innerHeight) return false;
+      return document.elementFromPoint(box.left + box.width / 2, box.top + box.height / 2)?.closest(".banner:not(:has(button))")
+        || document.elementFromPoint(box.left + box.width / 2, box.top + box.height / 2)?.closest(".alarm > span");
+    }).map((one) => one.textContent)"""
+    with skyloop.connect("warned", name="test") as drone:
+        before = page.pane.locator(".stage").bounding_box()
+        drone.config["battery.warn"] = 1.0
+        page.wait_for_text(".alarms", "battery low")
+        assert page.page.evaluate(covered) == []
+        assert page.pane.locator(".stage").bounding_box() == before, "and moves nothing"
