@@ -25,18 +25,23 @@ WRONG = """([drone, least]) => {
   const wanted = [...all, ...(pane ? [land, stop?.checkVisibility() ? stop : own] : [])];
   if (own.checkVisibility() && !wanted.includes(own)) wanted.push(own);
   return wanted.flatMap((one) => {
-    if (!one?.checkVisibility({visibilityProperty: true, opacityProperty: true})) return [`${one?.textContent}: not shown`];
+    const seen = one?.checkVisibility({visibilityProperty: true, opacityProperty: true});
+    if (!seen) return [`${one?.textContent}: not shown`];
     const box = one.getBoundingClientRect();
     const found = [];
-    if (box.left < -0.5 || box.top < -0.5 || box.right > innerWidth + 0.5 || box.bottom > innerHeight + 0.5) found.push("outside");
+    const [right, bottom] = [innerWidth + 0.5, innerHeight + 0.5];
+    if (box.left < -0.5 || box.top < -0.5 || box.right > right || box.bottom > bottom) found.push("outside");
     if (box.width < least - 0.5 || box.height < least - 0.5) found.push("small");
     for (const [x, y] of [[0.5, 0.5], [0.12, 0.2], [0.88, 0.2], [0.12, 0.8], [0.88, 0.8]]) {
       const top = document.elementFromPoint(box.left + x * box.width, box.top + y * box.height);
       if (!one.contains(top)) found.push(`covered by ${top?.tagName}.${top?.className}`);
     }
-    return found.length ? [`${one.textContent} ${Math.round(box.left)},${Math.round(box.top)}+${Math.round(box.width)}×${Math.round(box.height)}: ${[...new Set(found)].join(", ")}`] : [];
+    const place = [box.left, box.top, box.width, box.height].map(Math.round).join(" ");
+    return found.length ? [`${one.textContent} at ${place}: ${[...new Set(found)].join(", ")}`] : [];
   });
 }"""
+TO = """([name, block]) =>
+  document.querySelector(`.pane[data-drone="${CSS.escape(name)}"]`).scrollIntoView({block})"""
 WIDER = "document.documentElement.scrollWidth - innerWidth"
 
 
@@ -57,8 +62,7 @@ def sweep(page: DronePage, drones: tuple[str, ...], least: float = 24.0) -> str:
         for drone in drones or ("",):
             for block in ("start", "end") if drone else ("",):
                 if drone:
-                    script = '([name, block]) => document.querySelector(`.pane[data-drone="${name}"]`).scrollIntoView({block})'
-                    page.page.evaluate(script, [drone, block])
+                    page.page.evaluate(TO, [drone, block])
                     page.page.wait_for_timeout(16)
                 said = wrong(page, drone, least)
                 found += [f"{width}×{height} {drone} {block}: {one}" for one in said]
@@ -123,7 +127,8 @@ CUT = """() => {
   const place = document.querySelector(".route-body").getBoundingClientRect();
   return [...document.querySelectorAll(".route-table :is(input, button)")].filter((one) => {
     const box = one.getBoundingClientRect();
-    return box.width < 12 || box.left < place.left || box.right > place.right || box.right > innerWidth || one.scrollWidth > one.clientWidth + 2;
+    const cut = one.scrollWidth > one.clientWidth + 2;
+    return cut || box.width < 12 || box.left < place.left || box.right > Math.min(place.right, innerWidth);
   }).map((one) => one.getAttribute("aria-label"));
 }"""
 
