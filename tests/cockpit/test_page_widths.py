@@ -101,7 +101,7 @@ def share(page: DronePage, selector: str) -> float:
     found, size = page.pane.locator(selector).first.bounding_box(), page.page.viewport_size
     assert found is not None
     assert size is not None
-    return found["width"] * found["height"] / (size["width"] * size["height"])
+    return float(found["width"] * found["height"] / (size["width"] * size["height"]))
 
 
 def test_the_picture_is_first_and_the_panels_are_a_press_away(deck: Deck) -> None:
