@@ -1,4 +1,5 @@
-// What is wrong with a drone, over its pane and not in its flow: nothing moves under the finger. Each alarm can be acknowledged.
+// What is wrong with a drone, in a line that is always there: nothing is covered, nothing moves under the finger.
+// Each alarm can be acknowledged.
 
 import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { t } from "./language/index.js";
@@ -89,7 +90,7 @@ class Row {
   }
 }
 
-/** The alarms of one drone: those that are new in full, the others folded into a button. */
+/** The alarms of one drone: the worst that is new in full, in a line of its own; the others are folded into a button. */
 export class AlarmBanner {
   readonly element = h("div", { class: "alarms", hidden: true });
   /** Shows those that were acknowledged. */
@@ -105,9 +106,14 @@ export class AlarmBanner {
     return this.chip.getAttribute("aria-expanded") === "true";
   }
 
+  /** How many have room in the line; a page that shows old things has it for that. */
+  room = 1;
+
   show(): void {
     const [open, acknowledged] = [this.book.open.filter(isShown), this.book.acknowledged.filter(isShown)];
-    const shown = this.isUnfolded ? [...open, ...acknowledged] : open;
+    const all = [...open, ...acknowledged];
+    const shown = this.isUnfolded ? all : open.slice(0, this.room);
+    const folded = all.slice(shown.length);
     for (const [id, row] of this.rows) {
       if (shown.some((alarm) => alarm.id === id)) continue;
       row.element.remove();
@@ -123,11 +129,12 @@ export class AlarmBanner {
       if (this.element.children[place] !== row.element) this.element.insertBefore(row.element, this.element.children[place] ?? null);
     });
     setHidden(this.element, shown.length === 0);
-    setHidden(this.chip, acknowledged.length === 0);
-    if (acknowledged.length === 0) setAttribute(this.chip, "aria-expanded", "false");
-    setTone(this.chip, acknowledged.some((alarm) => alarm.severity === "critical") ? "bad" : "warn");
-    setText(this.chip, t.alarms.count(acknowledged.length));
-    setAttribute(this.chip, "title", acknowledged.map((alarm) => alarm.text).join(" · "));
+    const others = this.isUnfolded ? all.slice(Math.min(open.length, this.room)) : folded;
+    setHidden(this.chip, others.length === 0);
+    if (others.length === 0) setAttribute(this.chip, "aria-expanded", "false");
+    setTone(this.chip, others.some((alarm) => alarm.severity === "critical") ? "bad" : "warn");
+    setText(this.chip, t.alarms.count(others.length));
+    setAttribute(this.chip, "title", others.map((alarm) => alarm.text).join(" · "));
     if (this.book.raised === this.raised) return;
     this.raised = this.book.raised;
     setText(this.voice, open.map((alarm) => alarm.text).join(". "));

@@ -4,11 +4,12 @@ import { Battery } from "./battery.js";
 import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { t } from "./language/index.js";
 import type { DroneRow } from "./model.js";
-import { byName, describe } from "./row.js";
+import { byName, describe, titleOf } from "./row.js";
 
 class Card {
   readonly element: HTMLElement;
   private readonly battery = new Battery();
+  private readonly title = h("b");
   private readonly state = h("span", { class: "card-state" });
   private readonly owner = h("span", { class: "card-owner" });
   private readonly hops = [h("i", { class: "dot" }), h("i", { class: "dot" })];
@@ -20,7 +21,7 @@ class Card {
   private readonly main: HTMLButtonElement;
 
   constructor(name: string, open: (name: string, alone: boolean) => void) {
-    this.main = h("button", { type: "button", class: "card-main", onclick: () => open(name, true) }, h("span", { class: "unseen" }, t.overview.open), h("span", { class: "card-top" }, h("b", {}, name), this.recording, this.linked), h("span", { class: "card-bottom" }, this.state, this.battery.element), this.owner, this.linkText);
+    this.main = h("button", { type: "button", class: "card-main", onclick: () => open(name, true) }, h("span", { class: "unseen" }, t.overview.open), h("span", { class: "card-top" }, this.title, this.recording, this.linked), h("span", { class: "card-bottom" }, this.state, this.battery.element), this.owner, this.linkText);
     this.beside = h("button", { type: "button", class: "card-beside", title: t.overview.beside, onclick: () => open(name, false) }, "+");
     this.element = h("li", { class: "card", "data-drone": name }, this.main, this.beside, this.alarms);
   }
@@ -28,6 +29,7 @@ class Card {
   update(row: DroneRow, open: boolean): void {
     const { tone, state, holder, alarm, battery, hops, links } = describe(row);
     setTone(this.element, tone);
+    setText(this.title, titleOf(row));
     setText(this.state, state);
     this.battery.show(battery, row.alarms);
     setText(this.owner, holder);

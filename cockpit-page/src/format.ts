@@ -62,7 +62,7 @@ export function short(value: Known): string {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
   const size = Math.abs(value);
-  if (size >= 1e5 || size < 1e-3) return value.toExponential(2).replace("-", "−");
+  if (size >= 1e5 || size < 5e-5) return value.toExponential(2).replace("-", "−");
   return figure(value, Math.max(0, Math.min(4, 3 - Math.floor(Math.log10(size)))));
 }
 

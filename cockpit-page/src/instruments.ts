@@ -101,7 +101,7 @@ export function oldHolderText(mine: boolean): { who: string; more: string; tone:
 
 /** Who has control, in words; `authority` is the state of this page's own connection, where there is one. */
 export function holderText(state: State | null, authority: Authority | null): { who: string; more: string; tone: Tone } {
-  if (authority?.mine) return { who: t.instruments.you, more: t.instruments.youHave(String(authority.priority ?? "–")), tone: "busy" };
+  if (authority?.mine) return { who: t.instruments.youAs(authority.app), more: t.instruments.youHave(String(authority.priority ?? "–")), tone: "busy" };
   const { holder = null, priority = null } = authority?.holder ? authority : (state?.authority ?? {});
   const down = state?.links.application === "lost";
   if (!holder) return { who: t.instruments.nobody, more: down ? t.instruments.nobodyDown : t.instruments.nobodyHas, tone: "quiet" };

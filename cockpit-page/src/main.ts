@@ -9,6 +9,7 @@ import "./style/overview.css";
 import "./style/alarms.css";
 import "./style/replay.css";
 import "./style/follow.css";
+import "./style/picture.css";
 import "./style/touch.css";
 import "./style/flightmode.css";
 import { hashOf, namesOf, OVERVIEW } from "./address.js";
@@ -16,7 +17,7 @@ import { AlarmBook } from "./alarms.js";
 import { AlarmSound } from "./alarmsound.js";
 import { post } from "./api.js";
 import { ServerClock } from "./clock.js";
-import { h, setAttribute, setHidden, setText } from "./dom.js";
+import { h, memory, setAttribute, setHidden, setText } from "./dom.js";
 import { type Flown, Flying, type InputView } from "./flying.js";
 import { FleetList } from "./fleet.js";
 import { FlightMode } from "./flightmode.js";
@@ -39,6 +40,8 @@ import type { Own } from "./tile.js";
 const DRAW_MS = 45;
 /** The list of drones comes twice a second; when it is older than this it is grey [ms]. */
 const OLD_LIST_MS = 2000;
+/** Lower windows, as those of a page that is enlarged to 400 %, keep only the safety controls of the bar in sight. */
+const LOW_PX = 500;
 
 const isFlown = (pane: Pane): pane is Pane & Flown => pane.pilot !== null;
 
@@ -52,6 +55,7 @@ class Page {
   /** Back to the overview. */
   private readonly all = h("button", { type: "button", class: "small all-drones", onclick: () => this.leave() }, t.overview.all);
   private readonly deckhouse: HTMLElement;
+  private readonly bar: HTMLElement;
   /** Nobody has chosen yet what to see: the only drone is opened by itself. */
   private undecided = namesOf(location.hash).length === 0 && location.hash !== OVERVIEW;
   /** Overviews in a row with one and the same only drone. */
@@ -88,10 +92,13 @@ class Page {
     const person = h("span", { class: "person", title: who.name || role }, who.name ? `${who.name} · ${role}` : role);
     const leave = who.login ? h("button", { type: "button", class: "small", onclick: () => void post("/api/logout").finally(() => location.reload()) }, t.page.logOut) : null;
     const brand = h("h1", { class: "brand" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "Skyloop");
-    const bar = h("header", { class: "bar" }, brand, this.all, h("span", { class: "spring" }), person, leave, this.sound.button, this.help.chip, settings.button, this.safety?.element ?? null);
+    const usual = h("div", { class: "bar-usual" }, brand, this.all, h("span", { class: "spring" }), person, leave, this.sound.button, this.help.chip, settings.button);
+    this.bar = h("header", { class: "bar" }, usual, this.safety?.element ?? null, h("div", { class: "page-said" }, this.lost, this.safety?.message ?? null));
+    new ResizeObserver(() => this.measure()).observe(this.bar);
+    window.addEventListener("resize", () => this.measure());
     const recordings = new RecordingList(() => this.recorded, (name) => this.enter(name), who.role === "pilot");
     this.deckhouse = h("div", { class: "deckhouse" }, this.fleet.element, this.overview.element, this.main, this.overview.side, recordings.element);
-    root.replaceChildren(bar, h("div", { class: "over page-over" }, h("div", { class: "stack" }, this.lost, this.safety?.message ?? "")), this.deckhouse, this.help.modal.element, this.help.mapping.modal.element, settings.modal.element, this.countdown.element);
+    root.replaceChildren(this.bar, this.deckhouse, this.help.modal.element, this.help.mapping.modal.element, settings.modal.element, this.countdown.element);
     this.flying = new Flying({
       flown: () => [...this.panes.values()].filter(isFlown),
       selected: () => (this.selected && isFlown(this.selected) ? this.selected : null),
@@ -154,9 +161,26 @@ class Page {
   /** The list of drones is grey when it is old. */
   private age(now_ms: number): void {
     const old_ms = now_ms - this.listed_ms;
-    setHidden(this.lost, old_ms <= OLD_LIST_MS);
+    setHidden(this.lost, old_ms <= OLD_LIST_MS || !this.inOverview); // an opened drone says it itself
     for (const part of [this.fleet.element, this.overview.element, this.overview.side]) setAttribute(part, "data-old", String(old_ms > OLD_LIST_MS));
     if (old_ms > OLD_LIST_MS) setText(this.lostAge, `${(old_ms / 1000).toFixed(0)} s`);
+  }
+
+  /** How much of the window the bar has; where a window is low it leaves no more there than what stops and lands. */
+  private measure(): void {
+    const safety = this.safety?.element;
+    const away_px = window.innerHeight < LOW_PX && safety?.parentElement === this.bar ? Math.max(0, safety.offsetTop - 4) : 0;
+    const { style } = document.documentElement;
+    style.setProperty("--bar-away", `${away_px}px`);
+    style.setProperty("--bar", `${this.bar.offsetHeight - away_px}px`);
+  }
+
+  /** One drone alone has the whole window for its picture, unless the person wants the panels beside it. */
+  private frame(): void {
+    const alone = this.panes.size === 1;
+    const panels = memory.get("panels") === "true";
+    for (const pane of this.panes.values()) pane.frame(alone, panels);
+    setAttribute(this.deckhouse, "data-picture", String(alone && !panels && !this.inOverview));
   }
 
   private linked(open: boolean, code: number): void {
@@ -214,6 +238,7 @@ class Page {
     setHidden(this.main, overview);
     setHidden(this.fleet.element, overview);
     setHidden(this.all, overview);
+    this.frame();
   }
 
   /** `alone`: instead of those that are open; else beside them, or closed if it is open. */
@@ -234,6 +259,10 @@ class Page {
         fly: (one) => this.flight.toggle(one),
         known: (one) => this.panes.size === 1 && this.flight.offer(one),
         fillScreen: () => this.flight.fillScreen(),
+        panels: (shown) => {
+          memory.set("panels", String(shown));
+          this.frame();
+        },
         aimed: (one) => one === this.chosen && this.aim(),
         countdown: this.countdown,
       });

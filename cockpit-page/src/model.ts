@@ -128,6 +128,8 @@ export interface Parameter {
   default: Value | null;
   choices: Value[];
   read_only: boolean;
+  /** Writing it does something once, as a flip: it keeps no value. */
+  momentary: boolean;
   description: string;
 }
 
@@ -139,6 +141,10 @@ export interface Authority {
   mine: boolean;
   /** How this page lost the control that it had; null if it did not. */
   why: string | null;
+  /** This page has given it to who asked for it. */
+  given: boolean;
+  /** The name under which this page flies, as others see it; empty until the cockpit has said it. */
+  app: string;
   /** Where this page waits; null while it does not. */
   line: QueuePosition | null;
 }

@@ -8,9 +8,11 @@ import type { DroneRow } from "./model.js";
 import { byName, found } from "./row.js";
 import { isRecording } from "./safety.js";
 import { SmallVideo } from "./smallvideo.js";
+import { Surroundings } from "./surroundings.js";
 import { DroneTable } from "./table.js";
 import { type Own, Tile } from "./tile.js";
 import type { Scene } from "./world.js";
+import { zoneText } from "./zones.js";
 
 /** So many have a tile each; more are a table, unless the user chose otherwise. */
 export const MOST_TILES = 12;
@@ -19,6 +21,8 @@ const SEARCH_FROM = 7;
 const MAP_MS = 240;
 const AGE_MS = 240;
 const MARGIN = "80px";
+/** Zones may be changed by anybody: they are read again so often. */
+const AROUND_MS = 10_000;
 
 type Kind = "tiles" | "table";
 
@@ -32,6 +36,8 @@ export class OverviewView {
   private readonly table: DroneTable;
   private readonly map = new MapView(() => this.scene());
   private readonly trails = new Map<string, Trail>();
+  /** What stands around them, and where they may fly: of as many as have a tile, read while they are seen. */
+  private readonly surroundings = new Map<string, Surroundings>();
   private readonly none = h("p", { class: "empty nobody" }, t.overview.none, h("span", {}, t.overview.start), h("code", {}, "skyloop sim"));
   private readonly unfound = h("p", { class: "empty" }, t.overview.unfound);
   private readonly counted = h("span", { class: "count" });
@@ -41,6 +47,7 @@ export class OverviewView {
   private rows: readonly DroneRow[] = [];
   private visible = false;
   private drawn_ms = 0;
+  private around_ms = 0;
   private aged_ms = 0;
 
   constructor(
@@ -63,6 +70,7 @@ export class OverviewView {
     setHidden(this.element, !shown);
     setHidden(this.side, !shown);
     this.video.run(shown);
+    this.lookAround();
     if (shown) this.show();
   }
 
@@ -73,7 +81,25 @@ export class OverviewView {
       if (!this.trails.has(name)) this.trails.set(name, new Trail());
       if (position) this.trails.get(name)?.add(now_s, position);
     }
+    this.lookAround();
     if (this.visible) this.show();
+  }
+
+  private lookAround(): void {
+    const wanted = new Set(this.visible ? this.rows.filter((row) => !isRecording(row)).slice(0, MOST_TILES).map((row) => row.name) : []);
+    for (const [name, one] of this.surroundings) {
+      if (wanted.has(name)) continue;
+      one.close();
+      this.surroundings.delete(name);
+    }
+    const again = performance.now() - this.around_ms > AROUND_MS;
+    if (again) this.around_ms = performance.now();
+    for (const name of wanted) {
+      const known = this.surroundings.get(name);
+      const one = known ?? new Surroundings(name, () => this.map.repaint());
+      this.surroundings.set(name, one);
+      if (again || !known) one.reload();
+    }
   }
 
   tick(now_ms: number): void {
@@ -148,6 +174,10 @@ export class OverviewView {
       const trail = this.trails.get(name);
       return position === null || isRecording(row) ? [] : [{ name, position, roll: 0, pitch: 0, yaw, ink: "accent", ...(trail ? { trail } : {}) }];
     });
-    return { own: null, truth: null, others, targets: [], waypoints: [], trail: new Trail() };
+    const known = [...this.surroundings.values()].flatMap(({ world }) => world ?? []);
+    const zones = new Map(known.flatMap((world) => world.zones).map((zone) => [zoneText(zone), zone]));
+    const place = known.find((world) => world.source !== null) ?? known[0];
+    const world = place ? { ...place, zones: [...zones.values()], box: known.length === 1 ? place.box : null } : null;
+    return { own: null, truth: null, others, targets: [], waypoints: [], trail: new Trail(), world };
   }
 }

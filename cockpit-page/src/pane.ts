@@ -8,7 +8,7 @@ import { CameraControls } from "./cameracontrols.js";
 import { Channels } from "./channels.js";
 import { ServerClock } from "./clock.js";
 import { Deck } from "./deck.js";
-import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
+import { h, memory, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { Events } from "./events.js";
 import { corners, FlightHud } from "./flightmode.js";
 import type { FollowHost } from "./followtool.js";
@@ -27,6 +27,7 @@ import { Plots } from "./plots.js";
 import { Preflight } from "./preflight.js";
 import { ReplayBar } from "./replaybar.js";
 import { before, type Playback, playbackOf, type Timeline } from "./replaytime.js";
+import { titleOf } from "./row.js";
 import { isRecording, type Target } from "./safety.js";
 import type { SceneView } from "./scene.js";
 import { LastingSocket } from "./socket.js";
@@ -48,6 +49,8 @@ export interface PaneHost {
   /** What it is has become known: it could be flown. */
   known(pane: Pane): void;
   fillScreen(): void;
+  /** With the panels beside the picture, or without them: remembered. */
+  panels(shown: boolean): void;
   /** What its emergency stop is, or what became of it, may have changed. */
   aimed(name: string): void;
   readonly countdown: Countdown;
@@ -86,8 +89,12 @@ export class Pane {
   private readonly ended = h("p", { class: "banner ended-replay", role: "status", "data-tone": "quiet", hidden: true }, h("span", {}, t.pane.replayEnded), h("button", { type: "button", class: "small", onclick: () => this.host.close(this.name) }, t.modal.close));
   private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
   private readonly hud = new FlightHud();
+  private readonly title = h("h2");
   private readonly fly = h("button", { type: "button", class: "small fly", "aria-pressed": "false", onclick: () => this.host.fly(this) }, t.pane.flightMode);
   private readonly full = h("button", { type: "button", class: "full", "aria-label": t.pane.fullScreen, onclick: () => this.host.fillScreen() }, corners());
+  private readonly panels = h("button", { type: "button", class: "small panels", "aria-pressed": "false", onclick: () => this.host.panels(this.panels.getAttribute("aria-pressed") !== "true") }, t.pane.panels);
+  /** Over the smaller one of picture and map, where one of them has nearly all of the pane: it changes them. */
+  private readonly swap = h("button", { type: "button", class: "swap", onclick: () => this.enlarge(this.element.dataset["large"] === "map" ? "picture" : "map") }, h("span", { "aria-hidden": "true" }, "⤢"));
   private readonly stage: Stage;
   private readonly instruments = new Instruments();
   private readonly strip: Strip;
@@ -143,6 +150,7 @@ export class Pane {
       lists: new Deck("lists", [{ name: t.pane.events, element: this.events.element }, { name: t.pane.parameters, element: this.parameters.element, opened: () => void this.parameters.load() }, { name: t.pane.preflight, element: this.preflight.element, opened: () => void this.preflight.load() }], t.pane.lists),
     };
     this.element = this.build();
+    this.enlarge(memory.get("large") ?? "picture");
     this.socket = new LastingSocket(`${base}/telemetry`, {
       message: (data) => this.onMessage(JSON.parse(data as string) as Vehicle | State),
       state: (open, code) => this.linked(open, code),
@@ -191,6 +199,24 @@ export class Pane {
   selected(selected: boolean): void {
     if (!selected) this.thumbs.release();
     setAttribute(this.element, "data-selected", String(selected));
+  }
+
+  /** How it lies in the window: alone with its picture first, or with its panels. */
+  frame(alone: boolean, panels: boolean): void {
+    setHidden(this.panels, !alone);
+    setAttribute(this.panels, "aria-pressed", String(panels));
+    setAttribute(this.element, "data-picture", String(alone && !panels));
+  }
+
+  /** Where the picture is first: it, or the map, is the large one. */
+  private enlarge(what: string): void {
+    memory.set("large", what);
+    setAttribute(this.element, "data-large", what);
+    const [large, small] = what === "map" ? [this.decks.space.element, this.stage.element] : [this.stage.element, this.decks.space.element];
+    small.append(this.swap);
+    large.removeAttribute("data-small");
+    setAttribute(small, "data-small", "true");
+    setAttribute(this.swap, "aria-label", what === "map" ? t.pane.pictureLarge : t.pane.mapLarge);
   }
 
   /** For the flight mode, or as usual. */
@@ -244,9 +270,9 @@ export class Pane {
 
   private build(): HTMLElement {
     const close = h("button", { type: "button", class: "bare close", "aria-label": t.pane.close(this.name), onclick: () => this.host.close(this.name) }, "×");
-    const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.alarms.chip, this.pill, this.battery.element, this.hud.element, this.full, this.fly, close);
+    const head = h("header", { class: "pane-head" }, this.title, this.hud.element, this.endReplay, this.alarms.chip, this.pill, this.battery.element, this.full, this.panels, this.fly, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
-    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, h("div", { class: "over" }, h("div", { class: "stack" }, this.fresh.element, this.ended, this.alarms.element, this.notice)), this.alarms.voice, body, this.thumbs.element, this.strip.element);
+    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, h("div", { class: "said" }, this.kind, this.fresh.element, this.ended, this.alarms.element, this.notice), this.alarms.voice, body, this.thumbs.element, this.strip.element);
     element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
     element.addEventListener("focusin", () => this.host.select(this.name));
     return element;
@@ -261,12 +287,13 @@ export class Pane {
         if (this.stage.followRefused(command, why)) return;
         this.notify(command ? `${words(command)}: ${why}` : why, "warn");
       },
-      route: (progress) => this.map.route.update(progress),
+      route: (progress) => (progress ? this.map.route.update(progress) : this.map.route.forget()),
       follow: (message) => (message ? this.stage.followed(message) : this.stage.forgetTarget()),
       done: (command, name, value) => {
         if (command === "set" && name !== undefined && value !== undefined && !this.writes.done(name)) for (const list of [this.parameters, this.controls.parameters]) list.done(name, value);
         if (command === "stop") this.notify(t.pane.stopShown, "bad");
         if (command === "goto") this.notify(t.pane.reached, "ok");
+        if (command === "given" && name !== undefined) this.notify(t.pane.handedOver(name), "ok");
       },
     };
   }
@@ -361,9 +388,13 @@ export class Pane {
     // What came before the link broke is not known any more; what is merely old is shown in grey.
     const live = this.connected && state?.links.application !== "lost" ? state : null;
     const over = recording && (live === null || live.links.vehicle === "closed");
+    const title = vehicle ? titleOf(vehicle) : this.name;
+    setText(this.title, title);
+    setAttribute(this.title, "title", title);
     setText(this.kind, vehicle ? vehicle.description || vehicle.vehicle : "");
     const flight = live ? named(t.states, live.flight) : t.pane.unknown;
-    setText(this.flight, over ? t.pane.over : live && isOld ? t.pane.was(flight) : flight);
+    const waking = live?.links.vehicle === "connecting" && live.flight === "unknown";
+    setText(this.flight, waking ? t.waking : over ? t.pane.over : live && isOld ? t.pane.was(flight) : flight);
     setTone(this.pill, live && !isOld && !over ? (FLIGHT_TONES[live.flight] ?? "quiet") : "quiet");
     this.battery.show(live?.battery ?? null, live?.alarms ?? []);
     this.hud.update(live, this.connected && !isOld, pilot?.round_trip_s ?? null);
@@ -379,8 +410,10 @@ export class Pane {
     this.stage.allowFollow(mine && inAir ? "" : recording ? t.pane.recordingFlies : isOld ? t.pane.isOld : mine ? t.follow.takeOff : t.follow.take);
     for (const list of [this.parameters, this.controls.parameters]) list.allow(mine, recording ? t.pane.asRecorded : t.pane.takeToChange);
     this.alarmBook.update(this.found(), performance.now());
+    this.alarms.room = isOld && !this.absent ? 0 : 1;
     this.alarms.show();
     this.fresh.offer(this.alarmBook.open.some((alarm) => alarm.id === "old"));
+    setAttribute(this.element, "data-absent", String(this.absent !== ""));
     setAttribute(this.element, "data-lost", String(!live || isOld));
     setAttribute(this.element, "data-old", String(isOld || (!live && !over)));
     setAttribute(this.element, "data-mine", String(mine));
@@ -394,9 +427,10 @@ export class Pane {
     const severity = state?.airborne || this.pilot?.mine ? "critical" : "warning";
     const old: Alarm[] = this.fresh.isOld ? [{ id: "old", severity, text: t.pane.shownIsOld }] : [];
     if (this.connected) return [...old, ...(state?.alarms ?? [])];
+    if (!this.absent && old.length) return old; // the cause is the same
     if (this.absent) return [{ id: "absent", severity, text: this.absent }];
     if (!this.wasConnected && performance.now() - this.opened_ms < CONNECT_MS) return [];
-    return [...old, { id: "page_link", severity, text: t.pane.noData(this.name) }];
+    return [{ id: "page_link", severity, text: t.pane.noData(this.name) }];
   }
 
   notify(text: string, tone: Tone): void {

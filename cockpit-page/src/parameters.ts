@@ -86,14 +86,14 @@ export class Parameters {
 
   private row(parameter: Parameter): Row {
     const editor = editorOf(parameter);
-    const button = h("button", { type: "submit", class: "small" }, t.parameters.set);
+    const button = h("button", { type: "submit", class: "small" }, parameter.momentary ? t.parameters.doIt : t.parameters.set);
     const answer = h("p", { class: "answer", role: "status" });
     const standard = parameter.default === null ? "" : t.parameters.standard(valueText(parameter.default));
-    const facts = [parameter.type, rangeText(parameter), standard, parameter.read_only ? t.parameters.readOnly : ""].filter(Boolean).join(" · ");
+    const facts = [parameter.type, rangeText(parameter), standard, parameter.read_only ? t.parameters.readOnly : "", parameter.momentary ? t.parameters.momentary : ""].filter(Boolean).join(" · ");
     const element = h(
       "form",
       { class: "parameter", "data-parameter": parameter.name, novalidate: true },
-      h("div", { class: "about" }, h("b", {}, parameter.name), h("span", { class: "facts" }, facts)),
+      h("div", { class: "about" }, h("b", {}, ...parameter.name.split(/(?<=[._])/).flatMap((part) => [part, h("wbr")])), h("span", { class: "facts" }, facts)),
       h("div", { class: "edit" }, editor, h("span", { class: "unit" }, parameter.unit), button),
       parameter.description ? h("p", { class: "description" }, parameter.description) : null,
       answer,
@@ -129,7 +129,7 @@ export class Parameters {
   private enable(row: Row): void {
     const may = this.can && !row.parameter.read_only;
     setDisabled(row.editor, !may);
-    setDisabled(row.button, !may || row.editor.value === valueText(row.parameter.value));
+    setDisabled(row.button, !may || (!row.parameter.momentary && row.editor.value === valueText(row.parameter.value)));
   }
 
   /** Show those that were asked for. */

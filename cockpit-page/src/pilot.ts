@@ -23,12 +23,12 @@ export interface PilotListener {
   refused(command: string, why: string): void;
   done(command: string, name?: string, value?: Value): void;
   /** A flight along a route goes on. */
-  route?(progress: RouteProgress): void;
+  route?(progress: RouteProgress | null): void;
   /** What becomes of a target that was marked; null: the connection is gone, and the target with it. */
   follow?(message: FollowMessage | null): void;
 }
 
-const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, why: null, line: null };
+const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, why: null, given: false, app: "", line: null };
 
 export class Pilot {
   authority: Authority = NOBODY;
@@ -221,6 +221,7 @@ export class Pilot {
     this.authority = NOBODY;
     this.questions = [];
     this.listener.follow?.(null);
+    this.listener.route?.(null);
     this.listener.changed();
   }
 
@@ -234,8 +235,9 @@ export class Pilot {
     if (message.type === "authority") {
       this.authority = message;
       this.received_ms = this.now_ms();
-      if (message.mine) this.ended = "";
+      if (message.mine || message.given) this.ended = "";
       else if (message.why) this.ended = message.why;
+      if (message.given && message.why) this.listener.done("given", message.why);
       if (!message.mine) this.end();
       if (!message.mine) this.questions = [];
       this.listener.changed();

@@ -21,6 +21,7 @@ export interface RouteHost {
 
 const CHECK_MS = 400;
 const HEIGHT_M = 1;
+const HEADS = ["x m", "y m", "z m", "m/s", t.route.yawHead, t.route.turnHead, t.route.wait, t.route.photo] as const;
 
 export class RoutePanel implements MapTool {
   readonly element: HTMLElement;
@@ -31,7 +32,7 @@ export class RoutePanel implements MapTool {
   private readonly end = h("select", { class: "small", "aria-label": t.route.end, onchange: () => this.typed() }, ...Object.entries(t.route.ends).map(([value, text]) => h("option", { value }, text)));
   private readonly upload = h("input", { type: "file", accept: ".json", hidden: true, onchange: () => void this.read() });
   private readonly rows = h("tbody");
-  private readonly table = h("table", { class: "route-table" }, h("thead", {}, h("tr", {}, ...["", "x m", "y m", "z m", "m/s", t.route.yawHead, t.route.turnHead, t.route.wait, t.route.photo, ""].map((text) => (text ? h("th", { scope: "col" }, text) : h("td"))))), this.rows);
+  private readonly table = h("table", { class: "route-table" }, h("thead", {}, h("tr", {}, ...["", ...HEADS, ""].map((text) => (text ? h("th", { scope: "col" }, text) : h("td"))))), this.rows);
   private readonly summary = h("p", { class: "note", role: "status" });
   private readonly said = h("p", { class: "note", role: "alert", "data-tone": "warn" });
   private readonly found = h("ul", { class: "route-findings", "aria-label": t.route.against });
@@ -223,10 +224,7 @@ export class RoutePanel implements MapTool {
     photo.addEventListener("change", () => this.put(index, withActions(latest(), waitOf(latest()), photo.checked)));
     const act = (text: string, label: string, run: () => void, off = false): HTMLElement => h("button", { type: "button", class: "small bare", "aria-label": t.route.actOn(label, number), disabled: off, onclick: run }, text);
     const shift = (to: number): void => this.edit({ ...this.route, waypoints: moved(this.route.waypoints, index, to) });
-    return h(
-      "tr",
-      {},
-      h("th", { scope: "row" }, String(number)),
+    const cells = [
       axis("x"),
       axis("y"),
       axis("z"),
@@ -235,6 +233,13 @@ export class RoutePanel implements MapTool {
       direction("turn", turnOf(one), t.route.turnIn, (to) => withTurn(latest(), to)),
       field("wait", waitOf(one) || "", t.route.waitIn, 1, (value) => withActions(latest(), value ?? 0, hasPhoto(latest()))),
       h("td", {}, photo),
+    ];
+    cells.forEach((cell, place) => setAttribute(cell, "data-head", HEADS[place] as string)); // where the table is narrow, each waypoint is a card
+    return h(
+      "tr",
+      {},
+      h("th", { scope: "row" }, String(number)),
+      ...cells,
       h("td", { class: "route-acts" }, act("↑", t.route.up, () => shift(index - 1), index === 0), act("↓", t.route.down, () => shift(index + 1), index === this.route.waypoints.length - 1), act("×", t.route.delete, () => this.drop(index))),
     );
   }

@@ -29,13 +29,19 @@ const LINKS: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", conn
 /** In the unit that the person chose. */
 export const height = (altitude_m: number | null): string => lengthText(altitude_m, 1);
 
+/** What it is called: its name, or of a replay, whose proxy has a number, the recording's. */
+export function titleOf({ name, uri }: { name: string; uri: string }): string {
+  const file = uri.startsWith("replay:") ? uri.split("?")[0]?.split("/").at(-1)?.replace(/\.mcap$/, "") : "";
+  return file ? t.replay.of(decodeURIComponent(file)) : name;
+}
+
 export function describe(row: DroneRow): Described {
   const recorded = isRecording(row);
   const [application, vehicle] = [row.links.application, row.links.vehicle];
   const lost = application === "lost";
   const over = recorded && (lost || vehicle === "closed"); // as every recording is some time
   const critical = row.alarms.some((alarm) => alarm.severity === "critical");
-  const flight = row.airborne && row.altitude !== null ? `${named(t.states, row.state)} · ${height(row.altitude)}` : named(t.states, row.state);
+  const flight = row.airborne && row.altitude !== null ? `${named(t.states, row.state)} · ${height(row.altitude)}` : vehicle === "connecting" && !lost && row.state === "unknown" ? t.waking : named(t.states, row.state);
   return {
     tone: over ? "quiet" : lost || critical ? "bad" : row.alarms.length ? "warn" : row.airborne ? "ok" : "quiet",
     state: over ? t.overview.over : lost ? t.overview.lost : flight,

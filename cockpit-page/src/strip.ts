@@ -67,7 +67,7 @@ export class Strip {
     this.release = keyed(t.strip.release, "R", "", () => act("release"));
     this.takeOff = keyed(t.strip.takeOff, "T", "", () => act("takeoff"));
     this.hover = keyed(t.strip.hover, "H", "", () => act("hover"));
-    this.land = keyed(t.strip.land, "L", "", () => act("land"));
+    this.land = keyed(t.strip.land, "L", "land", () => act("land"));
     this.back = keyed(t.strip.back, "B", "", () => act("return"));
     this.reset = keyed(t.strip.reset, "", "", () => act("reset"));
     this.stop = holdButton(stop.countdown, stop.deadly, { class: "stop", title: t.safety.hold }, h("span", {}, t.safety.off), h("span", { class: "stop-name" }, drone), h("span", { class: "fate" }));

@@ -5,7 +5,7 @@ import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { duration } from "./format.js";
 import { t } from "./language/index.js";
 import type { DroneRow } from "./model.js";
-import { describe } from "./row.js";
+import { describe, titleOf } from "./row.js";
 import type { Sink, SmallHead, SmallVideo } from "./smallvideo.js";
 
 const STALE_S = 1;
@@ -21,6 +21,7 @@ export const OWN_WORDS: Readonly<Record<Own, string>> = { "": "", held: t.overvi
 
 export class Tile implements Sink {
   readonly element: HTMLElement;
+  private readonly title = h("b");
   private readonly canvas = h("canvas", { class: "tile-video", "aria-hidden": "true", width: 4, height: 3 });
   private readonly pen = this.canvas.getContext("2d", { alpha: false });
   private readonly nothing = h("span", { class: "tile-nothing" });
@@ -48,7 +49,7 @@ export class Tile implements Sink {
     private readonly video: SmallVideo,
     open: () => void,
   ) {
-    const top = h("span", { class: "tile-top" }, h("b", {}, name), this.recording, this.links);
+    const top = h("span", { class: "tile-top" }, this.title, this.recording, this.links);
     const picture = h("span", { class: "tile-picture" }, this.canvas, this.nothing, top, this.alarm);
     const text = h("span", { class: "tile-text" }, h("span", { class: "tile-line" }, this.state, this.battery.element), this.holder);
     this.main = h("button", { type: "button", class: "tile-main", onclick: open }, h("span", { class: "unseen" }, t.overview.open), picture, text, this.linkText);
@@ -57,6 +58,7 @@ export class Tile implements Sink {
 
   update(row: DroneRow, own: Own): void {
     const { tone, state, holder, alarm, alarmTone, battery, hops, links, over, lost } = describe(row);
+    setText(this.title, titleOf(row));
     this.over = over;
     setTone(this.element, tone);
     setText(this.state, state);

@@ -39,14 +39,14 @@ export function drawWorld(chart: Chart, world: World): void {
 /** Where it may not fly. */
 export function drawBounds(chart: Chart, box: SafetyBox | null, zones: readonly Zone[]): void {
   const { pen, ink } = chart;
-  zones.forEach((zone, number) => {
+  zones.forEach((zone) => {
     zoneOutline(chart, zone);
     fill(chart, "bad", 0.16);
     pen.strokeStyle = ink["bad"] ?? "";
     pen.lineWidth = 1.5;
     pen.stroke();
     const [x, y] = chart.at(zoneCentre(zone));
-    label(chart, x - 8, y, zoneName(zone, number), "bad");
+    label(chart, x - 8, y, zoneName(zone), "bad");
   });
   if (box) drawBox(chart, box);
 }

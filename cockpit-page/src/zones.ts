@@ -34,8 +34,15 @@ export function zoneText(zone: Zone): string {
   return `${zone.name ? `${zone.name}: ` : ""}${zone.kind} ${numbers.map(cm).join(" ")}`;
 }
 
-/** What a zone is called: by its name, or by its number in the list, from 0 on. */
-export const zoneName = (zone: Zone, number: number): string => zone.name || `Z${number + 1}`;
+/** What a zone is called: by its name, or as a refusal calls one that has none. */
+export const zoneName = (zone: Zone): string => zone.name || zoneText(zone);
+
+/** The first name that none of them has. */
+export function freeName(zones: readonly Zone[]): string {
+  let number = 1;
+  while (zones.some((zone) => zone.name === `Z${number}`)) number += 1;
+  return `Z${number}`;
+}
 
 export const zonesText = (zones: readonly Zone[]): string => zones.map(zoneText).join("; ");
 

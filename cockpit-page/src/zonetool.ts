@@ -7,7 +7,7 @@ import { t } from "./language/index.js";
 import type { Ink, MapTool, Project, Spot } from "./maptool.js";
 import type { Zone } from "./surroundings.js";
 import { zoneOutline } from "./worldlayer.js";
-import { type Bounds, type Edited, fields, handles, MAX_ZONES, rectangle, round, writes, zoneAt, zoneName } from "./zones.js";
+import { type Bounds, type Edited, fields, freeName, handles, MAX_ZONES, rectangle, round, writes, zoneAt, zoneName } from "./zones.js";
 
 const DEFAULT_TOP_M = 3;
 
@@ -169,7 +169,7 @@ export class ZoneTool implements MapTool {
     const top = this.host.ceiling() ?? DEFAULT_TOP_M;
     const made = adding.kind === "box" ? rectangle : round;
     this.edited = bounds.zones.length;
-    this.grabbed = (to) => ({ ...bounds, zones: [...bounds.zones, made(from, to, 0, top)] });
+    this.grabbed = (to) => ({ ...bounds, zones: [...bounds.zones, { ...made(from, to, 0, top), name: freeName(bounds.zones) }] });
   }
 
   private finish(place: readonly [number, number]): void {
@@ -227,7 +227,7 @@ export class ZoneTool implements MapTool {
     if (state === this.shown) return;
     this.shown = state;
     const option = (value: string, text: string): HTMLElement => h("option", { value }, text);
-    this.list.replaceChildren(option("box", bounds.box ? t.zones.box : t.zones.noBox), ...bounds.zones.map((zone, number) => option(String(number), t.zones.named(zoneName(zone, number), t.zones.kinds[zone.kind]))));
+    this.list.replaceChildren(option("box", bounds.box ? t.zones.box : t.zones.noBox), ...bounds.zones.map((zone, number) => option(String(number), t.zones.named(zoneName(zone), t.zones.kinds[zone.kind]))));
     this.list.value = String(this.edited);
     for (const button of this.buttons) setDisabled(button, !this.can);
     const has = this.edited === "box" ? bounds.box !== null : bounds.zones[this.edited] !== undefined;

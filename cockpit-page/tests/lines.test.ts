@@ -137,6 +137,27 @@ test("nothing is sent or kept while it is not open; closed is closed", () => {
   assert.deepEqual(received, []);
 });
 
+test("a route of a connection that broke is forgotten, and control that was given is not told as lost", () => {
+  const told: unknown[] = [];
+  let handlers: Handlers | null = null;
+  const pilot = new Pilot(
+    (given) => {
+      handlers = given;
+      return { isOpen: true, send: () => true, close: () => undefined };
+    },
+    new ServerClock(),
+    { changed: () => undefined, refused: () => undefined, done: (command, what) => told.push(`${command}: ${what}`), route: (progress) => told.push(progress) },
+  );
+  const [receive, link] = [(message: object) => handlers?.message(JSON.stringify(message)), (open: boolean) => handlers?.state?.(open, 0, "")];
+  link(true);
+  receive(held(true));
+  receive({ ...held(false, "survey.py"), state: "preempted", why: "survey.py has control now", given: true });
+  assert.equal(pilot.ended, "");
+  assert.equal(told.at(-1), "given: survey.py has control now");
+  link(false);
+  assert.equal(told.at(-1), null, "“Fly the route” is not held back by a flight that is gone");
+});
+
 type Sent = Record<string, unknown>;
 interface Flown {
   pilot: Pilot;
@@ -183,7 +204,7 @@ function flown(): Flown {
   };
 }
 
-const held = (mine: boolean, holder: string | null = mine ? "cockpit 1" : null): Authority => ({ type: "authority", state: mine ? "held" : "none", holder, priority: 8, mine, why: null, line: null });
+const held = (mine: boolean, holder: string | null = mine ? "cockpit 1" : null): Authority => ({ type: "authority", state: mine ? "held" : "none", holder, priority: 8, mine, why: null, given: false, app: "cockpit 1", line: null });
 const doings = (sent: Record<string, unknown>[]): unknown[] => sent.map((message) => message["do"]).filter((one) => one !== "ping");
 const FORWARD = { ...CENTRED, forward: 0.5 };
 

@@ -325,7 +325,7 @@ test("a question for control says what becomes of it", () => {
 
 test("the place in the line, with what was answered", () => {
   const waits = (line: Partial<QueuePosition>, state: Authority["state"] = "queued"): string =>
-    lineText({ type: "authority", state, holder: "follow.py", priority: 16, mine: false, why: null, line: { position: 2, wait_s: null, asked: false, declined: null, ...line } });
+    lineText({ type: "authority", state, holder: "follow.py", priority: 16, mine: false, why: null, given: false, app: "cockpit 1", line: { position: 2, wait_s: null, asked: false, declined: null, ...line } });
   assert.equal(waits({}), "You are number 2 in line");
   assert.equal(waits({ position: null }, "preempted"), "You wait in line");
   assert.equal(waits({ asked: true }), "follow.py was asked · you are number 2 in line");

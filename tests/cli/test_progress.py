@@ -18,6 +18,7 @@ from rich.table import Table
 from skyloop.bench.tables import Table as Words
 from skyloop.cli import bench, completion, doctor, flight_progress
 from skyloop.cli.findings import Health
+from skyloop.cli.install import EXTRAS
 from skyloop.cli.text import named
 from skyloop.drivers.video.devices import CameraDevice, cameras, described
 from tests.cli.conftest import FAST_SIM, Run
@@ -101,7 +102,7 @@ def test_video_without_a_camera_says_which_there_are(run: Run, monkeypatch: pyte
 
 def test_the_doctor_knows_every_optional_part() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert {extra for extra, _, _ in doctor.EXTRAS} == extras.keys() - {"all"}
+    assert {extra for extra, _, _ in EXTRAS} == extras.keys() - {"all"}
 
 
 def test_the_doctor_s_findings_for_programs(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,9 @@ CHROMIUM = next(
 PATIENCE_S = 30.0
 IN_FIREFOX = pytest.mark.parametrize("open_cockpit", ["firefox"], indirect=True, scope="module")
 IN_BOTH = pytest.mark.parametrize("open_cockpit", ["chromium", "firefox"], indirect=True, scope="module")
+#: Firefox runs it in the empty page before this one, too, which has no storage.
+PANELS = """
+try { localStorage.getItem("skyloop-panels") ?? localStorage.setItem("skyloop-panels", "true"); } catch {}"""
 WATCHED = "sim://?world=empty&cameras=front&width=320&fps=15"
 
 
@@ -60,8 +63,13 @@ class Deck:
         self.address = process.text.split("cockpit: ")[1].strip()
         return process
 
-    def page(self, *names: str, prepare: str = "", **options: Any) -> DronePage:
-        """The page with these drones opened, once it shows the last of them. ``prepare``: a script that runs first."""
+    def page(self, *names: str, prepare: str = "", panels: bool = True, **options: Any) -> DronePage:
+        """The page with these drones opened, once it shows the last of them. ``prepare``: a script that runs first.
+
+        With the panels beside the picture, as for a person who chose them, unless ``panels`` is false.
+        """
+        if panels:
+            prepare += PANELS
         page = self._new_page(prepare, options)
         shown = DronePage(page, names[-1])
         page.goto(f"{self.address}#{','.join(names)}")

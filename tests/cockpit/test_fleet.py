@@ -226,6 +226,29 @@ def test_drones_come_and_go_in_the_overview(nodes: Nodes) -> None:
         gamma.stop()
 
 
+def test_a_drone_that_moves_to_another_host_under_its_name_is_joined_there() -> None:
+    before, after = Node("alpha"), Node("alpha")
+    here = {"local": before}
+
+    class Moving(Nodes):
+        def __call__(self) -> list[Found]:
+            return [Found("alpha", where, node.dial) for where, node in here.items() if node.up]
+
+    try:
+        with cockpit(Fleet(Moving(), look_s=0.02)) as client, open_socket(client, "drones/alpha/telemetry") as page:
+            until(lambda: rows(client)[0]["links"]["application"] == "up")
+            before.stop()
+            here.clear()
+            here["network"] = after
+            until(lambda: rows(client)[0]["links"]["application"] == "up", "its connection leads to where it is now")
+            assert [(row["name"], row["transport"]) for row in rows(client)] == [("alpha", "network")]
+            while (state := page.receive_json())["type"] != "state" or state["links"]["application"] != "up":
+                pass  # the page that shows it goes on
+    finally:
+        before.stop()
+        after.stop()
+
+
 def test_the_overview_tells_who_holds_control(nodes: Nodes) -> None:
     with cockpit(Fleet(nodes, look_s=0.02)) as client, open_socket(client, "drones/alpha/control") as control:
         control.send_json({"do": "take", "priority": 3, "at_s": time.monotonic()})

@@ -116,7 +116,9 @@ def test_a_page_whose_cockpit_is_stopped_is_grey_and_tells_the_age_in_seconds(de
             style = page.pane.locator(part).first.evaluate("part => getComputedStyle(part).filter")
             assert "grayscale(1)" in style, part
         page.page.locator('.fleet[data-old="true"]').wait_for()
-        page.until(lambda: "No answer from the cockpit" in page.page.locator(".banner.lost").inner_text(), "on top too")
+        assert "the cockpit does not answer" in page.says(".banner.old")
+        assert page.page.locator(".banner:visible").count() == 1, "one cause is told once, and hides nothing"
+        assert page.pane.locator("h2").is_visible()
         with observe("grey") as drone:
             page.until(lambda: drone.feedback().owner_id == 0 or not drone.feedback().lease, "control ran out")
     page.until(lambda: page.pane.get_attribute("data-old") == "false", "it is heard again")

@@ -122,7 +122,7 @@ def test_a_zone_is_drawn_refused_and_seen_by_another_page(deck: Deck) -> None:
         page.page.mouse.up()
         page.wait_for_text(".zones .answer", "written")
         drawn = str(drone.config["safety.zones"])
-        assert drawn.startswith("box ")
+        assert drawn.startswith("Z1: box "), "it has the name that the map and refusals call it by"
         other.wait_for_text(".zones select", "Z1, box")
         assert other.pane.get_by_role("button", name="Delete").is_disabled(), "the other page has no control"
         # What makes no sense is refused, and the zone stays.
@@ -136,10 +136,10 @@ def test_a_zone_is_drawn_refused_and_seen_by_another_page(deck: Deck) -> None:
         page.until(lambda: bottom.input_value() == "0", "the field shows what is in force")
         # A place in it is refused before anything flies; then by keys alone: the cursor, and Del.
         page.pane.get_by_role("button", name="Zones").click()
-        west, south, _, east, north, _ = map(float, drawn.split()[1:])
+        west, south, _, east, north, _ = map(float, drawn.split()[2:])
         for axis, value in (("x", (west + east) / 2), ("y", (south + north) / 2), ("z", 1.0)):
             write(page, f"Waypoint {axis} in metres", f"{value:.2f}")
-        page.wait_for_text(".preview", "in a no-fly zone")
+        page.wait_for_text(".preview", "in a no-fly zone, Z1: box")
         page.pane.get_by_role("button", name="Zones").click()
         canvas.focus()
         page.press("ArrowRight", "Delete")

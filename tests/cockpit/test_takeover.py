@@ -67,6 +67,9 @@ def test_a_page_that_flies_is_asked_and_hands_over(client: TestClient, node: Nod
             pilot.say("answer", id=drone.app_id, grant=True)
             told = pilot.wait("authority", state="preempted")
             assert (told["holder"], told["mine"]) == ("survey.py", False)
+            assert told["given"], "it was not lost"
+            assert told["app"].startswith("cockpit "), "pages have names"
+            assert not [one for one in pilot.told if one["type"] == "refused"]
             assert {"type": "asked", "questions": []} in pilot.told
             until(lambda: drone.authority.state == "held")
             until(lambda: node.flyer.state is FlightState.HOVERING, "it hovers before it changes hands")

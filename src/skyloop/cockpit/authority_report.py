@@ -32,11 +32,16 @@ class AuthorityReport:
         #: As the page was sent it last: state, holder, its priority, position in the queue, how control was lost.
         self._sent: tuple[str, str | None, int | None, QueuePosition | None, str | None] | None = None
         self._was_mine = False
+        self._given = False  # to who asked for it
         self._loss: str | None = None  # how the control that this page had was lost; None: it was not
 
     def released(self) -> None:
         """Count the control as given back on purpose: it was not lost."""
         self._was_mine, self._loss = False, None
+
+    def handed_over(self) -> None:
+        """Count the control that goes now as given to who asked for it: it is not lost."""
+        self._given = True
 
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
         """Return the message for the page; None if nothing has changed.
@@ -62,6 +67,7 @@ class AuthorityReport:
             holder, priority = self._app, pilot.authority.priority
         if mine or (self._was_mine and pilot is not None):
             self._loss = None if mine or pilot is None else _end_of_control(pilot)
+        self._given = self._given and (self._was_mine or not mine)
         self._was_mine = mine
         why = None if self._loss is None else self._why(self._loss, holder, lost)
         if (state, holder, priority, place, why) == self._sent:
@@ -75,6 +81,8 @@ class AuthorityReport:
             "priority": priority,
             "mine": mine,
             "why": why,
+            "given": self._given and not mine,
+            "app": self._app,
             "line": line,
         }
 

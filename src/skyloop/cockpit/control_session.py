@@ -377,6 +377,8 @@ class ControlSession:
     async def _answer(self, command: Answer) -> None:
         self._acknowledge(command)
         await self._takeover.answer(command, self._held())
+        if command.grant:
+            self._authority.handed_over()
         self._done(command.do)
 
     async def _release(self, command: Release) -> None:

@@ -74,6 +74,7 @@ class Fleet:
         self._clock = clock
         self._look_s = look_s
         self._seen_ns: dict[str, int] = {}
+        self._found: dict[str, Found] = {}  # as each was found last
         self._connecting: dict[str, asyncio.Task[None]] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._watching: asyncio.Task[None] | None = None
@@ -115,6 +116,10 @@ class Fleet:
         now_ns = self._clock()
         for name, one in found.items():
             self._seen_ns[name] = now_ns
+            self._found[name] = one
+            if name in self.stations:
+                station = self.stations[name]
+                station.found = station.found._replace(transport=one.transport)
             if name not in self.stations and name not in self._connecting:
                 self._connecting[name] = asyncio.create_task(self._join(one))
         for name in [name for name in self.problems if name not in found]:
@@ -149,6 +154,8 @@ class Fleet:
                 _log.warning("can't look for drones: %s", error)
 
     async def _join(self, found: Found) -> None:
+        # A drone may move to another host under its name: connections that are made again lead to where it is then.
+        found = found._replace(dial=lambda handler: self._found[found.name].dial(handler))
         try:
             drone = await asyncio.to_thread(self._connect, found)
         except SkyloopError as error:

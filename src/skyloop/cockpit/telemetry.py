@@ -214,6 +214,13 @@ class TelemetryView:
                 known = stats.get(name)
                 if youngest_s is not None and (known is None or known.age_s is None or youngest_s < known.age_s):
                     stats = {**stats, name: feed.stats()}
+            shown = {feed.camera for feed in self._station.feeds if feed.wanted}
+            # Of video that no page shows there is nothing to tell: what did not come was not asked for.
+            stats = {
+                name: one
+                for name, one in stats.items()
+                if not name.startswith("video/") or name.removeprefix("video/") in shown
+            }
             self._channels = {name: channel_values(one) for name, one in stats.items()}
         except LinkError:
             pass  # closed meanwhile

@@ -1,0 +1,165 @@
+"""What stops and lands drones is on the screen: in each width and zoom, with long words, long names and with alarms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+import skyloop
+from tests.cockpit.browser import Deck, DronePage
+
+pytestmark = pytest.mark.process
+
+FINGER_PX = 44.0
+WIDTHS = (320, 390, 641, 768, 850, 947, 1024, 1440)
+#: A window of 1440 × 900 pixels and a tablet's of 1024 × 768, enlarged to 200, 300 and 400 %: what is left of them.
+ENLARGED = ((720, 450), (480, 300), (360, 225), (512, 384), (256, 192))
+LONG_NAME = "a-drone-with-a-name-as-long-as-names-can-be-1234"
+PSEUDO = "localStorage.setItem('skyloop-language', 'pseudo');"
+#: What is wrong with the controls that stop and land: outside of the window, covered, or smaller than ``least`` pixels.
+WRONG = """([drone, least]) => {
+  const pane = document.querySelector(`.pane[data-drone="${CSS.escape(drone)}"]`);
+  const [own, ...all] = document.querySelectorAll(".safety button");
+  const [land, stop] = [pane?.querySelector(".strip .land"), pane?.querySelector(".strip .stop")];
+  const wanted = [...all, ...(pane ? [land, stop?.checkVisibility() ? stop : own] : [])];
+  if (own.checkVisibility() && !wanted.includes(own)) wanted.push(own);
+  return wanted.flatMap((one) => {
+    const seen = one?.checkVisibility({visibilityProperty: true, opacityProperty: true});
+    if (!seen) return [`${one?.textContent}: not shown`];
+    const box = one.getBoundingClientRect();
+    const found = [];
+    const [right, bottom] = [innerWidth + 0.5, innerHeight + 0.5];
+    if (box.left < -0.5 || box.top < -0.5 || box.right > right || box.bottom > bottom) found.push("outside");
+    if (box.width < least - 0.5 || box.height < least - 0.5) found.push("small");
+    for (const [x, y] of [[0.5, 0.5], [0.12, 0.2], [0.88, 0.2], [0.12, 0.8], [0.88, 0.8]]) {
+      const top = document.elementFromPoint(box.left + x * box.width, box.top + y * box.height);
+      if (!one.contains(top)) found.push(`covered by ${top?.tagName}.${top?.className}`);
+    }
+    const place = [box.left, box.top, box.width, box.height].map(Math.round).join(" ");
+    return found.length ? [`${one.textContent} at ${place}: ${[...new Set(found)].join(", ")}`] : [];
+  });
+}"""
+TO = """([name, block]) =>
+  document.querySelector(`.pane[data-drone="${CSS.escape(name)}"]`).scrollIntoView({block})"""
+WIDER = "document.documentElement.scrollWidth - innerWidth"
+
+
+def wrong(page: DronePage, drone: str, least: float = 24.0) -> Any:
+    return page.page.evaluate(WRONG, [drone, least])
+
+
+def resize(page: DronePage, width: int, height: int) -> None:
+    page.page.set_viewport_size({"width": width, "height": height})
+    page.page.evaluate("() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+
+
+def sweep(page: DronePage, drones: tuple[str, ...], least: float = 24.0) -> str:
+    """What is wrong at each size, scrolled to the top, to the middle and to the end of what is opened."""
+    found = []
+    for width, height in [*((width, 860) for width in WIDTHS), *ENLARGED]:
+        resize(page, width, height)
+        for drone in drones or ("",):
+            for block in ("start", "end") if drone else ("",):
+                if drone:
+                    page.page.evaluate(TO, [drone, block])
+                    page.page.wait_for_timeout(16)
+                said = wrong(page, drone, least)
+                found += [f"{width}×{height} {drone} {block}: {one}" for one in said]
+        if page.page.evaluate(WIDER) > 0:
+            found.append(f"{width}×{height}: {page.page.evaluate(WIDER)} px beside the window")
+    return "\n".join(found)
+
+
+@pytest.mark.parametrize("panels", [False, True], ids=["picture", "panels"])
+def test_one_drone(deck: Deck, panels: bool) -> None:
+    deck.proxy("one")
+    page = deck.page("one", panels=panels)
+    page.take_control()
+    assert sweep(page, ("one",)) == ""
+
+
+def test_a_finger_a_long_name_and_alarms(deck: Deck) -> None:
+    deck.proxy(LONG_NAME)
+    page = deck.page(LONG_NAME, prepare=PSEUDO, panels=False, has_touch=True, viewport={"width": 1280, "height": 860})
+    with skyloop.connect(LONG_NAME, name="an-application-with-a-long-name-too") as drone:
+        drone.config["battery.warn"] = 1.0
+        page.until(lambda: page.pane.locator(".alarm").count() > 0, "an alarm")
+        assert sweep(page, (LONG_NAME,), FINGER_PX) == ""
+
+
+def test_two_drones_and_all_of_them(deck: Deck) -> None:
+    for name in ("left", "right"):
+        deck.proxy(name)
+    page = deck.page("left", "right")
+    assert sweep(page, ("left", "right")) == ""
+    assert sweep(deck.overview(has_touch=True), (), FINGER_PX) == ""
+
+
+def share(page: DronePage, selector: str) -> float:
+    """How much of the window a part of the pane has."""
+    found, size = page.pane.locator(selector).first.bounding_box(), page.page.viewport_size
+    assert found is not None
+    assert size is not None
+    return float(found["width"] * found["height"] / (size["width"] * size["height"]))
+
+
+def test_the_picture_is_first_and_the_panels_are_a_press_away(deck: Deck) -> None:
+    deck.proxy("first")
+    page = deck.page("first", panels=False, viewport={"width": 1440, "height": 900})
+    assert share(page, ".pictures") > 0.6
+    assert 0.01 < share(page, ".map-box") < 0.1, "the map is an inset"
+    assert not page.pane.locator(".deck.lists").is_visible()
+    page.pane.get_by_role("button", name="Enlarge the map").click()
+    assert share(page, ".map-box") > 0.5
+    page.pane.get_by_role("button", name="Enlarge the picture").click()
+    assert share(page, ".pictures") > 0.6
+    page.pane.get_by_role("button", name="Panels").click()
+    page.pane.locator(".deck.lists").wait_for()
+    page.page.reload()
+    page.pane.locator(".deck.lists").wait_for()
+    assert share(page, ".pictures") < 0.5, "it is remembered"
+    assert page.problems == []
+
+
+#: Fields and buttons of the route's table that are cut, or lie beside their place.
+CUT = """() => {
+  const place = document.querySelector(".route-body").getBoundingClientRect();
+  return [...document.querySelectorAll(".route-table :is(input, button)")].filter((one) => {
+    const box = one.getBoundingClientRect();
+    const cut = one.scrollWidth > one.clientWidth + 2;
+    return cut || box.width < 12 || box.left < place.left || box.right > Math.min(place.right, innerWidth);
+  }).map((one) => one.getAttribute("aria-label"));
+}"""
+
+
+def test_a_route_fits_from_320_pixels_on(deck: Deck) -> None:
+    deck.proxy("route")
+    page = deck.page("route")
+    page.pane.get_by_role("button", name="Route", exact=True).click()
+    page.pane.locator(".map").focus()
+    page.press("ArrowRight", "Enter", "ArrowUp", "ArrowUp", "ArrowUp", "Enter")
+    page.until(lambda: page.pane.locator(".route-table input[data-field=x]").count() == 2, "two waypoints")
+    for width in (320, 640, 768, 1024, 1280, 1440):
+        resize(page, width, 900)
+        assert page.page.evaluate(CUT) == [], width
+
+
+#: What of a pane lies below its line of alarms, and is no part of it.
+COVERED = """() => [...document.querySelectorAll(".pane :is(button, h2, .pill, .chip)")].filter((one) => {
+  const box = one.getBoundingClientRect();
+  if (!one.checkVisibility({visibilityProperty: true}) || box.top < 0 || box.bottom > innerHeight) return false;
+  const line = document.elementFromPoint(box.left + box.width / 2, box.top + box.height / 2)?.closest(".said");
+  return line && !line.contains(one);
+}).map((one) => one.textContent)"""
+
+
+def test_an_alarm_covers_nothing(deck: Deck) -> None:
+    deck.proxy("warned")
+    page = deck.page("warned", panels=False)
+    with skyloop.connect("warned", name="test") as drone:
+        before = page.pane.locator(".stage").bounding_box()
+        drone.config["battery.warn"] = 1.0
+        page.wait_for_text(".alarms", "battery low")
+        assert page.page.evaluate(COVERED) == []
+        assert page.pane.locator(".stage").bounding_box() == before, "and moves nothing"
