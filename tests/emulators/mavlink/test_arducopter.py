@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
 from skyloop.emulators.mavlink import Kind
 from skyloop.emulators.mavlink.places import geodetic
+from skyloop.emulators.mavlink.telemetry import MAKERS
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
 from skyloop.wire.mavlink.axes import to_wire
 from skyloop.wire.mavlink.codec import Codec, Message
@@ -34,6 +36,17 @@ def test_a_fresh_link_gets_a_heartbeat_a_second_and_what_is_asked_for() -> None:
     it.go_on(2.0)
     assert 90 <= len(it.of("ATTITUDE")) <= 102
     assert 9 <= len(it.of("HEARTBEAT")) <= 11
+
+
+def test_a_crash_is_told_as_far_as_the_message_has_room() -> None:
+    """The autopilot fell silent for a moment when it hit the ground at more than 32 g."""
+    it = rig()
+    it.go_on(0.1)
+    believed = replace(it.autopilot.report.believed, acceleration_m_s2=(-20.0, 0.0, 900.0))
+    it.autopilot.report = replace(it.autopilot.report, believed=believed)
+    made = MAKERS[m.MAVLINK_MSG_ID_RAW_IMU](it.autopilot)
+    (heard,) = Codec(1, 1).decode(Codec(2, 1).encode(made), whole=True)
+    assert (heard.xacc, heard.zacc) == (-2039, -32768)
 
 
 def test_accepted_is_not_flowing_before_it_knows_where_it_is() -> None:
