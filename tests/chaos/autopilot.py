@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import sys
 from collections import deque
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +29,7 @@ LAND: Final = 9
 RATE_HZ: Final = 50.0
 CHARGE: Final = 0.9
 BATTERY_S: Final = 0.5
+BATTERIES: Final = ((12.2, 80), (9.9, 5))  #: volts and percent
 _MODES: Final = {LAND: "land", 4: "guided"}
 
 
@@ -34,6 +37,7 @@ class JournalledAutopilot:
     """The autopilot, and the other ground station that commands it."""
 
     def __init__(self, name: str, folder: Path, proxy: int | Path) -> None:
+        self._second_battery = False
         self._journal = Journal(folder / f"{name}.vehicle")
         options = SimOptions(world="empty", seed=4, wind=0.0)
         self._world = SimHost(with_multirotors(options, rate_hz=RATE_HZ))
@@ -42,6 +46,8 @@ class JournalledAutopilot:
         self._radio = Radio(ports.udp, ports.remote, proxy, self._journal.write)
         self._firmware.start()
         self._autopilot = self._firmware.autopilot
+        for port in self._autopilot.ports:
+            port.send = partial(self._on_send, port.send)  # type: ignore[method-assign]
         self._hear, self._tick = self._autopilot.on_message, self._autopilot.tick
         self._autopilot.on_message = self._on_message  # type: ignore[method-assign]
         self._autopilot.tick = self._on_tick  # type: ignore[method-assign]
@@ -51,7 +57,6 @@ class JournalledAutopilot:
         self._lands_at_m = math.inf
         self._tips_after_s: float | None = None
         self._tips_s = math.inf
-        self._second_battery = False
         self._battery_s = 0.0
 
     def order(self, line: str) -> None:
@@ -84,6 +89,11 @@ class JournalledAutopilot:
             what = _MODES.get(round(message.param2))
             if what is not None and not autopilot.flight.standing:
                 self._journal.write(what)
+
+    def _on_send(self, send: Callable[[Message], None], message: Message) -> None:
+        if self._second_battery and message.get_type() == "SYS_STATUS":
+            message.battery_remaining = -1  # which of the two is for the receiver to find out
+        send(message)
 
     def _journal_set_point(self, message: Message) -> None:
         number = round(-message.yaw_rate / NUMBER_RAD_S)
@@ -141,9 +151,11 @@ class JournalledAutopilot:
             self._station(m.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, FORCE)
         if self._second_battery and autopilot.time_s - self._battery_s > BATTERY_S:
             self._battery_s = autopilot.time_s
-            cells = [9900] + [0xFFFF] * 9
-            for port in autopilot.ports:
-                port.send(m.MAVLink_battery_status_message(1, 0, 1, 32767, cells, 500, -1, -1, 5))
+            for number, (volts, percent) in enumerate(BATTERIES):
+                cells = [round(volts * 1000), *[0xFFFF] * 9]
+                status = m.MAVLink_battery_status_message(number, 0, 1, 32767, cells, 500, -1, -1, percent)
+                for port in autopilot.ports:
+                    port.send(status)
 
     def _station_lands(self) -> None:
         self._journal.write("other:land")

@@ -20,6 +20,7 @@ from tests.chaos.processes import Process, Resources
 
 RECOVERS_WITHIN_S: Final = 20.0
 TIME_NAMESPACE_S: Final = 5000
+TAIL_BYTES: Final = 30_000  #: of a journal: the last 15 s and more
 
 
 class Lane:
@@ -269,7 +270,7 @@ def tail(path: Path) -> list[Entry]:
     """The last entries of a journal that is being written."""
     with path.open("rb") as file:
         file.seek(0, os.SEEK_END)
-        file.seek(max(0, file.tell() - 2000))
+        file.seek(max(0, file.tell() - TAIL_BYTES))
         lines = file.read().decode().splitlines()[1:]
     whole = [line.split() for line in lines if len(line.split()) == 3]
     return [Entry(int(at_ns), what, int(number)) for at_ns, what, number in whole]

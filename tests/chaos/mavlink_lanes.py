@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from tests.chaos.journal import read
-from tests.chaos.lanes import Fault, Lane, fork, pilot_stop, proxy_kill
+from tests.chaos.lanes import Fault, Lane, fork, pilot_stop, proxy_kill, tail
 from tests.chaos.processes import Process
 
 PAGE: Final = Path(__file__).resolve().parents[2] / "cockpit-page"
@@ -45,7 +44,7 @@ class MavlinkLane(Lane):
     def until(self, what: str, since_ns: int, ending: threading.Event) -> bool:
         """Wait until the vehicle journals this; whether it did, before the end of all faults."""
         deadline = time.monotonic() + COMES_WITHIN_S
-        while not any(entry.what == what and entry.at_ns > since_ns for entry in read(self._vehicle_path)):
+        while not any(entry.what == what and entry.at_ns > since_ns for entry in tail(self._vehicle_path)):
             if ending.wait(0.1):
                 return False
             if time.monotonic() > deadline:
@@ -55,8 +54,7 @@ class MavlinkLane(Lane):
     @property
     def state(self) -> str:
         """The vehicle's, as it journalled it last."""
-        states = [entry.what for entry in read(self._vehicle_path) if entry.what.startswith("state:")]
-        return states[-1].removeprefix("state:")
+        return self._vehicle_path.read_text().rpartition(" state:")[2].split()[0]
 
     def _start_proxy(self) -> Process:
         place = f"udpin:127.0.0.1:{self.place}" if self.place.isdecimal() else f"serial:{self.place}:921600"
@@ -166,7 +164,7 @@ def tip_over(lane: Lane, source: random.Random, ending: threading.Event) -> None
     begin_ns = monotonic_ns()
     lane.vehicle.order("land")
     if lane.until("state:landed", begin_ns, ending):
-        lane.vehicle.order(f"tip {source.uniform(0.0, 0.8):.3f}")
+        lane.vehicle.order(f"tip {source.choice((0.0, 0.05, 0.3, 0.8))}")
         lane.until("other:tip", begin_ns, ending)
         ending.wait(1.0)
 

@@ -126,7 +126,7 @@ def test_faults_are_read_from_their_beginnings_and_ends() -> None:
     assert faults_of(lines) == [fault("hog", 1, 2)]
 
 
-# Flights that nobody asked for -----------------------------------------------------------------------------------------
+# Flights that nobody asked for -----------------------------------------
 
 
 class TakeOff:
@@ -215,7 +215,7 @@ def test_a_landing_that_neither_pilot_nor_failsafe_wanted_is_needless() -> None:
     assert not flight.judge(fault("pilot_stop", 5.0, 12.95)).needless
 
 
-# What lies between a vehicle and its proxy ------------------------------------------------------------------------------
+# What lies between a vehicle and its proxy -----------------------------------------
 
 
 def test_a_stop_is_known_among_frames_that_a_stream_cuts_anywhere() -> None:
