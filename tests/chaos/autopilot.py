@@ -96,10 +96,11 @@ class JournalledAutopilot:
         send(message)
 
     def _journal_set_point(self, message: Message) -> None:
+        left_ns = self._radio.left_ns.get(message.get_seq())
         number = round(-message.yaw_rate / NUMBER_RAD_S)
         fastest = max(abs(message.vx), abs(message.vy), abs(message.vz))
         if number:
-            self._journal.write("velocity", number)
+            self._journal.write("velocity", number, left_ns)
         if fastest > 1e-3:
             self._journal.write("moved", round(fastest * 1000))
 

@@ -28,12 +28,13 @@ def main() -> None:
         opening(driver, sink)
 
     def failsafe(driver: MavlinkDriver, action: Hover | Land) -> bool:
+        done = acting(driver, action)
         if driver.uri.text == address:
-            journal.write(f"failsafe:{action.name}")
-        return acting(driver, action)
+            journal.write(f"failsafe:{action.name}")  # from here on nothing older leaves
+        return done
 
-    MavlinkDriver._open = open_it  # type: ignore[method-assign]
-    MavlinkDriver.failsafe = failsafe  # type: ignore[method-assign]
+    setattr(MavlinkDriver, "_open", open_it)  # noqa: B010  (which mypy would not let be assigned)
+    setattr(MavlinkDriver, "failsafe", failsafe)  # noqa: B010
     serve(Fleet(name, (VehicleSettings(name, address),), Defaults()))
 
 

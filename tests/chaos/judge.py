@@ -164,7 +164,7 @@ def _judge_needless(
 ) -> None:
     landings = [entry.at_ns for entry in vehicle if entry.what == "failsafe:land"]
     for entry in vehicle:
-        if entry.what == "land" and not any(0 <= entry.at_ns - at_ns <= _ns(LANDS_S) for at_ns in landings):
+        if entry.what == "land" and not any(-_ns(LATE_S) <= entry.at_ns - at_ns <= _ns(LANDS_S) for at_ns in landings):
             verdict.needless.append(f"landed at {entry.at_ns / 1e9:.3f} s, which no pilot and no failsafe wanted")
         if not entry.what.startswith("failsafe:"):
             continue

@@ -14,6 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from skyloop.clock import monotonic_ns
+
 ATTITUDE: Final = 30
 COMMAND_LONG: Final = 76
 DISARM: Final = 400
@@ -22,6 +24,8 @@ _V2: Final = 0xFD
 _HEADER: Final = 10
 _TURN_S: Final = 0.02
 _MOST: Final = 65_536
+_STAMP: Final = struct.Struct("qq")  #: of a datagram, by the kernel
+_STAMPED: Final = getattr(socket, "SO_TIMESTAMPNS", 35)
 
 
 def kind_of(frame: bytes) -> int:
@@ -78,6 +82,9 @@ class Radio:
                 os.set_blocking(end, False)
             proxy.symlink_to(os.ttyname(self._device))
         self._received = bytearray()
+        self._left_ns = 0
+        #: When frames left the proxy, by their numbers in sequence: not later, though this process is stalled.
+        self.left_ns: dict[int, int] = {}
         self._late: list[tuple[float, bytes]] = []
         self._delay_s = 0.0
         self.lost_stops = 0  #: so many stops are lost from now on
@@ -111,9 +118,13 @@ class Radio:
                     self._send(frame)
 
     def _came(self) -> list[bytes]:
+        self._left_ns = monotonic_ns()
         if self._far is not None:
             with suppress(OSError):  # the proxy may be away
-                return [self._far.recv(_MOST)]
+                frame, more, _, _ = self._far.recvmsg(_MOST, socket.CMSG_SPACE(_STAMP.size))
+                for _, _, stamp in more:
+                    self._left_ns = _monotonic(*_STAMP.unpack(stamp))
+                return [frame]
             return []
         with suppress(BlockingIOError):
             self._received += os.read(self._serial, _MOST)
@@ -124,6 +135,8 @@ class Radio:
             self.lost_stops -= 1
             self._note("stop_lost")
             return
+        if kind_of(frame) >= 0:
+            self.left_ns[frame[4]] = self._left_ns
         self._near.sendto(frame, self._autopilot)
 
     def _down(self, frame: bytes) -> None:
@@ -149,7 +162,18 @@ class Radio:
                     os.write(self._device, bytes(size))
 
 
+def _monotonic(seconds: int, nanoseconds: int) -> int:
+    """A time of the wall clock as one of the monotonic clock, which it is never before."""
+    best, found_ns = 1 << 62, 0
+    for _ in range(5):  # this process may be put off between two clocks
+        before_ns, wall_ns, after_ns = monotonic_ns(), time.time_ns(), monotonic_ns()
+        if after_ns - before_ns < best:
+            best, found_ns = after_ns - before_ns, after_ns - (wall_ns - seconds * 10**9 - nanoseconds)
+    return found_ns
+
+
 def _socket(port: int) -> socket.socket:
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.setsockopt(socket.SOL_SOCKET, _STAMPED, 1)
     made.bind(("127.0.0.1", port))
     return made

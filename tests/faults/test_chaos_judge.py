@@ -207,9 +207,9 @@ def test_an_emergency_stop_is_executed_within_its_time(at_s: float | None, misse
 
 
 def test_a_landing_that_neither_pilot_nor_failsafe_wanted_is_needless() -> None:
-    flight = TakeOff()
-    flight.vehicle += [entry(3.0, "land")]
-    assert len(judge(flight.pilot, flight.vehicle, []).needless) == 1
+    taken_off = TakeOff()
+    taken_off.vehicle += [entry(3.0, "land")]
+    assert len(judge(taken_off.pilot, taken_off.vehicle, []).needless) == 1
     flight = Flight(away=(5.0, 13.0))
     flight.vehicle += [entry(5.52, "failsafe:hover"), entry(10.0, "failsafe:land"), entry(10.0, "land")]
     assert not flight.judge(fault("pilot_stop", 5.0, 12.95)).needless
@@ -228,7 +228,8 @@ def test_a_stop_is_known_among_frames_that_a_stream_cuts_anywhere() -> None:
     stop, disarm = command(400, 0.0, 21196.0), command(400, 0.0)
     frames = [disarm, stop, command(176, 1.0, 4.0)]
     assert [is_stop(frame) for frame in frames] == [False, True, False]
-    stream, buffer, found = bytes(9) + b"".join(frames), bytearray(), []
+    stream, buffer = bytes(9) + b"".join(frames), bytearray()
+    found: list[bytes] = []
     for at in range(0, len(stream), 7):
         buffer += stream[at : at + 7]
         found += frames_of(buffer)

@@ -9,7 +9,6 @@ import pytest
 
 from skyloop.emulators.mavlink import Kind
 from skyloop.emulators.mavlink.places import geodetic
-from skyloop.emulators.mavlink.telemetry import MAKERS
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
 from skyloop.wire.mavlink.axes import to_wire
 from skyloop.wire.mavlink.codec import Codec, Message
@@ -44,8 +43,8 @@ def test_a_crash_is_told_as_far_as_the_message_has_room() -> None:
     it.go_on(0.1)
     believed = replace(it.autopilot.report.believed, acceleration_m_s2=(-20.0, 0.0, 900.0))
     it.autopilot.report = replace(it.autopilot.report, believed=believed)
-    made = MAKERS[m.MAVLINK_MSG_ID_RAW_IMU](it.autopilot)
-    (heard,) = Codec(1, 1).decode(Codec(2, 1).encode(made), whole=True)
+    assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_RAW_IMU) == 0
+    (heard,) = it.of("RAW_IMU")
     assert (heard.xacc, heard.zacc) == (-2039, -32768)
 
 
