@@ -252,7 +252,11 @@ def torment(
                 report(f"{lane.name}: {kind} could not be done: {error}")
                 lane.faults.write(f"broken:{kind}")
             lane.faults.write(f"end:{kind}")
-            lane.resume(ending)
+            try:
+                lane.resume(ending)
+            except RuntimeError as error:
+                lane.complaints.append(f"not flown again after {kind}: {error}")
+                report(f"{lane.name}: {error}")
             _await_flight(lane, ending)
             ending.wait(source.uniform(0.5, 2.0))
 

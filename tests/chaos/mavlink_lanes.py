@@ -24,6 +24,7 @@ PAGE: Final = Path(__file__).resolve().parents[2] / "cockpit-page"
 ESBUILD: Final = PAGE / "node_modules" / ".bin" / "esbuild"
 REST_S: Final = 4.0  #: so long nobody takes off after a landing, so that a flight meanwhile is nobody's
 COMES_WITHIN_S: Final = 40.0
+ATTEMPTS: Final = 6
 
 
 class MavlinkLane(Lane):
@@ -85,7 +86,7 @@ class PageLane(MavlinkLane):
         return {**super().processes(), **cockpit}
 
     def resume(self, ending: threading.Event) -> None:
-        """Centre the sticks, take off if it stands, and push them again."""
+        """Centre the sticks, take off if it stands, and push them again. What arrives too late is pressed again."""
         self.pilot.order("centre")
         ending.wait(0.5)
         since_ns = monotonic_ns()
@@ -93,10 +94,16 @@ class PageLane(MavlinkLane):
             return
         if self.state == "landed":
             ending.wait(REST_S)
-            since_ns = monotonic_ns()
-            self.pilot.order("takeoff")
-            if not self.until("state:flying", since_ns, ending):
-                return
+            for attempt in range(ATTEMPTS):
+                if attempt:
+                    self.pilot.order("reset")
+                    ending.wait(1.0)
+                self.pilot.order("takeoff")
+                ending.wait(2.0)
+                if ending.is_set() or self.state != "landed":
+                    break
+            else:
+                raise RuntimeError(f"it did not take off in {ATTEMPTS} attempts")
         self.pilot.order("push")
 
     def _start_pilot(self) -> Process:
