@@ -195,7 +195,9 @@ class ControlSession:
         try:
             if problem:
                 raise RefusedError(problem)
-            if not isinstance(command, Answer):
+            if not isinstance(
+                command, (Answer, Stop)
+            ):  # a stop has a connection of its own: no refusal here is its own
                 self._last_command = command.do
                 self._commands += 1
             if _decides(command):
