@@ -2,7 +2,7 @@
 
 ``make chaos`` runs it; ``python -m tests.chaos --help`` says how. Every *lane* is one vehicle, its proxy and its pilot,
 in processes of their own. Each of them writes what it did to a *journal* (:mod:`tests.chaos.journal`), and
-:mod:`tests.chaos.judge` finds out from the journals alone what was executed too late, what flew though nobody asked for
-it, which failsafe was needless, and which one never came. Beside the lanes with faults fly others without: what happens
-to them is the machine's doing.
+:mod:`tests.chaos.judge` derives from the journals alone which commands were executed too late, which flights were not
+requested, which failsafes were needless, and which never came. Control lanes fly without faults: their needless
+failsafes are caused by the machine.
 """

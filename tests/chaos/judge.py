@@ -22,19 +22,19 @@ STALL_S: Final = 1.0  #: how long the library repeats a set-point without a call
 SLACK_S: Final = 0.05
 #: A failsafe that is later than this was missed.
 LATE_S: Final = 1.0
-#: A take-off that was asked for is over by then, whatever became of it.
+#: Every take-off request is over by then.
 TAKEOFF_S: Final = 30.0
-#: An emergency stop is executed within this, though its first packets are lost.
+#: An emergency stop is executed within this, even if its first packets are lost.
 STOP_S: Final = 3.0
 #: A failsafe's landing reaches the vehicle within this, with a link that may be lost meanwhile.
 LANDS_S: Final = 30.0
-#: What was under way when a stop was pressed may still be executed.
+#: A set-point that was under way when a stop was pressed may still be executed.
 UNDER_WAY_S: Final = 0.3
 DISRUPTIONS: Final = frozenset({"pilot_stop", "pilot_kill", "proxy_stop", "proxy_kill", "full_serial_port"})
 _PILOT: Final = frozenset({"pilot_stop", "pilot_kill"})
 _AIRBORNE: Final = frozenset({"state:taking_off", "state:hovering", "state:flying"})
 _DOWN: Final = frozenset({"state:landed", "state:emergency"})
-#: What ends a take-off that a pilot asked for, and with it whatever may turn a propeller.
+#: Each of these ends a pilot's take-off: nothing may turn a propeller after it.
 _ENDS: Final = frozenset({"touched_down", "disarmed", "other:land", "other:tip", "failsafe:land", "land", "ask_stop"})
 
 
@@ -208,7 +208,7 @@ def _judge_missed(verdict: Verdict, vehicle: Sequence[Entry], disruptions: Seque
 
 
 def _judge_flights(verdict: Verdict, pilot: Sequence[Entry], vehicle: Sequence[Entry], faults: Sequence[Fault]) -> None:
-    """It leaves the ground, is armed or taken from others only by a take-off that was asked for and has not ended."""
+    """Leaving the ground, arming and taking the vehicle from others need a pilot's take-off that is still in force."""
     history = sorted([*_with_touch_downs(vehicle), *pilot], key=lambda entry: entry.at_ns)
     asked: Entry | None = None
     ended: Entry | None = None
@@ -236,7 +236,7 @@ def _judge_flights(verdict: Verdict, pilot: Sequence[Entry], vehicle: Sequence[E
 
 
 def _with_touch_downs(vehicle: Sequence[Entry]) -> list[Entry]:
-    """The vehicle's entries, and when it left the ground and was on it again."""
+    """The vehicle's entries, with entries for each lift-off and touch-down."""
     found, down = [], True
     for entry in vehicle:
         if entry.what.startswith("state:") and (entry.what in _DOWN) is not down:
@@ -247,7 +247,7 @@ def _with_touch_downs(vehicle: Sequence[Entry]) -> list[Entry]:
 
 
 def _led_to(entry: Entry, asked: Entry | None, ended: Entry | None, faults: Sequence[Fault]) -> str:
-    """What went before, for people."""
+    """The history of an event, as a sentence."""
 
     def ago(at_ns: int) -> str:
         return f"{(entry.at_ns - at_ns) / 1e9:.3f} s before"
@@ -263,7 +263,7 @@ def _led_to(entry: Entry, asked: Entry | None, ended: Entry | None, faults: Sequ
 
 
 def _judge_stops(verdict: Verdict, pilot: Sequence[Entry], vehicle: Sequence[Entry]) -> None:
-    """An emergency stop is executed, whatever is lost."""
+    """An emergency stop is executed even if packets are lost."""
     stood = [entry.at_ns for entry in vehicle if entry.what in ("disarmed", "state:emergency")]
     for entry in pilot:
         if entry.what == "ask_stop":

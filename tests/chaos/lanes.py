@@ -203,7 +203,7 @@ def disk_full(lane: Lane, source: random.Random, ending: threading.Event) -> Non
         (lane.disk / "ballast").unlink(missing_ok=True)
 
 
-#: The first four are what the judge knows as disruptions.
+#: The first four are disruptions, as the judge calls them.
 LOCAL: Final[tuple[Fault, ...]] = (
     pilot_stop,
     pilot_kill,

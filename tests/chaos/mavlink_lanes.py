@@ -1,6 +1,6 @@
-"""Lanes whose vehicle is an emulated ArduCopter, hosted by ``skyloop host``, and what can be done to them.
+"""Lanes whose vehicle is an emulated ArduCopter, hosted by ``skyloop host``, and the faults they can suffer.
 
-One is flown by a program and one by a person: the cockpit page's own logic, with a gamepad, over a serial port.
+A program flies one of them. A person flies the other: the cockpit page's own logic, with a gamepad, over a serial port.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tests.chaos.processes import Process
 
 PAGE: Final = Path(__file__).resolve().parents[2] / "cockpit-page"
 ESBUILD: Final = PAGE / "node_modules" / ".bin" / "esbuild"
-REST_S: Final = 4.0  #: so long nobody takes off after a landing, so that a flight meanwhile is nobody's
+REST_S: Final = 4.0  #: the pause between a landing and the next take-off: any flight in it is unasked for
 COMES_WITHIN_S: Final = 40.0
 ATTEMPTS: Final = 6
 
@@ -43,7 +43,7 @@ class MavlinkLane(Lane):
         return {**super().processes(), "vehicle": self.vehicle}
 
     def until(self, what: str, since_ns: int, ending: threading.Event) -> bool:
-        """Wait until the vehicle journals this; whether it did, before the end of all faults."""
+        """Wait until the vehicle journals this. False if all faults ended first."""
         deadline = time.monotonic() + COMES_WITHIN_S
         while not any(entry.what == what and entry.at_ns > since_ns for entry in tail(self._vehicle_path)):
             if ending.wait(0.1):
@@ -54,7 +54,7 @@ class MavlinkLane(Lane):
 
     @property
     def state(self) -> str:
-        """The vehicle's, as it journalled it last."""
+        """The last state in the vehicle's journal."""
         return self._vehicle_path.read_text().rpartition(" state:")[2].split()[0]
 
     def _start_proxy(self) -> Process:
@@ -75,7 +75,7 @@ class PageLane(MavlinkLane):
 
     @staticmethod
     def missing() -> str:
-        """What it takes that is not here."""
+        """The requirement that this machine lacks; empty if there is none."""
         if shutil.which("node") is None:
             return "node"
         return "" if ESBUILD.exists() else "npm ci in cockpit-page"
@@ -86,14 +86,15 @@ class PageLane(MavlinkLane):
         return {**super().processes(), **cockpit}
 
     def resume(self, ending: threading.Event) -> None:
-        """Centre the sticks, take off if it stands, and push them again. What arrives too late is pressed again."""
+        """Centre the sticks, take off if it stands, and push them again. A press that arrives too late is repeated."""
         self.pilot.order("centre")
         ending.wait(0.5)
         since_ns = monotonic_ns()
         if self.state in ("landing", "emergency") and not self.until("state:landed", since_ns, ending):
             return
         if self.state == "landed":
-            ending.wait(REST_S)
+            if (self.folder / f"{self.name}.pilot").exists():  # it flew before
+                ending.wait(REST_S)
             for attempt in range(ATTEMPTS):
                 if attempt:
                     self.pilot.order("reset")
@@ -120,7 +121,7 @@ class PageLane(MavlinkLane):
 
 
 def second_battery(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """The vehicle reports a second battery by turns with the first, and it is nearly empty."""
+    """The vehicle reports two batteries in turn, and the second is nearly empty."""
     assert isinstance(lane, MavlinkLane)
     lane.vehicle.order("battery 1")
     ending.wait(source.uniform(4.0, 8.0))
@@ -136,7 +137,7 @@ def late_packet(lane: Lane, source: random.Random, ending: threading.Event) -> N
 
 
 def port_change(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """The vehicle goes on from another UDP port."""
+    """The vehicle switches to another UDP port in flight."""
     assert isinstance(lane, MavlinkLane)
     for _ in range(source.choice((1, 2))):
         lane.vehicle.order("port")
@@ -155,7 +156,7 @@ def removal_while_starting(lane: Lane, source: random.Random, ending: threading.
 
 
 def landed_in_its_takeoff(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """Another station lands the vehicle during its take-off, which nobody waits for."""
+    """Another station lands the vehicle during a ``takeoff(wait=False)``."""
     assert isinstance(lane, MavlinkLane)
     begin_ns = monotonic_ns()
     lane.vehicle.order("land")
@@ -177,7 +178,7 @@ def tip_over(lane: Lane, source: random.Random, ending: threading.Event) -> None
 
 
 def full_serial_port(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """The serial port's output buffer is full for seconds, and nobody reads it."""
+    """The serial port's output buffer stays full for seconds."""
     _fill_up(lane, ending, source.choice((1.0, 2.0, 5.0)))
 
 
@@ -207,14 +208,14 @@ def lost_stop(lane: Lane, source: random.Random, ending: threading.Event) -> Non
 
 
 def gamepad_swap(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """The gamepad is unplugged, and another one plugged in whose sticks are deflected."""
+    """The gamepad is unplugged, and another one with deflected sticks is plugged in."""
     assert isinstance(lane, PageLane)
     lane.pilot.order("swap")
     ending.wait(source.uniform(1.0, 3.0))
     lane.pilot.order("back")
 
 
-#: What the other lanes do as well is done here where a host, or a vehicle that outlives it, may make a difference.
+#: Faults of the other lanes are repeated here where a host, or a vehicle that outlives it, may behave differently.
 MAVLINK: Final[tuple[Fault, ...]] = (
     second_battery,
     late_packet,

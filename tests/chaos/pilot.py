@@ -1,12 +1,13 @@
 """A pilot that calls 32 times a second, for ever: ``python -m tests.chaos.pilot NAME FOLDER``; ``--help`` tells more.
 
 It journals each take-off that it asks for, and the beginning and the end of each other call, with its number. On
-SIGUSR1 it forks, and the child ends like a program that has nothing more to do.
+SIGUSR1 it forks, and the child ends by ``sys.exit``.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -21,7 +22,7 @@ from tests.chaos.journal import Journal, read
 from tests.chaos.vehicle import NUMBER_RAD_S, NUMBERS
 
 PERIOD_S = 1.0 / 32.0
-#: A take-off that has not begun by then is asked for again.
+#: A take-off that has not begun within this is requested again.
 BEGINS_WITHIN_S = 8.0
 
 
@@ -32,7 +33,7 @@ class Pilot:
         drone: What it flies.
         journal: Of its calls.
         first: The number of its first call.
-        rest_s: What landed stands for so long before the pilot takes off again. Sticks are held meanwhile.
+        rest_s: How long to wait on the ground before the next take-off, with the sticks held [s].
     """
 
     def __init__(self, drone: Drone, journal: Journal, first: int, rest_s: float) -> None:
@@ -40,8 +41,8 @@ class Pilot:
         self._journal = journal
         self._numbers = count(first)
         self._rest_s = rest_s
-        self._landed_s: float | None = None  # since when it stands
-        self._asked_s: float | None = None  # when the take-off was asked for that is not over
+        self._landed_s: float | None = -math.inf  # when it landed
+        self._asked_s: float | None = None  # when the present take-off was requested
         self.forks = False
 
     def step(self, now_s: float) -> None:

@@ -1,4 +1,4 @@
-"""What lies between an emulated autopilot and its proxy: UDP or a serial line, that loses and delays frames."""
+"""The link between an emulated autopilot and its proxy: UDP or a serial line that loses and delays frames."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def is_stop(frame: bytes) -> bool:
 
 
 def frames_of(buffer: bytearray) -> Iterator[bytes]:
-    """Take whole MAVLink 2 frames from the beginning of a stream, and what is none out of their way."""
+    """Take whole MAVLink 2 frames from the beginning of a stream, and discard other bytes."""
     while (begin := buffer.find(_V2)) >= 0:
         del buffer[:begin]
         if len(buffer) < _HEADER:
@@ -57,13 +57,13 @@ def frames_of(buffer: bytearray) -> Iterator[bytes]:
 
 
 class Radio:
-    """Carries frames on a thread of its own.
+    """Carries frames, on its own thread.
 
     Args:
         autopilot: Port of the autopilot.
         ground: Port to which it sends.
         proxy: UDP port of the proxy, or a path at which a serial port for it appears.
-        note: Told what was done to frames.
+        note: Called with each thing done to a frame.
     """
 
     def __init__(self, autopilot: int, ground: int, proxy: int | Path, note: Callable[[str], None]) -> None:
@@ -83,17 +83,17 @@ class Radio:
             proxy.symlink_to(os.ttyname(self._device))
         self._received = bytearray()
         self._left_ns = 0
-        #: When frames left the proxy, by their numbers in sequence: not later, though this process is stalled.
+        #: When frames left the proxy, by sequence number; correct even if this process was stalled.
         self.left_ns: dict[int, int] = {}
         self._late: list[tuple[float, bytes]] = []
         self._delay_s = 0.0
-        self.lost_stops = 0  #: so many stops are lost from now on
+        self.lost_stops = 0  #: how many of the next stops are lost
         self.full = False  #: nobody reads the serial port, and nothing more fits in
         self.moving = False  #: to another port of UDP
         threading.Thread(target=self._run, name="radio", daemon=True).start()
 
     def delay(self, seconds: float) -> None:
-        """Deliver the next ATTITUDE so much later [s]."""
+        """Delay the next ATTITUDE by this many seconds."""
         self._delay_s = seconds
 
     def _run(self) -> None:
@@ -163,7 +163,7 @@ class Radio:
 
 
 def _monotonic(seconds: int, nanoseconds: int) -> int:
-    """A time of the wall clock as one of the monotonic clock, which it is never before."""
+    """Convert a time of the wall clock to the monotonic clock; any error makes it later."""
     best, found_ns = 1 << 62, 0
     for _ in range(5):  # this process may be put off between two clocks
         before_ns, wall_ns, after_ns = monotonic_ns(), time.time_ns(), monotonic_ns()
