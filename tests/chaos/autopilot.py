@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -61,7 +62,7 @@ class JournalledAutopilot:
 
     def order(self, line: str) -> None:
         """``land``, ``land_at METRES`` (at the next climb), ``tip SECONDS`` (after it is armed next), ``battery 1/0``,
-        ``late SECONDS``, ``port``, ``lose_stops NUMBER``, ``full 1/0``. Any thread.
+        ``late SECONDS``, ``port``, ``lose_stops NUMBER``, ``full SECONDS``. Any thread.
         """
         what, _, argument = line.strip().partition(" ")
         if what == "late":
@@ -71,7 +72,7 @@ class JournalledAutopilot:
         elif what == "lose_stops":
             self._radio.lost_stops = int(argument)
         elif what == "full":
-            self._radio.full = argument == "1"
+            self._radio.full_until_s = time.monotonic() + float(argument)
         else:
             self._orders.append([what, argument])
 

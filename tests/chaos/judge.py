@@ -113,6 +113,8 @@ class _Calls:
 
 def _judge_ages(verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], failsafes: Sequence[int]) -> None:
     """Nothing old is executed: no set-point that nobody asked for lately, none from before a failsafe."""
+    stalls = [(entry.at_ns - entry.number * 1_000_000, entry.at_ns) for entry in vehicle if entry.what == "stalled"]
+    stall_ends = [end for _, end in stalls]
     for entry in vehicle:
         if entry.what != "velocity":
             continue
@@ -123,12 +125,15 @@ def _judge_ages(verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], fails
             continue
         begin_ns, end_ns = times
         verdict.delay_s.append((entry.at_ns - begin_ns) / 1e9)
-        age_s = (entry.at_ns - end_ns) / 1e9
+        # While the vehicle's own process is put off, it does not read what has arrived.
+        meanwhile = stalls[bisect_left(stall_ends, end_ns) : bisect_right(stall_ends, entry.at_ns)]
+        at_ns = entry.at_ns - sum(end - max(begin, end_ns) for begin, end in meanwhile)
+        age_s = (at_ns - end_ns) / 1e9
         if age_s > STALL_S + MAX_AGE_S + SLACK_S:
             verdict.stale.append(f"number {entry.number} was executed {age_s:.3f} s after its call")
         # A command under way when the failsafe came may still be executed, if it is young enough.
         after = bisect_right(failsafes, end_ns + _ns(MAX_AGE_S + SLACK_S))
-        if after < len(failsafes) and failsafes[after] < entry.at_ns:
+        if after < len(failsafes) and failsafes[after] < at_ns:
             verdict.stale.append(f"number {entry.number} was executed after a failsafe that came after its call")
 
 

@@ -189,10 +189,8 @@ def busy_serial_port(lane: Lane, source: random.Random, ending: threading.Event)
 
 def _fill_up(lane: Lane, ending: threading.Event, seconds: float) -> None:
     assert isinstance(lane, MavlinkLane)
-    lane.vehicle.order("full 1")
-    ending.wait(seconds)
-    lane.vehicle.order("full 0")
-    ending.wait(2.0)
+    lane.vehicle.order(f"full {seconds:.3f}")
+    ending.wait(seconds + 2.0)
 
 
 def lost_stop(lane: Lane, source: random.Random, ending: threading.Event) -> None:

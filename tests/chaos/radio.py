@@ -22,7 +22,9 @@ DISARM: Final = 400
 FORCE: Final = 21196.0
 _V2: Final = 0xFD
 _HEADER: Final = 10
+STALLED_S: Final = 0.08  #: a turn that takes so long was not given the processor
 _TURN_S: Final = 0.02
+_FULL_TURN_S: Final = 0.002  #: a port that is opened again is full at once
 _MOST: Final = 65_536
 _STAMP: Final = struct.Struct("qq")  #: of a datagram, by the kernel
 _STAMPED: Final = getattr(socket, "SO_TIMESTAMPNS", 35)
@@ -66,7 +68,7 @@ class Radio:
         note: Called with each thing done to a frame.
     """
 
-    def __init__(self, autopilot: int, ground: int, proxy: int | Path, note: Callable[[str], None]) -> None:
+    def __init__(self, autopilot: int, ground: int, proxy: int | Path, note: Callable[[str, int], None]) -> None:
         self._autopilot = ("127.0.0.1", autopilot)
         self._near = _socket(ground)
         self._note = note
@@ -88,7 +90,7 @@ class Radio:
         self._late: list[tuple[float, bytes]] = []
         self._delay_s = 0.0
         self.lost_stops = 0  #: how many of the next stops are lost
-        self.full = False  #: nobody reads the serial port, and nothing more fits in
+        self.full_until_s = 0.0  #: until then nobody reads the serial port, and nothing more fits in
         self.moving = False  #: to another port of UDP
         threading.Thread(target=self._run, name="radio", daemon=True).start()
 
@@ -97,15 +99,21 @@ class Radio:
         self._delay_s = seconds
 
     def _run(self) -> None:
+        looked_s = time.monotonic()
         while True:
+            now_s = time.monotonic()
+            if self._far is None and now_s - looked_s > STALLED_S:  # of datagrams the kernel tells when they came
+                self._note("stalled", round((now_s - looked_s) * 1000))
+            looked_s = now_s
+            full = now_s < self.full_until_s
             if self.moving and self._far is not None:
                 self.moving = False
                 self._far.close()
                 self._far = _socket(0)
-            if self.full:
+            if full:
                 self._fill()
             ends = [self._near.fileno(), self._serial if self._far is None else self._far.fileno()]
-            ready, _, _ = select.select(ends[: 1 if self.full else 2], [], [], _TURN_S)
+            ready, _, _ = select.select(ends[: 1 if full else 2], [], [], _FULL_TURN_S if full else _TURN_S)
             if ends[0] in ready:
                 self._down(self._near.recv(_MOST))
             if ends[1] in ready:
@@ -133,7 +141,7 @@ class Radio:
     def _up(self, frame: bytes) -> None:
         if self.lost_stops and is_stop(frame):
             self.lost_stops -= 1
-            self._note("stop_lost")
+            self._note("stop_lost", 0)
             return
         if kind_of(frame) >= 0:
             self.left_ns[frame[4]] = self._left_ns
@@ -143,7 +151,7 @@ class Radio:
         if self._delay_s and kind_of(frame) == ATTITUDE:
             self._late.append((time.monotonic() + self._delay_s, frame))
             self._delay_s = 0.0
-            self._note("delayed")
+            self._note("delayed", 0)
         else:
             self._send(frame)
 

@@ -73,6 +73,15 @@ def test_a_set_point_from_before_a_failsafe_is_stale_however_young() -> None:
     assert "after a failsafe" in found
 
 
+def test_a_set_point_that_waited_for_a_stalled_vehicle_is_not_stale() -> None:
+    flight = Flight(away=(5.0, 7.5))
+    flight.vehicle += [entry(5.6, "failsafe:hover"), entry(7.0, "velocity", 50)]
+    stopped = fault("pilot_stop", 5.05, 7.5)
+    assert len(flight.judge(stopped).stale) == 2, "too old, and from before the failsafe"
+    flight.vehicle.append(entry(6.99, "stalled", 1900))
+    assert not flight.judge(stopped).stale
+
+
 def test_a_failsafe_while_the_pilot_calls_is_needless() -> None:
     flight = Flight()
     flight.vehicle.append(entry(5.05, "failsafe:hover"))
