@@ -99,12 +99,15 @@ class Radio:
         self._delay_s = seconds
 
     def _run(self) -> None:
-        looked_s = time.monotonic()
+        looked_s, full = time.monotonic(), False
         while True:
             now_s = time.monotonic()
             if self._far is None and now_s - looked_s > STALLED_S:  # of datagrams the kernel tells when they came
                 self._note("stalled", round((now_s - looked_s) * 1000))
             looked_s = now_s
+            if now_s < self.full_until_s and not full:  # what is here already has been received: no port can recall it
+                for frame in self._came():
+                    self._up(frame)
             full = now_s < self.full_until_s
             if self.moving and self._far is not None:
                 self.moving = False
