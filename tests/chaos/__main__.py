@@ -30,7 +30,7 @@ CONTROLS = {
     "local": "local-control",
     "network": "network-control",
     "mavlink": "mavlink-control",
-    "page": "mavlink-control",
+    "page": "page-control",
 }
 #: A proxy that went through all this may hold so much more than before. What waited at once in a flood (some 25 MB over
 #: the network) the allocator keeps for the next: an hour of floods was seen to leave less, three minutes 26 MB.
@@ -58,8 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _lane(name: str, folder: Path) -> Lane:
-    """``page``, or a name that begins with ``local``, ``network`` or ``mavlink``."""
-    if name == "page":
+    """The kind is the beginning of its name."""
+    if name.startswith("page"):
         return PageLane(name, folder)
     if name.startswith("mavlink"):
         return MavlinkLane(name, folder)
@@ -86,7 +86,7 @@ def _run(folder: Path, seconds: float, seed: int, quiet: bool, faults: Mapping[s
             print(f"{time.monotonic() - begin:7.1f} s  {text}", flush=True)
 
     with ExitStack() as stack:
-        lanes = _begun((*faults, *sorted(set(CONTROLS.values()))), folder, stack)
+        lanes = _begun((*faults, *(CONTROLS[name] for name in faults)), folder, stack)
         ending = threading.Event()
         for lane in lanes:
             lane.proxy.until("ready")

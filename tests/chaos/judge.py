@@ -77,12 +77,17 @@ def faults_of(entries: Iterable[Entry]) -> list[Fault]:
     return faults
 
 
-def judge(pilot: Sequence[Entry], vehicle: Sequence[Entry], faults: Sequence[Fault]) -> Verdict:
-    """What became of the promises of one lane, from its sorted journals."""
+def judge(
+    pilot: Sequence[Entry], vehicle: Sequence[Entry], faults: Sequence[Fault], *, transit_s: float = 0.0
+) -> Verdict:
+    """What became of the promises of one lane, from its sorted journals.
+
+    ``transit_s``: how long a set-point may be under way from the proxy to its line in the vehicle's journal.
+    """
     verdict = Verdict(calls=sum(entry.what == "call" for entry in pilot))
     calls = _Calls(pilot)
     failsafes = [entry.at_ns for entry in vehicle if entry.what.startswith("failsafe:")]
-    _judge_ages(verdict, calls, vehicle, failsafes)
+    _judge_ages(verdict, calls, vehicle, [at_ns + _ns(transit_s) for at_ns in failsafes])
     disruptions = [fault for fault in faults if fault.kind in DISRUPTIONS]
     windows = _judge_recoveries(verdict, calls, vehicle, disruptions)
     windows += [(entry.at_ns, entry.at_ns + _ns(1.0)) for entry in vehicle if entry.what == "open"]

@@ -26,6 +26,8 @@ TAIL_BYTES: Final = 30_000  #: of a journal: the last 15 s and more
 class Lane:
     """One vehicle with its pilot. ``network``: an address at which they meet, else on this host."""
 
+    transit_s = 0.0  #: see :func:`tests.chaos.judge.judge`
+
     def __init__(self, name: str, folder: Path, *, network: str | None = None) -> None:
         self.name = name
         self.network = network
@@ -81,7 +83,7 @@ class Lane:
         """What its journals tell."""
         vehicle = read(self._vehicle_path)  # first, so that each call that it executed is in the pilot's
         faults = faults_of(read(self.folder / f"{self.name}.faults"))
-        return judge(read(self.folder / f"{self.name}.pilot"), vehicle, faults)
+        return judge(read(self.folder / f"{self.name}.pilot"), vehicle, faults, transit_s=self.transit_s)
 
     def close(self) -> None:
         """End its processes."""

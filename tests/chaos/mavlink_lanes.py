@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.clock import monotonic_ns
+from tests.chaos.judge import SLACK_S
 from tests.chaos.lanes import Fault, Lane, fork, pilot_stop, proxy_kill, tail
 from tests.chaos.processes import Process
 
@@ -68,6 +69,8 @@ class MavlinkLane(Lane):
 
 class PageLane(MavlinkLane):
     """Flown by the page's own logic under node, through a cockpit, over a serial port (a pty)."""
+
+    transit_s = SLACK_S  # nothing tells when bytes left the port
 
     def __init__(self, name: str, folder: Path) -> None:
         self.cockpit: Process | None = None
