@@ -11,17 +11,27 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from skyloop.transport.fabric.config import free_port
 from tests.chaos.judge import Verdict
-from tests.chaos.lanes import LOCAL, NETWORK, Fault, Lane, Resources, disk_full, foreign_clock, torment
+from tests.chaos.lanes import LOCAL, NETWORK, Fault, Lane, disk_full, foreign_clock, torment
+from tests.chaos.mavlink_lanes import HANDS, MAVLINK, MavlinkLane, PageLane
+from tests.chaos.processes import Resources
 
 EPILOG = "Example: python -m tests.chaos --seconds 180 --seed 7; ends with 1 if a promise was broken, and says which."
 CALM_S = 5.0  #: before the first fault and after the last
 DISK = "8m"
+#: The lane beside each that has no faults: what happens to it as well is the machine's doing.
+CONTROLS = {
+    "local": "local-control",
+    "network": "network-control",
+    "mavlink": "mavlink-control",
+    "page": "page-control",
+}
 #: A proxy that went through all this may hold so much more than before. What waited at once in a flood (some 25 MB over
 #: the network) the allocator keeps for the next: an hour of floods was seen to leave less, three minutes 26 MB.
 MORE_DESCRIPTORS, MORE_THREADS, MORE_MB = 8, 3, 48.0
@@ -40,11 +50,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
             impossible.add(foreign_clock)
         for fault in impossible:
             print(f"left out, as it takes root: {fault.__doc__}")
-        local, remote = ([fault for fault in faults if fault not in impossible] for faults in (LOCAL, NETWORK))
-        return _run(Path(folder), chosen.seconds, chosen.seed, chosen.quiet, local, remote)
+        faults = {"local": LOCAL, "network": NETWORK, "mavlink": MAVLINK, "page": HANDS}
+        if missing := PageLane.missing():
+            print(f"left out, as it takes {missing}: {', '.join(str(fault.__doc__) for fault in faults.pop('page'))}")
+        possible = {name: [fault for fault in each if fault not in impossible] for name, each in faults.items()}
+        return _run(Path(folder), chosen.seconds, chosen.seed, chosen.quiet, possible)
 
 
-def _run(folder: Path, seconds: float, seed: int, quiet: bool, local: Sequence[Fault], remote: Sequence[Fault]) -> int:
+def _lane(name: str, folder: Path) -> Lane:
+    """The kind is the beginning of its name."""
+    if name.startswith("page"):
+        return PageLane(name, folder)
+    if name.startswith("mavlink"):
+        return MavlinkLane(name, folder)
+    return Lane(name, folder, network=f"127.0.0.1:{free_port('127.0.0.1')}" if name.startswith("network") else None)
+
+
+def _begun(names: Sequence[str], folder: Path, stack: ExitStack) -> list[Lane]:
+    """Lanes that start side by side, and are closed with the stack."""
+
+    def begin(name: str) -> Lane:
+        lane = _lane(name, folder)
+        stack.callback(lane.close)
+        return lane
+
+    with ThreadPoolExecutor(len(names)) as pool:
+        return list(pool.map(begin, names))
+
+
+def _run(folder: Path, seconds: float, seed: int, quiet: bool, faults: Mapping[str, Sequence[Fault]]) -> int:
     begin = time.monotonic()
 
     def report(text: str) -> None:
@@ -52,25 +86,22 @@ def _run(folder: Path, seconds: float, seed: int, quiet: bool, local: Sequence[F
             print(f"{time.monotonic() - begin:7.1f} s  {text}", flush=True)
 
     with ExitStack() as stack:
-        lanes: list[Lane] = []
-        for name in ("local", "network", "local-control", "network-control"):
-            network = f"127.0.0.1:{free_port('127.0.0.1')}" if name.startswith("network") else None
-            lane = Lane(name, folder, network=network)
-            stack.callback(lane.close)
-            lanes.append(lane)
+        lanes = _begun((*faults, *(CONTROLS[name] for name in faults)), folder, stack)
+        ending = threading.Event()
         for lane in lanes:
             lane.proxy.until("ready")
         for lane in lanes:
             lane.pilot.until("flying")
+        for lane in lanes:
+            lane.resume(ending)
         report("all fly")
         time.sleep(CALM_S)
         for lane in lanes:
             lane.settled()
-        ending = threading.Event()
         threads = []
-        for number, (lane, faults) in enumerate(zip(lanes, (local, remote), strict=False)):
+        for number, (lane, each) in enumerate(zip(lanes, faults.values(), strict=False)):
             source = random.Random(seed * 1000 + number)
-            thread = threading.Thread(target=torment, args=(lane, faults, source, ending, report), name=lane.name)
+            thread = threading.Thread(target=torment, args=(lane, each, source, ending, report), name=lane.name)
             thread.start()
             threads.append(thread)
         try:
@@ -83,6 +114,7 @@ def _run(folder: Path, seconds: float, seed: int, quiet: bool, local: Sequence[F
         time.sleep(CALM_S + 5.0)
         verdicts = {lane.name: lane.verdict() for lane in lanes}
         broken = [*_leaks(lanes), *_dead(lanes)]
+        broken += [f"{lane.name}: {text}" for lane in lanes for text in lane.complaints]
         broken += _broken(verdicts)
         for lane in lanes:
             log = lane.folder / f"{lane.name}.log"
@@ -102,8 +134,9 @@ def _broken(verdicts: dict[str, Verdict]) -> list[str]:
     for name, verdict in verdicts.items():
         broken += [f"{name}: stale: {text}" for text in verdict.stale]
         broken += [f"{name}: missed: {text}" for text in verdict.missed]
+        broken += [f"{name}: nobody asked for it: {text}" for text in verdict.unasked]
         broken += [f"{name}: not flown again after {text}" for text in verdict.unrecovered]
-        control = verdicts.get(f"{name}-control")
+        control = verdicts.get(CONTROLS.get(name, ""))
         if control is not None and len(verdict.needless) > len(control.needless):
             broken += [f"{name}: needless: {text}" for text in verdict.needless]
         if not verdict.applied:
@@ -126,19 +159,25 @@ def _leaks(lanes: Sequence[Lane]) -> list[str]:
 
 
 def _dead(lanes: Sequence[Lane]) -> list[str]:
-    processes = [(lane.name, what, getattr(lane, what)) for lane in lanes for what in ("proxy", "pilot")]
-    return [f"{name}: the {what} is dead" for name, what, process in processes if not process.alive]
+    return [
+        f"{lane.name}: the {what} is dead"
+        for lane in lanes
+        for what, process in lane.processes().items()
+        if not process.alive
+    ]
 
 
 def _table(verdicts: dict[str, Verdict], lanes: Sequence[Lane]) -> str:
     rows = [["", *verdicts]]
     rows.append(["calls / executed", *(f"{v.calls} / {v.applied}" for v in verdicts.values())])
     rows.append(["stale executed", *(str(len(v.stale)) for v in verdicts.values())])
+    rows.append(["flights nobody asked for", *(str(len(v.unasked)) for v in verdicts.values())])
     rows.append(["needless failsafes", *(str(len(v.needless)) for v in verdicts.values())])
     rows.append(["missed failsafes", *(str(len(v.missed)) for v in verdicts.values())])
     rows.append(["failsafes that were due", *(str(v.justified) for v in verdicts.values())])
     rows.append(["call to vehicle [ms]", *(_spread(v.delay_s) for v in verdicts.values())])
     rows.append(["hover after its time [ms]", *(_spread(v.hover_late_s) for v in verdicts.values())])
+    rows.append(["stop to standing [ms]", *(_spread(v.stop_s) for v in verdicts.values())])
     for kind in sorted({kind for v in verdicts.values() for kind in v.recovery_s}):
         spans = (v.recovery_s.get(kind, []) for v in verdicts.values())
         rows.append([f"flown after {kind.replace('_', ' ')} [ms]", *(_spread(span) for span in spans)])

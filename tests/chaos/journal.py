@@ -24,9 +24,9 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
 
-    def write(self, what: str, number: int = 0) -> None:
-        """Append an entry with the present time."""
-        os.write(self._file, f"{monotonic_ns()} {what} {number}\n".encode())
+    def write(self, what: str, number: int = 0, at_ns: int | None = None) -> None:
+        """Append an entry, with the present time if none is given."""
+        os.write(self._file, f"{monotonic_ns() if at_ns is None else at_ns} {what} {number}\n".encode())
 
     def close(self) -> None:
         """Close the file."""

@@ -1,7 +1,7 @@
 """From the journals of a lane to what became of its promises. Pure.
 
-Times are of one host's monotonic clock. A *disruption* is a fault that takes pilot or proxy away, so that a failsafe is
-what is wanted; any other fault must leave the flight as it is.
+Times are of one host's monotonic clock. A *disruption* is a fault that takes the pilot, the proxy or the vehicle's
+link away, so that a failsafe is what is wanted; any other fault must leave the flight as it is.
 """
 
 from __future__ import annotations
@@ -22,9 +22,20 @@ STALL_S: Final = 1.0  #: how long the library repeats a set-point without a call
 SLACK_S: Final = 0.05
 #: A failsafe that is later than this was missed.
 LATE_S: Final = 1.0
-DISRUPTIONS: Final = frozenset({"pilot_stop", "pilot_kill", "proxy_stop", "proxy_kill"})
+#: Every take-off request is over by then.
+TAKEOFF_S: Final = 30.0
+#: An emergency stop is executed within this, even if its first packets are lost.
+STOP_S: Final = 3.0
+#: A failsafe's landing reaches the vehicle within this, with a link that may be lost meanwhile.
+LANDS_S: Final = 30.0
+#: A set-point that was under way when a stop was pressed may still be executed.
+UNDER_WAY_S: Final = 0.3
+DISRUPTIONS: Final = frozenset({"pilot_stop", "pilot_kill", "proxy_stop", "proxy_kill", "full_serial_port"})
 _PILOT: Final = frozenset({"pilot_stop", "pilot_kill"})
 _AIRBORNE: Final = frozenset({"state:taking_off", "state:hovering", "state:flying"})
+_DOWN: Final = frozenset({"state:landed", "state:emergency"})
+#: Each of these ends a pilot's take-off: nothing may turn a propeller after it.
+_ENDS: Final = frozenset({"touched_down", "disarmed", "other:land", "other:tip", "failsafe:land", "land", "ask_stop"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +57,12 @@ class Verdict:
     needless: list[str] = field(default_factory=list)
     missed: list[str] = field(default_factory=list)
     unrecovered: list[str] = field(default_factory=list)
+    unasked: list[str] = field(default_factory=list)  #: flights that no pilot asked for
     justified: int = 0  #: failsafes that somebody's silence or death asked for
     hover_late_s: list[float] = field(default_factory=list)  #: after ``failsafe.hover_after_s``; negative: before
     recovery_s: dict[str, list[float]] = field(default_factory=dict)
     delay_s: list[float] = field(default_factory=list)  #: from the call to the vehicle
+    stop_s: list[float] = field(default_factory=list)  #: from an emergency stop to standing motors
 
 
 def faults_of(entries: Iterable[Entry]) -> list[Fault]:
@@ -64,17 +77,24 @@ def faults_of(entries: Iterable[Entry]) -> list[Fault]:
     return faults
 
 
-def judge(pilot: Sequence[Entry], vehicle: Sequence[Entry], faults: Sequence[Fault]) -> Verdict:
-    """What became of the promises of one lane, from its sorted journals."""
+def judge(
+    pilot: Sequence[Entry], vehicle: Sequence[Entry], faults: Sequence[Fault], *, transit_s: float = 0.0
+) -> Verdict:
+    """What became of the promises of one lane, from its sorted journals.
+
+    ``transit_s``: how long a set-point may be under way from the proxy to its line in the vehicle's journal.
+    """
     verdict = Verdict(calls=sum(entry.what == "call" for entry in pilot))
     calls = _Calls(pilot)
     failsafes = [entry.at_ns for entry in vehicle if entry.what.startswith("failsafe:")]
-    _judge_ages(verdict, calls, vehicle, failsafes)
+    _judge_ages(verdict, calls, vehicle, [at_ns + _ns(transit_s) for at_ns in failsafes])
     disruptions = [fault for fault in faults if fault.kind in DISRUPTIONS]
     windows = _judge_recoveries(verdict, calls, vehicle, disruptions)
     windows += [(entry.at_ns, entry.at_ns + _ns(1.0)) for entry in vehicle if entry.what == "open"]
     _judge_needless(verdict, calls, vehicle, windows, faults)
     _judge_missed(verdict, vehicle, disruptions)
+    _judge_flights(verdict, pilot, vehicle, faults)
+    _judge_stops(verdict, pilot, vehicle)
     return verdict
 
 
@@ -98,6 +118,8 @@ class _Calls:
 
 def _judge_ages(verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], failsafes: Sequence[int]) -> None:
     """Nothing old is executed: no set-point that nobody asked for lately, none from before a failsafe."""
+    stalls = [(entry.at_ns - entry.number * 1_000_000, entry.at_ns) for entry in vehicle if entry.what == "stalled"]
+    stall_ends = [end for _, end in stalls]
     for entry in vehicle:
         if entry.what != "velocity":
             continue
@@ -108,12 +130,15 @@ def _judge_ages(verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], fails
             continue
         begin_ns, end_ns = times
         verdict.delay_s.append((entry.at_ns - begin_ns) / 1e9)
-        age_s = (entry.at_ns - end_ns) / 1e9
+        # While the vehicle's own process is put off, it does not read what has arrived.
+        meanwhile = stalls[bisect_left(stall_ends, end_ns) : bisect_right(stall_ends, entry.at_ns)]
+        at_ns = entry.at_ns - sum(end - max(begin, end_ns) for begin, end in meanwhile)
+        age_s = (at_ns - end_ns) / 1e9
         if age_s > STALL_S + MAX_AGE_S + SLACK_S:
             verdict.stale.append(f"number {entry.number} was executed {age_s:.3f} s after its call")
         # A command under way when the failsafe came may still be executed, if it is young enough.
         after = bisect_right(failsafes, end_ns + _ns(MAX_AGE_S + SLACK_S))
-        if after < len(failsafes) and failsafes[after] < entry.at_ns:
+        if after < len(failsafes) and failsafes[after] < at_ns:
             verdict.stale.append(f"number {entry.number} was executed after a failsafe that came after its call")
 
 
@@ -147,7 +172,10 @@ def _judge_needless(
     windows: Sequence[tuple[int, int]],
     faults: Sequence[Fault],
 ) -> None:
+    landings = [entry.at_ns for entry in vehicle if entry.what == "failsafe:land"]
     for entry in vehicle:
+        if entry.what == "land" and not any(-_ns(LATE_S) <= entry.at_ns - at_ns <= _ns(LANDS_S) for at_ns in landings):
+            verdict.needless.append(f"landed at {entry.at_ns / 1e9:.3f} s, which no pilot and no failsafe wanted")
         if not entry.what.startswith("failsafe:"):
             continue
         last = bisect_right(calls.begins, entry.at_ns)
@@ -187,6 +215,73 @@ def _judge_missed(verdict: Verdict, vehicle: Sequence[Entry], disruptions: Seque
                 verdict.missed.append(f"{step} after {fault.kind} at {fault.begin_ns / 1e9:.3f} s")
             elif step == "hover":
                 verdict.hover_late_s.append((came[0] - fault.begin_ns) / 1e9 - HOVER_AFTER_S)
+
+
+def _judge_flights(verdict: Verdict, pilot: Sequence[Entry], vehicle: Sequence[Entry], faults: Sequence[Fault]) -> None:
+    """Leaving the ground, arming and taking the vehicle from others need a pilot's take-off that is still in force."""
+    history = sorted([*_with_touch_downs(vehicle), *pilot], key=lambda entry: entry.at_ns)
+    asked: Entry | None = None
+    ended: Entry | None = None
+    others = False  # somebody else has decided what becomes of it
+    stopped_ns: int | None = None
+    for entry in history:
+        if entry.what == "ask_takeoff":
+            asked, ended, others, stopped_ns = entry, None, False, None
+        elif entry.what in _ENDS:
+            ended = ended or entry
+            others = others or entry.what.startswith("other:")
+            stopped_ns = entry.at_ns if entry.what == "ask_stop" else stopped_ns
+        wrong = ""
+        in_force = asked is not None and ended is None and entry.at_ns - asked.at_ns <= _ns(TAKEOFF_S)
+        if entry.what in ("armed", "left_ground") and not in_force:
+            wrong = entry.what.replace("_", " ")
+        elif entry.what == "guided" and others:
+            wrong = "taken from others"
+        elif entry.what == "moved":
+            wrong = f"moved at {entry.number / 1000:.2f} m/s"
+        elif entry.what == "velocity" and stopped_ns is not None and entry.at_ns - stopped_ns > _ns(UNDER_WAY_S):
+            wrong = "flown by sticks after an emergency stop"
+        if wrong:
+            verdict.unasked.append(f"{wrong} {_led_to(entry, asked, ended, faults)}")
+
+
+def _with_touch_downs(vehicle: Sequence[Entry]) -> list[Entry]:
+    """The vehicle's entries, with entries for each lift-off and touch-down."""
+    found, down = [], True
+    for entry in vehicle:
+        if entry.what.startswith("state:") and (entry.what in _DOWN) is not down:
+            down = not down
+            found.append(Entry(entry.at_ns, "touched_down" if down else "left_ground"))
+        found.append(entry)
+    return found
+
+
+def _led_to(entry: Entry, asked: Entry | None, ended: Entry | None, faults: Sequence[Fault]) -> str:
+    """The history of an event, as a sentence."""
+
+    def ago(at_ns: int) -> str:
+        return f"{(entry.at_ns - at_ns) / 1e9:.3f} s before"
+
+    parts = [f"at {entry.at_ns / 1e9:.3f} s"]
+    parts.append("no take-off was ever asked for" if asked is None else f"a take-off asked for {ago(asked.at_ns)}")
+    if ended is not None:
+        parts.append(f"ended by {ended.what.replace('_', ' ')} {ago(ended.at_ns)}")
+    before = [fault for fault in faults if fault.begin_ns <= entry.at_ns]
+    if before:
+        parts.append(f"{before[-1].kind} began {ago(before[-1].begin_ns)}")
+    return ", ".join(parts)
+
+
+def _judge_stops(verdict: Verdict, pilot: Sequence[Entry], vehicle: Sequence[Entry]) -> None:
+    """An emergency stop is executed even if packets are lost."""
+    stood = [entry.at_ns for entry in vehicle if entry.what in ("disarmed", "state:emergency")]
+    for entry in pilot:
+        if entry.what == "ask_stop":
+            place = bisect_left(stood, entry.at_ns)
+            after_s = (stood[place] - entry.at_ns) / 1e9 if place < len(stood) else float("inf")
+            verdict.stop_s.append(after_s)
+            if after_s > STOP_S:
+                verdict.missed.append(f"emergency stop at {entry.at_ns / 1e9:.3f} s: it stood {after_s:.3f} s later")
 
 
 def _ns(span_s: float) -> int:

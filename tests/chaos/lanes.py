@@ -4,93 +4,29 @@ from __future__ import annotations
 
 import os
 import random
-import select
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from skyloop.clock import monotonic_ns
 from tests.chaos.journal import Entry, Journal, read
 from tests.chaos.judge import Verdict, faults_of, judge
+from tests.chaos.processes import Process, Resources
 
-STARTS_WITHIN_S: Final = 60.0
 RECOVERS_WITHIN_S: Final = 20.0
 TIME_NAMESPACE_S: Final = 5000
-
-
-class Process:
-    """A child that is ended by its own number."""
-
-    def __init__(self, *command: str, log: Path, environment: dict[str, str]) -> None:
-        with log.open("ab") as errors:
-            self._popen = subprocess.Popen(
-                command,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                env={**os.environ, **environment},
-                start_new_session=True,
-            )
-
-    @property
-    def pid(self) -> int:
-        """Its number."""
-        return self._popen.pid
-
-    @property
-    def alive(self) -> bool:
-        """Whether it runs, or is stopped."""
-        return self._popen.poll() is None
-
-    def until(self, word: str) -> None:
-        """Wait for a word at its standard output. Raises ``RuntimeError`` if it does not come."""
-        stream = self._popen.stdout
-        assert stream is not None
-        said, deadline = b"", time.monotonic() + STARTS_WITHIN_S
-        while word.encode() not in said:
-            ready, _, _ = select.select([stream], [], [], max(0.0, deadline - time.monotonic()))
-            more = os.read(stream.fileno(), 4096) if ready else b""
-            if not more:
-                raise RuntimeError(f"{self._popen.args!r} did not say {word!r} but {said.decode()!r}")
-            said += more
-
-    def signal(self, number: signal.Signals) -> None:
-        """Send it a signal."""
-        os.kill(self.pid, number)
-
-    def kill(self) -> None:
-        """End it and what it started, and wait."""
-        with suppress(ProcessLookupError):
-            os.killpg(self.pid, signal.SIGKILL)
-        self._popen.wait(10)
-        if self._popen.stdout is not None:
-            self._popen.stdout.close()
-
-
-@dataclass(frozen=True, slots=True)
-class Resources:
-    """What a proxy holds."""
-
-    descriptors: int
-    threads: int
-    memory_mb: float
-
-    @classmethod
-    def of(cls, pid: int) -> Resources:
-        """As the kernel counts."""
-        status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
-        descriptors = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-        return cls(descriptors, int(status["Threads"]), int(status["VmRSS"].split()[0]) / 1024)
+TAIL_BYTES: Final = 30_000  #: of a journal: the last 15 s and more
 
 
 class Lane:
     """One vehicle with its pilot. ``network``: an address at which they meet, else on this host."""
+
+    transit_s = 0.0  #: see :func:`tests.chaos.judge.judge`
 
     def __init__(self, name: str, folder: Path, *, network: str | None = None) -> None:
         self.name = name
@@ -98,6 +34,7 @@ class Lane:
         self.folder = folder
         self.disk = folder / "disk"
         self.faults = Journal(folder / f"{name}.faults")
+        self.complaints: list[str] = []  #: promises that were broken besides those that journals show
         self._pilots_rooms = folder / ("elsewhere" if network else "run")  # where the proxy's socket can't be found
         self.proxy = self._start_proxy()
         self.pilot = self._start_pilot()
@@ -114,16 +51,13 @@ class Lane:
 
     def run(self, module: str, *arguments: str, prefix: Sequence[str] = (), remote: bool = False) -> Process:
         """A program of this package beside the lane."""
+        command = (*prefix, sys.executable, "-m", f"tests.chaos.{module}", *arguments)
+        return Process(*command, log=self.folder / f"{self.name}.log", environment=self.environment(remote=remote))
+
+    def environment(self, *, remote: bool = False) -> dict[str, str]:
+        """Of its programs; ``remote``: of those that must not find the proxy's socket."""
         rooms = self._pilots_rooms if remote else self.folder / "run"
-        return Process(
-            *prefix,
-            sys.executable,
-            "-m",
-            f"tests.chaos.{module}",
-            *arguments,
-            log=self.folder / f"{self.name}.log",
-            environment={"SKYLOOP_RUNTIME_DIR": str(rooms), "XDG_STATE_HOME": str(self.disk / "state")},
-        )
+        return {"SKYLOOP_RUNTIME_DIR": str(rooms), "XDG_STATE_HOME": str(self.disk / "state")}
 
     def restart_proxy(self) -> None:
         """A new one, once the one before is dead; returns when it serves."""
@@ -134,19 +68,26 @@ class Lane:
         """A new one, once the one before is dead."""
         self.pilot = self._start_pilot()
 
+    def resume(self, ending: threading.Event) -> None:
+        """What it takes for the pilot to fly on after a fault."""
+
+    def processes(self) -> dict[str, Process]:
+        """Those that must be alive at the end."""
+        return {"proxy": self.proxy, "pilot": self.pilot}
+
     def flown_since(self, since_ns: int) -> bool:
         """Whether the vehicle executed a set-point after this time."""
-        return any(entry.what == "velocity" and entry.at_ns > since_ns for entry in _tail(self._vehicle_path))
+        return any(entry.what == "velocity" and entry.at_ns > since_ns for entry in tail(self._vehicle_path))
 
     def verdict(self) -> Verdict:
         """What its journals tell."""
         vehicle = read(self._vehicle_path)  # first, so that each call that it executed is in the pilot's
         faults = faults_of(read(self.folder / f"{self.name}.faults"))
-        return judge(read(self.folder / f"{self.name}.pilot"), vehicle, faults)
+        return judge(read(self.folder / f"{self.name}.pilot"), vehicle, faults, transit_s=self.transit_s)
 
     def close(self) -> None:
         """End its processes."""
-        for process in (self.pilot, self.proxy):
+        for process in self.processes().values():
             process.kill()
         self.faults.close()
 
@@ -158,7 +99,7 @@ class Lane:
         return self.run("vehicle", self.name, str(self.folder), *([self.network] if self.network else []))
 
     def _start_pilot(self) -> Process:
-        arguments = [self.network] if self.network else []
+        arguments = ["--network", self.network] if self.network else []
         return self.run("pilot", self.name, str(self.folder), *arguments, remote=True)
 
 
@@ -189,6 +130,20 @@ def proxy_kill(lane: Lane, source: random.Random, ending: threading.Event) -> No
     lane.proxy.kill()
     ending.wait(source.choice((0.0, 1.0, 3.0)))
     lane.restart_proxy()
+
+
+def fork(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """The pilot forks inside its ``with`` block, and the child ends by ``sys.exit``."""
+    children = Path(f"/proc/{lane.pilot.pid}/task/{lane.pilot.pid}/children")
+    for _ in range(source.choice((1, 3))):
+        lane.pilot.signal(signal.SIGUSR1)
+        ending.wait(1.0)
+    deadline = time.monotonic() + RECOVERS_WITHIN_S
+    while left := children.read_text().strip():
+        if time.monotonic() > deadline:
+            lane.complaints.append(f"the pilot's children {left} did not end")
+            return
+        ending.wait(0.1)
 
 
 def observer_stop(lane: Lane, source: random.Random, ending: threading.Event) -> None:
@@ -250,12 +205,13 @@ def disk_full(lane: Lane, source: random.Random, ending: threading.Event) -> Non
         (lane.disk / "ballast").unlink(missing_ok=True)
 
 
-#: The first four are what the judge knows as disruptions.
+#: The first four are disruptions, as the judge calls them.
 LOCAL: Final[tuple[Fault, ...]] = (
     pilot_stop,
     pilot_kill,
     proxy_stop,
     proxy_kill,
+    fork,
     observer_stop,
     starvation,
     silent_flood,
@@ -269,6 +225,7 @@ NETWORK: Final[tuple[Fault, ...]] = (
     pilot_kill,
     proxy_stop,
     proxy_kill,
+    fork,
     observer_stop,
     network_flood,
     request_flood,
@@ -297,6 +254,11 @@ def torment(
                 report(f"{lane.name}: {kind} could not be done: {error}")
                 lane.faults.write(f"broken:{kind}")
             lane.faults.write(f"end:{kind}")
+            try:
+                lane.resume(ending)
+            except RuntimeError as error:
+                lane.complaints.append(f"not flown again after {kind}: {error}")
+                report(f"{lane.name}: {error}")
             _await_flight(lane, ending)
             ending.wait(source.uniform(0.5, 2.0))
 
@@ -310,11 +272,11 @@ def _await_flight(lane: Lane, ending: threading.Event) -> None:
             return
 
 
-def _tail(path: Path) -> list[Entry]:
+def tail(path: Path) -> list[Entry]:
     """The last entries of a journal that is being written."""
     with path.open("rb") as file:
         file.seek(0, os.SEEK_END)
-        file.seek(max(0, file.tell() - 2000))
+        file.seek(max(0, file.tell() - TAIL_BYTES))
         lines = file.read().decode().splitlines()[1:]
     whole = [line.split() for line in lines if len(line.split()) == 3]
     return [Entry(int(at_ns), what, int(number)) for at_ns, what, number in whole]

@@ -6,6 +6,7 @@ import os
 import random
 import socket
 import sys
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -13,11 +14,16 @@ from typing import Final
 
 import skyloop
 from skyloop.errors import SkyloopError
+from skyloop.host.control import AddNamed, Remove, Status, ask
+from skyloop.host.vehicle import Condition
 from skyloop.messages import Hello, ListParameters, Ping, Request, Role, encode
+from skyloop.transport.fabric.config import free_port
 from skyloop.transport.local import packets
+from skyloop.transport.local.directory import PROXY, find_directory
 
 CONNECTIONS: Final = 40
 BURSTS_PER_S: Final = 50.0
+REMOVALS: Final = 6
 
 
 def observe(name: str, network: str = "") -> None:
@@ -130,6 +136,48 @@ def record(name: str, path: str) -> None:
             time.sleep(0.2)
 
 
+def remove_starting(host: str, seed: str) -> None:
+    """Add vehicles to a host and remove each while it starts; ends with an error if one is served after that."""
+    source = random.Random(int(seed))
+    for number in range(REMOVALS):
+        name, address = f"extra{number}", f"mavlink://udpin:127.0.0.1:{free_port('127.0.0.1')}"
+        add = AddNamed(name, address, own_process=source.random() < 0.3)
+        adding = threading.Thread(target=_asked, args=(host, add))
+        adding.start()
+        time.sleep(source.choice((0.0, 0.005, 0.02, 0.1)))
+        early = _asked(host, Remove(name))
+        adding.join()
+        if not early:  # it was not there yet
+            _asked(host, Remove(name))
+        rows = [
+            row for row in ask(host, Status()).vehicles if row.name == name and row.condition is not Condition.STOPPED
+        ]
+        deadline = time.monotonic() + 5.0
+        path = str(find_directory(None, PROXY).socket_path(name))
+        while (served := _is_served(path)) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        if served or rows:
+            sys.exit(f"{add} was removed ({'early' if early else 'late'}), and still {rows or 'serves'}")
+    _ready()
+
+
+def _asked(host: str, request: AddNamed | Remove) -> bool:
+    try:
+        ask(host, request)
+    except SkyloopError as error:
+        print(f"{request}: {error}", file=sys.stderr)
+        return False
+    return True
+
+
+def _is_served(path: str) -> bool:
+    try:
+        _connect(path).close()
+    except OSError:
+        return False
+    return True
+
+
 def _connect(path: str) -> socket.socket:
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     connection.setblocking(False)
@@ -146,5 +194,5 @@ def _ready() -> None:
 
 
 if __name__ == "__main__":
-    programs = (observe, silent, garbage, requests, network_requests, hog, fill, record)
+    programs = (observe, silent, garbage, requests, network_requests, hog, fill, record, remove_starting)
     {program.__name__: program for program in programs}[sys.argv[1]](*sys.argv[2:])

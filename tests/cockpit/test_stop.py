@@ -9,9 +9,10 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.cockpit import station
+from skyloop.cockpit.control_session import ControlSession
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.errors import DriverError, UnsupportedError
-from skyloop.messages import AnyAction, EmergencyStop, FlightState, Hover, Velocity
+from skyloop.messages import AnyAction, EmergencyStop, Event, EventKind, FlightState, Hover, Refusal, Value, Velocity
 from tests.cockpit.fake import Node, open_socket, until
 from tests.cockpit.test_control import Page, count, page
 from tests.cockpit.testclient import TestClient
@@ -51,6 +52,28 @@ def test_a_stop_whose_first_packets_are_lost_comes_while_the_sticks_are_held(cli
             )
     kinds = [type(action) for action in node.flyer.applied]
     assert Velocity not in kinds[kinds.index(EmergencyStop) :]
+
+
+def test_sticks_that_a_stop_overtakes_are_refused_and_the_stop_is_not(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A set-point under way was refused for the stop's sake, and the page was told that the stop was refused."""
+    on_event = ControlSession._on_event
+
+    def overtaken(session: ControlSession, event: Event) -> None:
+        text = "velocity refused: there was an emergency"
+        data: dict[str, Value] = {"reason": Refusal.WRONG_STATE.value}
+        on_event(session, Event(EventKind.COMMAND_REFUSED, text, 0, app=session.app, data=data))
+        on_event(session, event)
+
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("fly", forward=0.5)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+        monkeypatch.setattr(ControlSession, "_on_event", overtaken)
+        pilot.say("stop", n=70)
+        pilot.wait("done", do="stop")
+        assert {told["do"] for told in pilot.told if told["type"] == "refused"} == {"fly"}
 
 
 def test_a_stop_that_does_not_show_is_never_done_and_the_drone_hovers(

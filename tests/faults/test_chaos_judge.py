@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from skyloop.wire.mavlink.codec import Codec, dialect
 from tests.chaos.journal import Entry
 from tests.chaos.judge import Fault, Verdict, faults_of, judge
+from tests.chaos.radio import frames_of, is_stop
 
 START_NS = 10**12
 
@@ -71,6 +73,15 @@ def test_a_set_point_from_before_a_failsafe_is_stale_however_young() -> None:
     assert "after a failsafe" in found
 
 
+def test_a_set_point_that_waited_for_a_stalled_vehicle_is_not_stale() -> None:
+    flight = Flight(away=(5.0, 7.5))
+    flight.vehicle += [entry(5.6, "failsafe:hover"), entry(7.0, "velocity", 50)]
+    stopped = fault("pilot_stop", 5.05, 7.5)
+    assert len(flight.judge(stopped).stale) == 2, "too old, and from before the failsafe"
+    flight.vehicle.append(entry(6.99, "stalled", 1900))
+    assert not flight.judge(stopped).stale
+
+
 def test_a_failsafe_while_the_pilot_calls_is_needless() -> None:
     flight = Flight()
     flight.vehicle.append(entry(5.05, "failsafe:hover"))
@@ -122,3 +133,113 @@ def test_recovery_is_counted_to_the_first_new_set_point() -> None:
 def test_faults_are_read_from_their_beginnings_and_ends() -> None:
     lines = [entry(1, "begin:hog"), entry(2, "end:hog"), entry(3, "begin:hog"), entry(4, "end:other")]
     assert faults_of(lines) == [fault("hog", 1, 2)]
+
+
+# Flights that nobody asked for -----------------------------------------
+
+
+class TakeOff:
+    """Journals of one take-off at 1 s, up at 2 s; what a test adds comes after it."""
+
+    def __init__(self, *pilot: Entry) -> None:
+        self.pilot = [entry(1.0, "ask_takeoff"), *pilot]
+        self.vehicle = [entry(-2.0, "open"), entry(-1.9, "state:landed"), entry(1.1, "armed")]
+        self.vehicle += [entry(1.2, "state:taking_off"), entry(2.0, "state:flying")]
+
+    def unasked(self, *more: Entry, during: Fault | None = None) -> list[str]:
+        by_time = sorted([*self.vehicle, *more], key=lambda line: line.at_ns)
+        return judge(self.pilot, by_time, [during] if during else []).unasked
+
+
+LANDED = (entry(3.0, "other:land"), entry(3.1, "state:landing"), entry(5.0, "state:landed"))
+AGAIN = entry(5.1, "state:taking_off")
+
+
+def test_a_takeoff_that_was_asked_for_is_somebody_s() -> None:
+    assert TakeOff().unasked() == []
+    assert TakeOff(entry(9.0, "ask_takeoff")).unasked(*LANDED, entry(9.1, "armed"), entry(9.2, "state:flying")) == []
+
+
+def test_one_that_nobody_asked_for_is_told_with_what_led_to_it() -> None:
+    flight = TakeOff()
+    flight.pilot = []
+    assert all("no take-off was ever asked for" in text for text in flight.unasked())
+    (found,) = TakeOff().unasked(*LANDED, AGAIN, during=fault("landed_in_its_takeoff", 0.5, 6.0))
+    assert "left ground" in found
+    assert "asked for 4.100 s before" in found
+    assert "ended by other:land 2.100 s before" in found
+    assert "landed_in_its_takeoff began 4.600 s before" in found
+
+
+@pytest.mark.parametrize(
+    "ended",
+    [
+        (entry(3.0, "disarmed"), entry(3.0, "state:emergency")),
+        (entry(3.0, "other:tip"), entry(3.1, "state:landed")),
+        (entry(3.0, "failsafe:land"), entry(5.0, "state:landed")),
+        (entry(3.0, "state:landed"),),
+    ],
+)
+def test_what_ended_a_takeoff_ended_it(ended: tuple[Entry, ...]) -> None:
+    assert len(TakeOff().unasked(*ended, entry(5.1, "armed"), entry(5.2, "state:flying"))) == 2
+
+
+def test_a_takeoff_is_not_asked_for_for_ever() -> None:
+    flight = TakeOff()
+    flight.vehicle = [entry(-1.9, "state:landed")]
+    assert flight.unasked(entry(20.0, "armed"), entry(20.1, "state:flying")) == []
+    assert len(flight.unasked(entry(40.0, "armed"), entry(40.1, "state:flying"))) == 2
+
+
+def test_to_take_a_vehicle_from_others_is_asked_for_by_a_takeoff_only() -> None:
+    assert len(TakeOff().unasked(entry(3.0, "other:land"), entry(3.5, "guided"))) == 1
+    assert TakeOff().unasked(entry(3.5, "guided")) == []
+
+
+def test_a_movement_that_no_stick_has_asked_for_is_found() -> None:
+    (found,) = TakeOff().unasked(entry(3.0, "moved", 700))
+    assert "moved at 0.70 m/s" in found
+
+
+def test_sticks_fly_nothing_after_an_emergency_stop_though_its_packet_is_lost() -> None:
+    flight = TakeOff(entry(2.5, "call", 7), entry(3.0, "ask_stop"))
+    assert flight.unasked(entry(3.1, "velocity", 7)) == []
+    assert len(flight.unasked(entry(3.5, "velocity", 7))) == 1
+
+
+@pytest.mark.parametrize(("at_s", "missed"), [(3.4, 0), (7.0, 1), (None, 1)])
+def test_an_emergency_stop_is_executed_within_its_time(at_s: float | None, missed: int) -> None:
+    flight = TakeOff(entry(3.0, "ask_stop"))
+    flight.vehicle += [] if at_s is None else [entry(at_s, "disarmed")]
+    verdict = judge(flight.pilot, flight.vehicle, [])
+    assert len(verdict.missed) == missed
+
+
+def test_a_landing_that_neither_pilot_nor_failsafe_wanted_is_needless() -> None:
+    taken_off = TakeOff()
+    taken_off.vehicle += [entry(3.0, "land")]
+    assert len(judge(taken_off.pilot, taken_off.vehicle, []).needless) == 1
+    flight = Flight(away=(5.0, 13.0))
+    flight.vehicle += [entry(5.52, "failsafe:hover"), entry(10.0, "failsafe:land"), entry(10.0, "land")]
+    assert not flight.judge(fault("pilot_stop", 5.0, 12.95)).needless
+
+
+# What lies between a vehicle and its proxy -----------------------------------------
+
+
+def test_a_stop_is_known_among_frames_that_a_stream_cuts_anywhere() -> None:
+    codec = Codec(255, 190)
+
+    def command(number: int, *arguments: float) -> bytes:
+        padded = (*arguments, *[0.0] * (7 - len(arguments)))
+        return codec.encode(dialect.MAVLink_command_long_message(1, 1, number, 0, *padded))
+
+    stop, disarm = command(400, 0.0, 21196.0), command(400, 0.0)
+    frames = [disarm, stop, command(176, 1.0, 4.0)]
+    assert [is_stop(frame) for frame in frames] == [False, True, False]
+    stream, buffer = bytes(9) + b"".join(frames), bytearray()
+    found: list[bytes] = []
+    for at in range(0, len(stream), 7):
+        buffer += stream[at : at + 7]
+        found += frames_of(buffer)
+    assert found == frames

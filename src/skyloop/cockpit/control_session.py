@@ -193,7 +193,8 @@ class ControlSession:
                 raise RefusedError(problem)
             if _decides(command):
                 self._decisions += 1
-                if command.do != self._last_command:
+                # A stop has a connection of its own: no refusal here is its own.
+                if command.do != self._last_command and not isinstance(command, Stop):
                     self._last_command, self._first = command.do, 1 + (self._pilot.intent if self._pilot else 0)
             self._handlers[type(command)](command)
         except SkyloopError as error:

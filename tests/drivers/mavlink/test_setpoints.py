@@ -643,6 +643,25 @@ def test_another_stations_landing_during_a_take_off_stays(autopilot: int) -> Non
     assert bench.heard_of(SET_POINT) == []
 
 
+@AUTOPILOTS
+@pytest.mark.parametrize("reached", [True, False])
+def test_who_lands_it_as_a_take_off_ends_keeps_it(autopilot: int, reached: bool) -> None:
+    """It stood in the mode of the landing before, and was taken from the other station within 0.3 s."""
+    bench = climbing(autopilot, stands_in=LAND[autopilot][0])
+    vehicle = bench.vehicle
+    if reached:
+        vehicle.place, vehicle.mode = (0.0, 0.0, -1.4), {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+        bench.go_on(0.02)
+        bench.commands()
+    vehicle.mode = LAND[autopilot][0]
+    bench.go_on(0.02)
+    vehicle.place = (0.0, 0.0, -1.4)
+    bench.go_on(1.2)
+    assert bench.commands() == []
+    assert bench.session.setpoints is not None
+    assert bench.session.setpoints.ownership.others == LAND[autopilot][0]
+
+
 def test_who_stops_a_px4_on_its_way_up_keeps_it() -> None:
     """By the mode for holding the place, which a take-off ends in as well, at its height."""
     bench = climbing(PX4)
@@ -691,13 +710,16 @@ def test_a_failsafe_that_hands_a_px4_to_somebody_who_has_a_remote_control_is_lef
     assert bench.apply(Land(), alone=True) == Idle()
 
 
-def climbing(autopilot: int) -> Bench:
-    """Taking off to 1.5 m, and 0.4 m high."""
+def climbing(autopilot: int, stands_in: str = "") -> Bench:
+    """Taking off to 1.5 m, and 0.4 m high. ``stands_in``: its mode when the take-off was asked for."""
     bench = Bench(Vehicle(autopilot)).found()
     vehicle = bench.vehicle
-    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    arming = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    vehicle.mode = stands_in or arming
     bench.go_on(0.3)
     bench.apply(Takeoff())
+    vehicle.mode = arming
+    bench.go_on(0.1)
     bench.answer(ARM)
     vehicle.armed, vehicle.status = True, 4
     bench.go_on(0.3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -34,6 +35,17 @@ def test_a_fresh_link_gets_a_heartbeat_a_second_and_what_is_asked_for() -> None:
     it.go_on(2.0)
     assert 90 <= len(it.of("ATTITUDE")) <= 102
     assert 9 <= len(it.of("HEARTBEAT")) <= 11
+
+
+def test_a_crash_is_told_as_far_as_the_message_has_room() -> None:
+    """The autopilot fell silent for a moment when it hit the ground at more than 32 g."""
+    it = rig()
+    it.go_on(0.1)
+    believed = replace(it.autopilot.report.believed, acceleration_m_s2=(-20.0, 0.0, 900.0))
+    it.autopilot.report = replace(it.autopilot.report, believed=believed)
+    assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_RAW_IMU) == 0
+    (heard,) = it.of("RAW_IMU")
+    assert (heard.xacc, heard.zacc) == (-2039, -32768)
 
 
 def test_accepted_is_not_flowing_before_it_knows_where_it_is() -> None:

@@ -321,6 +321,8 @@ class TakeoffSequence:
             result = commands.result(m.MAV_CMD_NAV_TAKEOFF, self._begun_ns)
             refused = f": the take-off was {result_name(result)}" if result not in (None, ACCEPTED) else ""
             self.given_up = f"it does not leave the ground{refused}"
+        elif self._other_ns is not None:
+            pass  # nor is it done in a mode of others, however high it swings
         elif not cut_short and self._autopilot.has_taken_off(vehicle, self._height_m, self.rose and self._seen):
             self.done = True
         elif self._position_ns is not None and now_ns - self._position_ns > STALLED_NS:

@@ -106,12 +106,16 @@ class FlightOwnership:
 
     # What the vehicle reports ------------------------------------------------------------------------------------
 
+    def on_mode(self, mode: str) -> None:
+        """Note that it left the mode in which it was found at the last decision: back there it is by somebody else."""
+        if mode != self._from:
+            self._from = ""
+
     def observe(self, vehicle: VehicleState, now_ns: int) -> bool:
         """Return whether a vehicle that was flown from here is in a foreign mode: nothing is sent to it then."""
         if not self._steering or not self.is_foreign(vehicle):
             self._foreign_ns = None
-            if vehicle.mode != self._from:
-                self._from = ""
+            self.on_mode(vehicle.mode)
             return False
         if self._foreign_ns is None:
             self._foreign_ns = now_ns

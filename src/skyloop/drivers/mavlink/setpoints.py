@@ -379,6 +379,7 @@ class SetpointController:
     def _step_takeoff(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
         takeoff = self._takeoff
         assert takeoff is not None
+        self.ownership.on_mode(vehicle.mode)
         messages = takeoff.step(vehicle, self._commands, now_ns)
         if takeoff.done:
             self._follow(PositionHold(now_ns))

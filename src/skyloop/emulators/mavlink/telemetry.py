@@ -155,9 +155,14 @@ def _imu(a: AutopilotState) -> Message:
     return m.MAVLink_highres_imu_message(a.boot_ms * 1000, *force, *rates, 0.2, 0.0, 0.4, 955.0, 0.0, 488.0, 20.0, 63)
 
 
+def _in_16_bits(value: float) -> int:
+    """Return it as a sensor does, whose range ends."""
+    return max(-0x8000, min(0x7FFF, round(value)))
+
+
 def _raw_imu(a: AutopilotState) -> Message:
-    force = (round(each / GRAVITY_M_S2 * 1000) for each in flip(*a.report.believed.acceleration_m_s2))
-    rates = (round(each * 1000) for each in flip(*a.report.believed.angular_velocity_rad_s))
+    force = (_in_16_bits(each / GRAVITY_M_S2 * 1000) for each in flip(*a.report.believed.acceleration_m_s2))
+    rates = (_in_16_bits(each * 1000) for each in flip(*a.report.believed.angular_velocity_rad_s))
     return m.MAVLink_raw_imu_message(a.boot_ms * 1000, *force, *rates, 200, 0, 400)
 
 

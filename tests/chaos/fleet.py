@@ -1,0 +1,42 @@
+"""``skyloop host`` with one MAVLink vehicle: ``python -m tests.chaos.fleet NAME FOLDER ADDRESS``.
+
+The failsafes of its proxy are journalled.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from skyloop.drivers.base import Sink
+from skyloop.drivers.mavlink.driver import MavlinkDriver
+from skyloop.host.fleet import Defaults, Fleet, VehicleSettings
+from skyloop.host.serve import serve
+from skyloop.messages import Hover, Land
+from tests.chaos.journal import Journal
+
+
+def main() -> None:
+    """Serve until killed."""
+    name, folder, address = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
+    journal = Journal(folder / f"{name}.vehicle")
+    opening, acting = MavlinkDriver._open, MavlinkDriver.failsafe
+
+    def open_it(driver: MavlinkDriver, sink: Sink) -> None:
+        if driver.uri.text == address:
+            journal.write("open")
+        opening(driver, sink)
+
+    def failsafe(driver: MavlinkDriver, action: Hover | Land) -> bool:
+        done = acting(driver, action)
+        if driver.uri.text == address:
+            journal.write(f"failsafe:{action.name}")  # from here on nothing older leaves
+        return done
+
+    setattr(MavlinkDriver, "_open", open_it)  # noqa: B010  (which mypy would not let be assigned)
+    setattr(MavlinkDriver, "failsafe", failsafe)  # noqa: B010
+    serve(Fleet(name, (VehicleSettings(name, address),), Defaults()))
+
+
+if __name__ == "__main__":
+    main()
