@@ -9,10 +9,9 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.cockpit import station
-from skyloop.cockpit.control_session import ControlSession
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.errors import DriverError, UnsupportedError
-from skyloop.messages import AnyAction, EmergencyStop, Event, EventKind, FlightState, Hover, Refusal, Value, Velocity
+from skyloop.messages import AnyAction, EmergencyStop, Fate, FlightState, Hover, Outcome, Refusal, Velocity
 from tests.cockpit.fake import Node, open_socket, until
 from tests.cockpit.test_control import Page, count, page
 from tests.cockpit.testclient import TestClient
@@ -58,21 +57,22 @@ def test_sticks_that_a_stop_overtakes_are_refused_and_the_stop_is_not(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A set-point under way was refused for the stop's sake, and the page was told that the stop was refused."""
-    on_event = ControlSession._on_event
+    asked: list[int] = []
 
-    def overtaken(session: ControlSession, event: Event) -> None:
-        text = "velocity refused: there was an emergency"
-        data: dict[str, Value] = {"reason": Refusal.WRONG_STATE.value}
-        on_event(session, Event(EventKind.COMMAND_REFUSED, text, 0, app=session.app, data=data))
-        on_event(session, event)
+    def overtaken(pilot: PilotConnection, first: int) -> Outcome | None:
+        asked.append(first)
+        if len(asked) > 1:
+            return None
+        return Outcome(pilot.app_id, first, Fate.REFUSED, Refusal.WRONG_STATE, "velocity refused: an emergency")
 
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("fly", forward=0.5)
         until(lambda: node.flyer.state is FlightState.FLYING)
-        monkeypatch.setattr(ControlSession, "_on_event", overtaken)
         pilot.say("stop", n=70)
         pilot.wait("done", do="stop")
+        monkeypatch.setattr(PilotConnection, "refusal", overtaken)
+        pilot.wait("refused")
         assert {told["do"] for told in pilot.told if told["type"] == "refused"} == {"fly"}
 
 
