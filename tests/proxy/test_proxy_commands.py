@@ -224,6 +224,24 @@ def test_a_pilots_hover_and_landing_go_to_a_vehicle_that_is_not_heard(
     assert bench.driver.told == [Hover()], "what was asked for in between is not done later"
 
 
+@pytest.mark.parametrize("state", [FlightState.LANDING, FlightState.LANDED])
+def test_a_landing_goes_to_a_vehicle_that_is_not_heard_whatever_it_showed_before(
+    bench: Bench, state: FlightState
+) -> None:
+    """It was held back: "it lands already", although a hover that it may have heard had broken that off."""
+    pilot = bench.airborne()
+    bench.driver.answers = False
+    bench.driver.report(state=state)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.tick()
+    pilot.command(Hover())
+    bench.driver.told.clear()
+    pilot.command(Land(), automatic=True)
+    assert bench.driver.told == []
+    pilot.command(Land())
+    assert bench.driver.told == [Land()]
+
+
 def test_a_hover_in_software_is_refused_while_the_vehicle_is_not_heard() -> None:
     with Bench({"velocity"}) as bench:
         bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)
