@@ -708,6 +708,7 @@ class CommandHandler:
             battery=feedback.battery if feedback is not None else None,
             ours=self.flight.ours,
             return_problem=self._back.why_not(now_ns),
+            shown=self._vehicle.link_up or Land not in self._executor.native,
         )
         effects = self.ladder.update(now_ns, inputs)
         if effects:
