@@ -192,6 +192,22 @@ def test_a_driver_that_raises_is_told_and_the_flight_goes_on(bench: Bench) -> No
     assert bench.driver.told == [Velocity(0.5), EmergencyStop()]
 
 
+def test_a_landing_that_failed_once_is_not_told_to_be_refused_while_the_vehicle_lands(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.fail = {"apply"}
+    pilot.command(Land())
+    bench.tick()
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.over, outcome.reason) == (False, Refusal.DRIVER_FAILED)
+    bench.driver.report(state=FlightState.LANDING)
+    pilot.command(Land(), repeat=True)
+    bench.driver.report(state=FlightState.LANDING)
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.over, outcome.reason, outcome.text) == (False, None, "")
+
+
 @pytest.mark.parametrize("state", [FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN])
 @pytest.mark.parametrize("action", [Hover(), Land()])
 def test_a_pilots_hover_and_landing_go_to_a_vehicle_that_is_not_heard(

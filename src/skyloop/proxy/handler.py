@@ -383,12 +383,13 @@ class CommandHandler:
                 why = vehicle.driver_refused("apply", error)
                 self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.DRIVER_FAILED, why, now_ns), now_ns
-            intent.begun, intent.reason, intent.text = True, None, ""
+            intent.begun = True
             if decision.takes_off:
                 flight.claim(now_ns)
                 self._rising_until_ns = intent.asked_ns + TAKEOFF_NS
             if not flight.ours or kind is Takeoff:
                 self._take_vehicle(session, applied, new)
+        intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
             checks.back = None
         # Before feedback tells of this intent: beside it, "arrived" would be of the return before this one.
