@@ -258,6 +258,20 @@ def test_a_landing_goes_to_a_vehicle_that_is_not_heard_whatever_it_showed_before
     assert bench.driver.told == [Land()]
 
 
+def test_a_landing_that_nobody_carries_out_does_not_keep_the_failsafes_hover_back(bench: Bench) -> None:
+    """``land()`` waits and asks by itself: that is refused, and the hover that had failed was not tried again."""
+    pilot = bench.airborne()
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.fail = {"apply"}
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.tick()
+    pilot.command(Land(), automatic=True)
+    bench.driver.fail = set()
+    bench.run(1.0, lambda: pilot.command(Land(), repeat=True, automatic=True))
+    assert set(bench.driver.told) == {Hover()}
+
+
 def test_a_hover_in_software_is_refused_while_the_vehicle_is_not_heard() -> None:
     with Bench({"velocity"}) as bench:
         bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)

@@ -648,7 +648,7 @@ class CommandHandler:
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
-            lands = self._lands  # wherever it is
+            lands = self._landing is not None  # wherever it is
             event = position_jumped_event(airspace.jumped_m, lands=lands)
             self._events.publish_repeated((0, "jumped"), lambda: event)
             if not lands:
@@ -656,11 +656,11 @@ class CommandHandler:
         airspace.jumped_m = 0.0
 
     @property
-    def _lands(self) -> bool:
-        """Whether its pilot's landing, where the vehicle is, is under way."""
+    def _landing(self) -> Intent | None:
+        """Its pilot's landing, where the vehicle is, that is under way."""
         holder = self.authority.holder
         session = self._sessions.get(holder.app_id) if holder is not None else None
-        return session is not None and session.intents.lands
+        return session.intents.newest if session is not None and session.intents.lands else None
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""
@@ -698,7 +698,8 @@ class CommandHandler:
         feedback = self._vehicle.feedback_now
         state = self._executor.state
         airborne = self.flight.flies(state)
-        if airborne and not self._vehicle.link_up and self._lands:
+        landing = None if self._vehicle.link_up else self._landing
+        if airborne and landing is not None and landing.begun:
             state = FlightState.LANDING  # as far as anybody can tell: no hover takes its pilot's landing back
         inputs = FailsafeInputs(
             state=state,
