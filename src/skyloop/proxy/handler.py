@@ -141,6 +141,7 @@ class CommandHandler:
         self._subscribers = server.subscribers
         self._sessions = sessions
         self._clock = clock
+        self._left = False  # the proxy ends: nothing flies by a decision of it any more
         self._pilot = "none"  # why nobody holds the authority, or "held"
         self._breaks_seen = 0  # of the vehicle's link, when last looked at
         self._slept = slept
@@ -255,6 +256,8 @@ class CommandHandler:
     def tick(self, now_ns: int) -> None:
         """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace."""
         with self._lock:
+            if self._left:
+                return
             self._observe_sleep(now_ns)
             self._observe_link(now_ns)
             self._observe_position(now_ns)
@@ -300,6 +303,7 @@ class CommandHandler:
             lands = executor.state is FlightState.LANDING and (Land in executor.native or not withdrew)
             if self.flight.ours and executor.airborne and not lands:
                 executor.leave(now_ns)
+            self._left = True
 
     @property
     def airborne(self) -> bool:
@@ -694,6 +698,8 @@ class CommandHandler:
     # Failsafe ----------------------------------------------------------------------------------------------------
 
     def _update_failsafe(self, now_ns: int) -> None:
+        if self._left:
+            return
         self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
         state = self._executor.state
