@@ -168,6 +168,29 @@ def test_esc_held_just_past_its_first_repeat_is_one_press_once_the_keyboard_is_k
     assert fingers.press("esc", after_s=0.3) + fingers.wait(0.2) == ["stop"], "a second press at another time"
 
 
+@pytest.mark.parametrize("delay_s", [0.25, 0.5])
+def test_esc_pressed_again_and_again_at_the_keyboards_own_pace_stops_the_motors(delay_s: float) -> None:
+    """Each second press was taken for a repeat of the first, however often Esc was pressed."""
+    fingers = Fingers()
+    fingers.press("w")
+    fingers.wait(delay_s - 0.05)
+    for _ in range(5):
+        fingers.press("w")
+    fingers.wait(3.0)
+    wanted: list[Order | Deflection] = []
+    for _ in range(3):
+        wanted += fingers.press("esc") + fingers.wait(delay_s - 0.05)
+    assert wanted == ["hover", "held", "stop"]
+
+
+def test_repeats_that_were_held_up_behind_the_first_one_stop_no_motors() -> None:
+    fingers = Fingers()
+    fingers.hold("w", 0.3)
+    fingers.wait(3.0)
+    assert fingers.press("esc") + fingers.wait(0.5) + fingers.press("esc", after_s=0.02) == ["hover", "held"]
+    assert "stop" not in fingers.press(*["esc"] * 9, after_s=0.4) + fingers.wait(0.5)
+
+
 @pytest.mark.parametrize("between", ["w", "alt", "h", "up", "x"])
 def test_esc_with_another_key_between_is_no_second_press(between: str) -> None:
     fingers = Fingers()

@@ -285,6 +285,17 @@ def test_each_drone_of_a_recording_gives_its_own_samples(tmp_path: Path) -> None
         assert driver.capabilities() == seen["alpha"][0], "the first one, if none is named"
 
 
+def test_a_path_that_looks_like_a_secret_is_opened_and_not_shown(flight: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "key=front"
+    folder.mkdir()
+    path = folder / "flight.mcap"
+    path.write_bytes(flight.read_bytes())
+    driver = driver_of(path)
+    assert driver.options.path == path
+    assert driver.capabilities().vehicle == "replay"
+    assert "front" not in str(driver.uri)
+
+
 def test_capabilities(flight: Path, tmp_path: Path) -> None:
     found = driver_of(flight).capabilities()
     assert found.vehicle == "replay"

@@ -192,6 +192,22 @@ def test_a_driver_that_raises_is_told_and_the_flight_goes_on(bench: Bench) -> No
     assert bench.driver.told == [Velocity(0.5), EmergencyStop()]
 
 
+def test_a_landing_that_failed_once_is_not_told_to_be_refused_while_the_vehicle_lands(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.fail = {"apply"}
+    pilot.command(Land())
+    bench.tick()
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.over, outcome.reason) == (False, Refusal.DRIVER_FAILED)
+    bench.driver.report(state=FlightState.LANDING)
+    pilot.command(Land(), repeat=True)
+    bench.driver.report(state=FlightState.LANDING)
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.over, outcome.reason, outcome.text) == (False, None, "")
+
+
 @pytest.mark.parametrize("state", [FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN])
 @pytest.mark.parametrize("action", [Hover(), Land()])
 def test_a_pilots_hover_and_landing_go_to_a_vehicle_that_is_not_heard(
@@ -222,6 +238,38 @@ def test_a_pilots_hover_and_landing_go_to_a_vehicle_that_is_not_heard(
     bench.driver.told.clear()
     pilot.command(action, repeat=True)
     assert bench.driver.told == [Hover()], "what was asked for in between is not done later"
+
+
+@pytest.mark.parametrize("state", [FlightState.LANDING, FlightState.LANDED])
+def test_a_landing_goes_to_a_vehicle_that_is_not_heard_whatever_it_showed_before(
+    bench: Bench, state: FlightState
+) -> None:
+    """It was held back: "it lands already", although a hover that it may have heard had broken that off."""
+    pilot = bench.airborne()
+    bench.driver.answers = False
+    bench.driver.report(state=state)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.tick()
+    pilot.command(Hover())
+    bench.driver.told.clear()
+    pilot.command(Land(), automatic=True)
+    assert bench.driver.told == []
+    pilot.command(Land())
+    assert bench.driver.told == [Land()]
+
+
+def test_a_landing_that_nobody_carries_out_does_not_keep_the_failsafes_hover_back(bench: Bench) -> None:
+    """``land()`` waits and asks by itself: that is refused, and the hover that had failed was not tried again."""
+    pilot = bench.airborne()
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.fail = {"apply"}
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.tick()
+    pilot.command(Land(), automatic=True)
+    bench.driver.fail = set()
+    bench.run(1.0, lambda: pilot.command(Land(), repeat=True, automatic=True))
+    assert set(bench.driver.told) == {Hover()}
 
 
 def test_a_hover_in_software_is_refused_while_the_vehicle_is_not_heard() -> None:

@@ -19,6 +19,7 @@ from skyloop.messages import (
     Parameter,
     ParameterType,
     Refusal,
+    ReleaseAuthority,
     SetParameter,
     Takeoff,
     Velocity,
@@ -241,3 +242,16 @@ def assert_set(event: threading.Event) -> None:
 
 def refused(app: App) -> list[object]:
     return [event.data["reason"] for event in app.events if event.kind is EventKind.COMMAND_REFUSED]
+
+
+def test_what_was_left_hovering_is_not_landed_by_who_leaves_then_nor_by_a_late_tick(bench: Bench) -> None:
+    """A tick that waited meanwhile, and an application that goes as it hears of the end, made the ladder land it."""
+    pilot = bench.airborne()
+    bench.proxy.handler.leave_hovering(bench.clock())
+    assert bench.driver.told[-1] == Hover()
+    bench.driver.told.clear()
+    pilot.ask(ReleaseAuthority())
+    bench.run(1.0)
+    assert bench.driver.told == []
+    pilot.command(EmergencyStop())
+    assert bench.driver.told == [EmergencyStop()]

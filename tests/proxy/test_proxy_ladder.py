@@ -76,6 +76,27 @@ def test_a_landing_that_does_not_show_yet_goes_on_without_its_pilot(bench: Bench
     assert bench.driver.told == [], "it is over"
 
 
+def test_the_ladder_goes_on_to_ask_for_its_landing_while_the_vehicle_is_not_heard(bench: Bench) -> None:
+    """A driver keeps a landing for 3 s. Where it had shown before the link was lost, nobody asked again."""
+    bench.airborne()
+    bench.run(5.1)
+    assert bench.driver.told[-1] == Land()
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.LANDING)
+    bench.driver.told.clear()
+    bench.run(1.0)
+    assert bench.driver.told == [], "it shows"
+    bench.driver.link(LinkState.LOST)
+    bench.run(4.0)
+    assert bench.driver.told == [Land()] * len(bench.driver.told)
+    assert len(bench.driver.told) > 10
+    bench.driver.link(LinkState.UP)
+    bench.driver.told.clear()
+    bench.driver.report(state=FlightState.LANDING)
+    bench.run(1.0)
+    assert bench.driver.told == []
+
+
 def test_the_next_pilot_takes_such_a_landing_over(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.answers = False

@@ -108,6 +108,7 @@ class Hands:
         self._escaped_s = -math.inf  # the last press of Esc, with no other key since
         self._second: tuple[float, float] | None = None  # a second one: when, and how long after the first
         self._repeats = False  # Esc is held
+        self._doubtful = False  # nothing but the time of the newest press says so
         self._delay_s = math.inf  # the keyboard's, before it repeats a key that is held; not known yet
         self._newest = "", -math.inf, math.inf  # the last key, when, and how long after the same one before it
 
@@ -176,16 +177,20 @@ class Hands:
         if now_s - self._stopped_s < STOPPING_S:
             return self._stop(now_s)  # once more, and no hover in its place
         gap_s, self._escaped_s = now_s - self._escaped_s, now_s
+        doubtful, self._doubtful = self._doubtful, False
         if self._second is not None or (self._repeats and gap_s < REPEAT_S):
             first, self._second, self._repeats = not self._repeats, None, True
             return "held" if first else None
-        if gap_s > TWICE_S or self._repeats:
+        if gap_s > TWICE_S or (self._repeats and not doubtful):
             self._repeats = False
             return "hover"
+        if doubtful:  # whichever of them was a repeat, it was pressed twice by now, unless more of them come at once
+            self._repeats, self._second = False, (now_s, math.inf)
+            return None
         if REPEAT_S <= gap_s < DELAY_S:
             return self._stop(now_s)
         if abs(gap_s - self._delay_s) < SAME_S:
-            self._repeats = True
+            self._repeats = self._doubtful = True
             return "held"
         self._second = now_s, gap_s
         return None

@@ -63,7 +63,7 @@ def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None
 def _calibration(uri: VehicleUri) -> Calibration:
     for option in sorted(INTRINSICS_OPTIONS & uri.options.keys() - {"calibration"}):
         raise UsageError(f"{uri}: option {option} does not go with calibration, which has it already")
-    return load_calibration(uri.options["calibration"])
+    return load_calibration(uri.reveal("calibration") or "")
 
 
 def _distortion(uri: VehicleUri) -> tuple[float, ...]:

@@ -141,6 +141,7 @@ class CommandHandler:
         self._subscribers = server.subscribers
         self._sessions = sessions
         self._clock = clock
+        self._left = False  # the proxy ends: nothing flies by a decision of it any more
         self._pilot = "none"  # why nobody holds the authority, or "held"
         self._breaks_seen = 0  # of the vehicle's link, when last looked at
         self._slept = slept
@@ -255,6 +256,8 @@ class CommandHandler:
     def tick(self, now_ns: int) -> None:
         """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace."""
         with self._lock:
+            if self._left:
+                return
             self._observe_sleep(now_ns)
             self._observe_link(now_ns)
             self._observe_position(now_ns)
@@ -300,6 +303,7 @@ class CommandHandler:
             lands = executor.state is FlightState.LANDING and (Land in executor.native or not withdrew)
             if self.flight.ours and executor.airborne and not lands:
                 executor.leave(now_ns)
+            self._left = True
 
     @property
     def airborne(self) -> bool:
@@ -383,12 +387,13 @@ class CommandHandler:
                 why = vehicle.driver_refused("apply", error)
                 self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.DRIVER_FAILED, why, now_ns), now_ns
-            intent.begun, intent.reason, intent.text = True, None, ""
+            intent.begun = True
             if decision.takes_off:
                 flight.claim(now_ns)
                 self._rising_until_ns = intent.asked_ns + TAKEOFF_NS
             if not flight.ours or kind is Takeoff:
                 self._take_vehicle(session, applied, new)
+        intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
             checks.back = None
         # Before feedback tells of this intent: beside it, "arrived" would be of the return before this one.
@@ -647,7 +652,7 @@ class CommandHandler:
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
-            lands = self._lands  # wherever it is
+            lands = self._landing is not None  # wherever it is
             event = position_jumped_event(airspace.jumped_m, lands=lands)
             self._events.publish_repeated((0, "jumped"), lambda: event)
             if not lands:
@@ -655,11 +660,11 @@ class CommandHandler:
         airspace.jumped_m = 0.0
 
     @property
-    def _lands(self) -> bool:
-        """Whether its pilot's landing, where the vehicle is, is under way."""
+    def _landing(self) -> Intent | None:
+        """Its pilot's landing, where the vehicle is, that is under way."""
         holder = self.authority.holder
         session = self._sessions.get(holder.app_id) if holder is not None else None
-        return session is not None and session.intents.lands
+        return session.intents.newest if session is not None and session.intents.lands else None
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""
@@ -693,11 +698,14 @@ class CommandHandler:
     # Failsafe ----------------------------------------------------------------------------------------------------
 
     def _update_failsafe(self, now_ns: int) -> None:
+        if self._left:
+            return
         self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
         state = self._executor.state
         airborne = self.flight.flies(state)
-        if airborne and not self._vehicle.link_up and self._lands:
+        landing = None if self._vehicle.link_up else self._landing
+        if airborne and landing is not None and landing.begun:
             state = FlightState.LANDING  # as far as anybody can tell: no hover takes its pilot's landing back
         inputs = FailsafeInputs(
             state=state,
@@ -708,6 +716,7 @@ class CommandHandler:
             battery=feedback.battery if feedback is not None else None,
             ours=self.flight.ours,
             return_problem=self._back.why_not(now_ns),
+            shown=self._vehicle.link_up or Land not in self._executor.native,
         )
         effects = self.ladder.update(now_ns, inputs)
         if effects:

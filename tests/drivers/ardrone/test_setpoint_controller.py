@@ -157,6 +157,23 @@ def test_a_landing_of_ours_can_be_broken_off() -> None:
     assert cockpit.ref() == Ref.TAKEOFF
 
 
+def test_a_landing_that_was_given_up_and_shows_all_the_same_is_not_broken_off() -> None:
+    """The drone was told to take off again as soon as it was heard."""
+    cockpit = at(AIR)
+    cockpit.take(Land())
+    cockpit.hears(LANDING)
+    cockpit.setpoints.lost()
+    assert cockpit.setpoints.forget_landing()
+    assert not cockpit.setpoints.forget_landing()
+    for condition in (None, LANDING, AIR):
+        if condition is not None:
+            cockpit.hears(condition)
+        assert cockpit.ref() is None, "it may be somebody else's flight by now"
+    cockpit.hears(LANDING)
+    cockpit.take(Hover())
+    assert cockpit.ref() == Ref.TAKEOFF, "a pilot breaks it off"
+
+
 def test_set_points_are_said_until_the_next_decision() -> None:
     cockpit = at(AIR)
     assert cockpit.take(Attitude(pitch=0.1, climb=9.0)) == Attitude(pitch=0.1, climb=0.7)

@@ -222,7 +222,7 @@ class SetpointController:
         """Land no longer; return whether it was to."""
         if not self._landing_is_ours or self._decision is not Decision.LAND:
             return False
-        self._decision = Decision.STAY
+        self._decision, self._steering = Decision.STAY, False
         return True
 
     def _release_motors(self, now_ns: int) -> None:

@@ -62,7 +62,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
         reject_unknown_options(uri, KNOWN)
     if uri.place:
         raise UsageError(f"{uri}: a simulated drone has no place; did you mean sim://?world={uri.place}")
-    options = uri.options
+    options, world = uri.options, uri.reveal("world")
     quality = options.get("quality", "smooth")
     if quality not in QUALITIES:
         raise UnknownNameError("quality of pictures", quality, QUALITIES)
@@ -79,7 +79,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
         raise UsageError(f"{uri}: Betaflight's clock is the computer's: speed is 1 with it, not {speed:g}")
     noise = uri.number("noise", 1.0, minimum=0.0, maximum=20.0)
     return SimOptions(
-        world=options.get("world", "room"),
+        world="room" if world is None else world,
         seed=uri.whole("seed", 0),
         speed=speed,
         cameras=tuple(_camera(uri, model, noise) for model in _models(options.get("cameras", "front,bottom"))),
@@ -96,7 +96,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
         most_lag_s=REAL_TIME_LAG_S if autopilot is AutopilotKind.BETAFLIGHT else MOST_LAG_S,
         parameters=VEHICLES[vehicle],
         autopilot=None if autopilot is None else autopilot.value,
-        autopilot_folder=options.get("autopilot_folder"),
+        autopilot_folder=uri.reveal("autopilot_folder"),
     )
 
 

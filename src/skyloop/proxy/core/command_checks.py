@@ -168,6 +168,8 @@ class CommandChecks:
             self.back = None
         if automatic and (state is FlightState.LANDING or self._ladder.step is Failsafe.LAND):
             policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
+        elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
+            policy = StatePolicy.APPLY  # that it lands, or stands, was before: it may have heard something else since
         problem = self._problem(action, policy, state, link, new=new, automatic=automatic)
         if problem is not None:
             return Decision(None, *problem)

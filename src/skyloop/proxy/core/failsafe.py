@@ -69,6 +69,7 @@ class FailsafeInputs:
     battery: float | None
     ours: bool = True  #: the flight was begun, or taken, by an application of this proxy
     return_problem: str = ""  #: why it can't return to its start, for a person; empty if it can, or need not
+    shown: bool = True  #: its state is what it shows now; else what a vehicle showed last that is not heard
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +166,8 @@ class FailsafeLadder:
             effects += self._begin(StepChange(Failsafe.LAND, self.barred), now_ns)
         elif self.returning and inputs.return_problem:
             effects += self._begin(StepChange(Failsafe.LAND, self.reason, why=inputs.return_problem), now_ns)
-        return effects + self._try(now_ns, inputs.state)
+        unheard = isinstance(self._wanted, Land) and not inputs.shown  # a driver keeps a landing while it is asked for
+        return effects + self._try(now_ns, FlightState.UNKNOWN if unheard else inputs.state)
 
     def fresh_command(self) -> list[Effect]:
         """The pilot sent a fresh command: end the step, unless the vehicle lands for a reason that stays."""
