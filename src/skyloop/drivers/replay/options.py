@@ -41,7 +41,7 @@ def options_of(uri: VehicleUri) -> ReplayOptions:
         raise UsageError(f"{uri} names no file: it looks like replay:///home/me/flight.mcap?speed=2")
     stepped = uri.options.get("speed") == MAX
     options = ReplayOptions(
-        path=expand(uri.place),
+        path=expand(uri.reveal_place()),
         drone=uri.options.get("drone"),
         speed=1.0 if stepped else uri.number("speed", 1.0, minimum=SPEEDS[0], maximum=SPEEDS[1]),
         stepped=stepped,
