@@ -4,7 +4,7 @@ import { get, errorText } from "./api.js";
 import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
 import { t } from "./language/index.js";
 import type { Parameter, Value } from "./model.js";
-import { parse, rangeText, valueText } from "./values.js";
+import { parse, Presses, rangeText, valueText } from "./values.js";
 
 /** Only some of them: what is said where there are none, and the name of the list. */
 export interface Choice {
@@ -21,6 +21,7 @@ interface Row {
   editor: Editor;
   button: HTMLButtonElement;
   answer: HTMLElement;
+  presses: Presses;
 }
 
 export class Parameters {
@@ -98,7 +99,7 @@ export class Parameters {
       parameter.description ? h("p", { class: "description" }, parameter.description) : null,
       answer,
     );
-    const row = { parameter, element, editor, button, answer };
+    const row = { parameter, element, editor, button, answer, presses: new Presses() };
     element.addEventListener("submit", (event) => {
       event.preventDefault();
       this.submit(row);
@@ -109,6 +110,7 @@ export class Parameters {
   }
 
   private submit(row: Row): void {
+    if (row.parameter.momentary && !row.presses.isNew(performance.now())) return; // as a second flip would follow the first
     const parsed = parse(row.parameter, row.editor.value);
     row.editor.removeAttribute("aria-invalid");
     if ("problem" in parsed) {

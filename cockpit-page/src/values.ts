@@ -26,6 +26,20 @@ export function parse(parameter: Pick<Parameter, "type">, text: string): { value
   return { value };
 }
 
+/** Presses that come sooner after the one before are one press: a finger that taps twice, or a key that is held [ms]. */
+export const ONE_PRESS_MS = 700;
+
+/** Tells the presses of a button that does something once each time. */
+export class Presses {
+  private newest_ms = Number.NEGATIVE_INFINITY;
+
+  isNew(now_ms: number): boolean {
+    const since_ms = now_ms - this.newest_ms;
+    this.newest_ms = now_ms;
+    return since_ms >= ONE_PRESS_MS;
+  }
+}
+
 export function rangeText(parameter: Pick<Parameter, "minimum" | "maximum" | "choices">): string {
   if (parameter.choices.length) return parameter.choices.map(valueText).join(" | ");
   const { minimum, maximum } = parameter;

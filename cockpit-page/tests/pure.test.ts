@@ -16,7 +16,7 @@ import { lacking } from "../src/recordings.js";
 import { isRecording, outcome } from "../src/safety.js";
 import { CENTRED, DEAD_BAND, deadBand, Hands, isCentred, Latch, merge, PACES, type Pace, ramp, RAMP_S, scale } from "../src/sticks.js";
 import { lineText } from "../src/strip.js";
-import { parse, rangeText } from "../src/values.js";
+import { ONE_PRESS_MS, parse, Presses, rangeText } from "../src/values.js";
 import { othersOf } from "../src/world.js";
 import { around, gridStep, toMetres, toPixels, zoomed } from "../src/view.js";
 import { arrow, nearest } from "../src/maptool.js";
@@ -24,6 +24,13 @@ import { leg } from "../src/waypoint.js";
 
 const near = (value: number, wanted: number): void => assert.ok(Math.abs(value - wanted) < 1e-9, `${value} is not ${wanted}`);
 const push = (sticks: Partial<Sticks>): Sticks => ({ ...CENTRED, ...sticks });
+
+test("a double tap, or a key that is held, does something once", () => {
+  const presses = new Presses();
+  assert.equal(presses.isNew(0), true);
+  for (let at_ms = 200; at_ms < 5 * ONE_PRESS_MS; at_ms += 200) assert.equal(presses.isNew(at_ms), false);
+  assert.equal(presses.isNew(10 * ONE_PRESS_MS), true);
+});
 
 test("dead band: nothing within, no step at its edge, all at the end", () => {
   for (const value of [0, 0.05, DEAD_BAND, -DEAD_BAND, Number.NaN]) assert.equal(Math.abs(deadBand(value)), 0);

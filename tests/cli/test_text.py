@@ -34,3 +34,8 @@ def test_who_wants_no_colour_gets_none(monkeypatch: pytest.MonkeyPatch, variable
 
 def test_a_pipe_gets_plain_text() -> None:
     assert coloured("skyloop: no file", io.StringIO()) == "skyloop: no file"
+
+
+def test_without_standard_error_nothing_is_coloured_and_nothing_fails() -> None:
+    """A flight's reports go through here: one that failed would end it."""
+    assert coloured("skyloop: no file", None) == "skyloop: no file"

@@ -355,6 +355,20 @@ def test_what_takes_the_place_of_a_flight_and_is_refused_leaves_it_hovering(
             until(lambda: node.flyer.state is FlightState.HOVERING)
 
 
+def test_a_way_stays_watched_after_a_command_that_took_nobodys_place(client: TestClient, node: Node) -> None:
+    """What the proxy refused of the way there was taken for older than the newest command, which had flown nothing."""
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("goto", x=50, y=0, z=1)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+        with pilot.staying():
+            pilot.say("route_skip")
+            assert "no route" in pilot.wait("refused", do="route_skip")["why"]
+            pilot.say("set", name="safety.box.x_high", value=20.0)
+            assert "outside of the safety box" in pilot.wait("refused", do="goto")["why"]
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+
+
 def test_a_way_that_something_else_ended_is_told(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().take_off()

@@ -67,6 +67,16 @@ def huge(path: Path) -> Path:
     return network(path, nodes, {"shape": [1 << 31, 1]})
 
 
+def test_a_file_beside_a_network_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python looks for modules in the working directory first, of a child process that is given its program there."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [one for one in sys.path if one])
+    (tmp_path / "numpy.py").write_text("open('was_run', 'w')")
+    write_policy(Path("policy.onnx"))
+    PolicyNetwork("policy.onnx")
+    assert not (tmp_path / "was_run").exists()
+
+
 def test_a_loop_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx, "CPU_S", 4)
     with pytest.raises(FileFormatError, match=r"endless\.onnx is refused: it takes more than 4 s.*signal"):

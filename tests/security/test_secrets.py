@@ -23,6 +23,7 @@ from skyloop.cockpit.access import Person, Token
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.camera_source import source_of
 from skyloop.drivers.mavlink.options import options_of as mavlink_options
+from skyloop.drivers.replay.options import options_of as replay_options
 from skyloop.drivers.sim.options import firmware_options
 from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.drivers.video.options import options_of as video_options
@@ -190,6 +191,18 @@ def test_a_driver_that_fails_to_open_is_quoted_without_the_secrets() -> None:
 def test_keys_and_tokens_do_not_show_themselves() -> None:
     token = Token(Person(Role.PILOT, "ann"), SECRET.encode())
     assert SECRET not in f"{token!r} {Key(3, SECRET.encode())!r}"
+
+
+@pytest.mark.parametrize("path", ["/data/key=7/flight.mcap", "C:/Users/me@home/flight.mcap"])
+def test_a_recording_is_found_in_a_folder_that_looks_like_a_secret(path: str) -> None:
+    assert str(replay_options(parse_uri(f"replay://{path}")).path) == path
+
+
+def test_a_short_secret_hides_nothing_but_itself() -> None:
+    """Each of its letters was hidden in all that was told of the vehicle, and could be read from that."""
+    uri = parse_uri("mavlink://udp:0.0.0.0:14550?signing_key=ab&camera=rtsp://u:p@h/x")
+    assert uri.scrub("up, not able to open rtsp://u:p@h/x") == "up, not able to open rtsp://h/x"
+    assert uri.scrub("key ab, password p") == "key ***, password ***"
 
 
 def test_without_secrets_nothing_is_changed() -> None:

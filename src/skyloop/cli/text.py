@@ -46,16 +46,16 @@ def _unaccented(character: str) -> str:
     return unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
 
 
-def coloured(line: str, stream: TextIO) -> str:
+def coloured(line: str, stream: TextIO | None) -> str:
     """Return a line with a coloured beginning, if it has one that matters and the stream shows colours.
 
     That is a terminal which is not dumb, where ``NO_COLOR`` is not set (https://no-color.org).
 
     Args:
         line: For people.
-        stream: Where it is written to.
+        stream: Where it is written to; None, as Python has it for one that was closed before it began: nowhere.
     """
-    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not stream.isatty():
+    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or stream is None or not stream.isatty():
         return line
     for beginning, colour in _COLOURS.items():
         if line.startswith(beginning):

@@ -125,7 +125,8 @@ class ControlSession:
         self._silence: asyncio.TimerHandle | None = None
         self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
-        self._last_command, self._first = "", 0  # what the page commanded last, and the number of its first intent
+        self._decided = ""  # what the page decided last, which may yet be refused, or wait for answers
+        self._last_command, self._first = "", 0  # what took another's place last, and the number of its first intent
         self._decisions = 0  # grows with whatever flies, or ends a flight: what waits for answers compares it
         self._hands = HandWatch()
         self._awaited: tuple[str, frozenset[FlightState], int] | None = None  # what is done in which states, from when
@@ -194,8 +195,7 @@ class ControlSession:
             if _decides(command):
                 self._decisions += 1
                 # A stop has a connection of its own: no refusal here is its own.
-                if command.do != self._last_command and not isinstance(command, Stop):
-                    self._last_command, self._first = command.do, 1 + (self._pilot.intent if self._pilot else 0)
+                self._decided = self._decided if isinstance(command, Stop) else command.do
             self._handlers[type(command)](command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
@@ -463,6 +463,8 @@ class ControlSession:
     def _end_flight(self, why: str = "something else was commanded, or the page was away") -> None:
         """End what the page flew before; a route is paused, and may be resumed."""
         self._decisions += 1
+        if self._decided != self._last_command:  # until here what flies, and its refusals, were the former's
+            self._last_command, self._first = self._decided, 1 + (self._pilot.intent if self._pilot else 0)
         self._steering = self._stood_down = False
         self._follow.interrupt(why)
         if self._route is not None:

@@ -13,6 +13,7 @@ from skyloop.address import HIDDEN, is_broken, shown_address, shown_name, withou
 from skyloop.errors import UsageError
 
 _HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
+_SHORT: Final = 4  # characters: so short a secret stands in many a word
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
 
@@ -94,7 +95,10 @@ class VehicleUri:
     def scrub(self, text: str) -> str:
         """Return a text, such as that of a library's error, with the secrets of this address hidden."""
         for given, shown in self._secrets:
-            text = text.replace(given, shown)
+            if len(given) < _SHORT:  # within words it would hide, and show, too much
+                text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(given)}(?![A-Za-z0-9])", HIDDEN, text)
+            else:
+                text = text.replace(given, shown)
         return text
 
     def number(self, option: str, default: float, *, minimum: float = -math.inf, maximum: float = math.inf) -> float:

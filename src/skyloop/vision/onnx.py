@@ -17,7 +17,11 @@ MEMORY: Final = 4 << 30  #: bytes of address space, beside four times the file's
 _WAIT_S: Final = 300.0  # on a busy computer
 _REFUSED: Final = 3  # exit code of a child that says why
 _OWN: Final = Path(__file__).with_name("weights")
-_CHILD: Final = "import sys; from skyloop.vision.onnx import run_alone; run_alone(sys.argv[1], int(sys.argv[2]))"
+#: Modules are looked up where this process does, and not in the working directory: strangers' files may lie there.
+_CHILD: Final = (
+    "import sys; sys.path[:] = sys.argv[3:]; "
+    "from skyloop.vision.onnx import run_alone; run_alone(sys.argv[1], int(sys.argv[2]))"
+)
 
 
 def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exception], ...], Any]:
@@ -59,7 +63,7 @@ def try_alone(path: Path) -> None:
     Raises:
         FileFormatError: It can't be loaded, or not within the limits.
     """
-    command = [sys.executable, "-c", _CHILD, str(path), str(CPU_S)]
+    command = [sys.executable, "-c", _CHILD, str(path), str(CPU_S), *(one for one in sys.path if isinstance(one, str))]
     limits = f"{CPU_S} s of the processor and {MEMORY >> 30} GiB of memory to load it and to run it once"
     try:
         ended = subprocess.run(
