@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -141,10 +142,10 @@ def test_a_restart_that_fails_is_told_and_tried_again(monkeypatch: pytest.Monkey
     endings: list[str] = []
     real = ChildProcess
 
-    def start(command: Sequence[str], *, keep_errors: bool) -> ChildProcess:
+    def start(command: Sequence[str], **options: Any) -> ChildProcess:
         if len(endings) == 1:
             raise OSError(errno.EMFILE, "Too many open files")
-        return real(command, keep_errors=keep_errors)
+        return real(command, **options)
 
     monkeypatch.setattr("skyloop.child_process.ChildProcess", start)
     code = "import sys; sys.stdin.read()"

@@ -76,5 +76,5 @@ def test_without_matplotlib_it_says_what_to_install(
     from skyloop.errors import MissingExtraError
 
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingExtraError, match=r"skyloop\[bench\]"):
+    with pytest.raises(MissingExtraError, match="skyloop install bench"):
         draw(made_up, tmp_path)

@@ -321,7 +321,7 @@ def test_without_pyav_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
     ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'skyloop\[video\]'"):
+    with pytest.raises(MissingExtraError, match=r"skyloop install video"):
         make_driver("video:///tmp/x.mp4")
 
 

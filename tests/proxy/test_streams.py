@@ -297,7 +297,7 @@ def test_without_pyav_a_form_is_refused_with_what_to_install(bench: Bench, monke
     monkeypatch.setattr(streams, "require_pyav", missing)
     app = watcher(bench)
     (event,) = app.told(EventKind.PACKET_MALFORMED)
-    assert "pip install" in event.text
+    assert "skyloop install video" in event.text
 
 
 def test_the_vehicles_own_pictures_come_in_pieces_if_they_are_large(bench: Bench) -> None:

@@ -84,7 +84,7 @@ def test_a_driver_that_is_not_open_commands_nothing() -> None:
 
 def test_without_rclpy_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rclpy", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'skyloop\[ros\]'"):
+    with pytest.raises(MissingExtraError, match=r"skyloop install ros"):
         Ros2Driver(parse_uri(SERVED)).open(RecordingSink())
 
 

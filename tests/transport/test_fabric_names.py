@@ -91,7 +91,7 @@ def test_of_two_with_one_name_the_older_keeps_it() -> None:
 
 def test_an_unknown_name_says_where_was_looked_and_what_is_there() -> None:
     at = place()
-    said = rf"network \({at}\) named 'alfa'; did you mean 'alpha'"
+    said = rf"named 'alfa' on the network \({at}\); did you mean 'alpha'"
     with serving("alpha", at), pytest.raises(UnknownNameError, match=said):
         dial("alfa", calling(at), find_s=0.3)(ClientLog())
     with pytest.raises(UsageError, match="cannot be the name"):

@@ -113,7 +113,7 @@ def test_times_are_finite_and_in_order(time_s: Any) -> None:
 
 def test_scipy_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
-    with pytest.raises(MissingExtraError, match=r"skyloop\[detect\]"):
+    with pytest.raises(MissingExtraError, match="skyloop install detect"):
         ObjectTracks()
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
+from skyloop.messages.feedback import WAKING_UP
 from skyloop.messages.geometry import wrap_angle
 
 if TYPE_CHECKING:
@@ -69,9 +70,13 @@ class Flight:
         """Take off and wait until the vehicle hovers or flies; without a native take-off, climb to 0.6 m.
 
         Raises:
-            AssertionError: It was not up within the suite's ``takeoff_timeout_s``.
+            AssertionError: It was not awake, or not up within the suite's ``takeoff_timeout_s``.
         """
         if "takeoff" in self.actions:
+            links = self.sink.links
+            assert self.sink.wait(lambda: not links[-1][1].startswith(WAKING_UP), self.suite.takeoff_timeout_s), links[
+                -1
+            ]
             self.driver.apply(Takeoff())
             settled = (FlightState.HOVERING, FlightState.FLYING)
             self.until(lambda f: f.state in settled, self.suite.takeoff_timeout_s, "hovering after take-off")

@@ -412,7 +412,7 @@ def test_a_door_ends_who_says_too_much_or_nothing() -> None:
 
 def test_without_the_sdk_the_error_says_what_to_install(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'skyloop\[foxglove\]'"):
+    with pytest.raises(MissingExtraError, match=r"skyloop install foxglove"):
         FoxgloveServer([fly()], port=0)
 
 
