@@ -153,6 +153,13 @@ def test_repeats_that_were_held_up_stop_no_motors() -> None:
     fingers.press("esc", after_s=0.5)
     assert fingers.press(*["esc"] * 9, after_s=0.4) + fingers.wait(0.5) == ["held"]
     assert Fingers().press(*["esc"] * 9) == ["hover", "held"]
+    known = Fingers()
+    known.hold("w", 0.3)
+    known.wait(3.0)
+    known.press("esc")
+    known.wait(0.5)
+    assert known.press("esc", after_s=0.02) == ["held"]
+    assert "stop" not in known.press(*["esc"] * 9, after_s=0.4) + known.wait(0.5)
 
 
 @pytest.mark.parametrize("key", ["w", "esc"])
@@ -189,6 +196,18 @@ def test_repeats_that_were_held_up_behind_the_first_one_stop_no_motors() -> None
     fingers.wait(3.0)
     assert fingers.press("esc") + fingers.wait(0.5) + fingers.press("esc", after_s=0.02) == ["hover", "held"]
     assert "stop" not in fingers.press(*["esc"] * 9, after_s=0.4) + fingers.wait(0.5)
+
+
+@pytest.mark.parametrize("gap_s", [0.5, 0.9])
+def test_who_goes_on_pressing_esc_stops_the_motors_whatever_the_keyboards_delay(gap_s: float) -> None:
+    """Presses in the rhythm of the keyboard's delay were each taken for its first repeat, and nothing ever stopped."""
+    fingers = Fingers()
+    fingers.hold("w", 0.3)
+    fingers.wait(3.0)
+    assert fingers.press("esc") == ["hover"]
+    fingers.wait(0.5)
+    assert fingers.press("esc", after_s=0.02) + fingers.wait(gap_s - 0.02) == ["held"]
+    assert fingers.press("esc") == ["stop"]
 
 
 @pytest.mark.parametrize("between", ["w", "alt", "h", "up", "x"])

@@ -10,7 +10,9 @@ import pytest
 
 from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.drone import open_drone
+from skyloop.cockpit import authority_report
 from skyloop.cockpit.commands import decode_command
+from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
 from skyloop.errors import DecodeError
 from skyloop.messages import Event, EventKind, FlightState
@@ -148,6 +150,25 @@ def test_who_releases_is_asked_no_more(client: TestClient, node: Node) -> None:
             pilot.say("release")
             pilot.wait("asked", questions=[])
             until(lambda: drone.authority.state == "held")
+
+
+def test_control_that_was_offered_in_vain_and_taken_later_is_lost_all_the_same(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who is pre-empted was told, as of something that went well, to have handed control over."""
+    monkeypatch.setattr(PilotConnection, "answer_takeover", lambda *_: None)
+    monkeypatch.setattr(authority_report, "GIVEN_S", 0.0)
+    with page(client) as pilot:
+        pilot.take(8)
+        with asks(node) as drone:
+            pilot.say("answer", id=question(pilot)["id"], grant=True)
+            pilot.wait("done", do="answer")
+            pilot.say("ping")
+            pilot.wait("pong")
+            drone.request_authority(priority=0, takeover="now")
+            told = pilot.wait("authority", mine=False)
+            assert "has control" in told["why"]
+            assert not told["given"]
 
 
 # Asking ----------------------------------------------------------------------------------------------------------

@@ -77,6 +77,16 @@ def test_a_file_beside_a_network_is_not_run(tmp_path: Path, monkeypatch: pytest.
     assert not (tmp_path / "was_run").exists()
 
 
+def test_who_is_allowed_less_loads_networks_all_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "policy.onnx"
+    write_policy(path)
+    program = (
+        "import resource, sys; from pathlib import Path; from skyloop.vision.onnx import try_alone;"
+        "resource.setrlimit(resource.RLIMIT_CPU, (15, 15)); try_alone(Path(sys.argv[1]))"
+    )
+    subprocess.run([sys.executable, "-c", program, str(path)], check=True, timeout=120)
+
+
 def test_a_loop_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx, "CPU_S", 4)
     with pytest.raises(FileFormatError, match=r"endless\.onnx is refused: it takes more than 4 s.*signal"):

@@ -108,7 +108,7 @@ class Hands:
         self._escaped_s = -math.inf  # the last press of Esc, with no other key since
         self._second: tuple[float, float] | None = None  # a second one: when, and how long after the first
         self._repeats = False  # Esc is held
-        self._doubtful = False  # nothing but the time of the newest press says so
+        self._doubtful = False  # the last Esc may have been a press, or the first repeat of one that was held
         self._delay_s = math.inf  # the keyboard's, before it repeats a key that is held; not known yet
         self._newest = "", -math.inf, math.inf  # the last key, when, and how long after the same one before it
 
@@ -128,7 +128,7 @@ class Hands:
             wanted.append(self._stop(now_s))
         for key in keys:
             self._learn(key, now_s, stalled=stalled)
-            order = self._escape(now_s) if key == "esc" else self._press(key, now_s, state)
+            order = self._escape(now_s, stalled=stalled) if key == "esc" else self._press(key, now_s, state)
             if order in ("hover", "land", "takeoff", "stop"):
                 self._pressed.clear()
                 self._moving = False
@@ -172,21 +172,19 @@ class Hands:
             self._pressed[axis] = (sign, now_s)
         return None
 
-    def _escape(self, now_s: float) -> Order | None:
+    def _escape(self, now_s: float, *, stalled: bool) -> Order | None:
         """Hover at the first press, and cut the motors at the second, which a key that is held does not make."""
         if now_s - self._stopped_s < STOPPING_S:
             return self._stop(now_s)  # once more, and no hover in its place
         gap_s, self._escaped_s = now_s - self._escaped_s, now_s
-        doubtful, self._doubtful = self._doubtful, False
         if self._second is not None or (self._repeats and gap_s < REPEAT_S):
-            first, self._second, self._repeats = not self._repeats, None, True
+            first, self._second, self._repeats, self._doubtful = not self._repeats, None, True, False
             return "held" if first else None
-        if gap_s > TWICE_S or (self._repeats and not doubtful):
-            self._repeats = False
+        if self._doubtful and gap_s <= TWICE_S and not stalled:
+            return self._stop(now_s)  # no repeat comes so late: pressed anew, whatever the one before was
+        if gap_s > TWICE_S or self._repeats:
+            self._repeats = self._doubtful = False
             return "hover"
-        if doubtful:  # whichever of them was a repeat, it was pressed twice by now, unless more of them come at once
-            self._repeats, self._second = False, (now_s, math.inf)
-            return None
         if REPEAT_S <= gap_s < DELAY_S:
             return self._stop(now_s)
         if abs(gap_s - self._delay_s) < SAME_S:
@@ -197,6 +195,7 @@ class Hands:
 
     def _stop(self, now_s: float) -> Order:
         self._second, self._escaped_s, self._stopped_s = None, -math.inf, now_s
+        self._doubtful = False
         self._pressed.clear()
         self._moving = False
         return "stop"

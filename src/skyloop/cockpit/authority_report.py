@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from skyloop.clock import monotonic_ns
+from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import LinkError
 from skyloop.messages import LinkState
 
@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from skyloop.cockpit.pilot_connection import PilotConnection
     from skyloop.cockpit.station import Station
     from skyloop.cockpit.takeover import QueuePosition
+
+GIVEN_S: Final = 2.0  #: control that was handed over is gone within this; later it is lost like any other
 
 Json = dict[str, Any]
 
@@ -32,7 +34,7 @@ class AuthorityReport:
         #: As the page was sent it last: state, holder, its priority, position in the queue, how control was lost.
         self._sent: tuple[str, str | None, int | None, QueuePosition | None, str | None] | None = None
         self._was_mine = False
-        self._given = False  # to who asked for it
+        self._given, self._given_ns = False, 0  # to who asked for it, and when
         self._loss: str | None = None  # how the control that this page had was lost; None: it was not
 
     def released(self) -> None:
@@ -41,7 +43,7 @@ class AuthorityReport:
 
     def handed_over(self) -> None:
         """Count the control that goes now as given to who asked for it: it is not lost."""
-        self._given = True
+        self._given, self._given_ns = True, monotonic_ns()
 
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
         """Return the message for the page; None if nothing has changed.
@@ -67,7 +69,8 @@ class AuthorityReport:
             holder, priority = self._app, pilot.authority.priority
         if mine or (self._was_mine and pilot is not None):
             self._loss = None if mine or pilot is None else _end_of_control(pilot)
-        self._given = self._given and (self._was_mine or not mine)
+        if mine != self._was_mine and (mine or monotonic_ns() - self._given_ns > nanoseconds(GIVEN_S)):
+            self._given = False  # it was given at another time, or whoever asked did not take it
         self._was_mine = mine
         why = None if self._loss is None else self._why(self._loss, holder, lost)
         if (state, holder, priority, place, why) == self._sent:
@@ -81,7 +84,7 @@ class AuthorityReport:
             "priority": priority,
             "mine": mine,
             "why": why,
-            "given": self._given and not mine,
+            "given": self._given and not mine and self._loss not in ("link", "silent"),
             "app": self._app,
             "line": line,
         }

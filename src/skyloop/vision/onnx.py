@@ -86,9 +86,11 @@ def run_alone(path: str, cpu_s: int) -> None:
     if sys.platform != "win32":
         import resource
 
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s))
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY + 4 * Path(path).stat().st_size,) * 2)
+        memory = MEMORY + 4 * Path(path).stat().st_size
+        for kind, most in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_AS, memory)):
+            _, allowed = resource.getrlimit(kind)  # who is allowed less can't ask for more
+            limit = most if allowed == resource.RLIM_INFINITY else min(most, allowed)
+            resource.setrlimit(kind, (limit, limit))
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
