@@ -21,7 +21,7 @@ class VehicleUri:
     """A parsed vehicle address that shows itself without its secrets, wherever it goes.
 
     ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles have neither users nor passwords nor keys (see
-    :mod:`skyloop.address`). Only what opens the vehicle asks for those, with :meth:`reveal_place` and :meth:`reveal`.
+    ``skyloop.address``). Only what opens the vehicle asks for those, with :meth:`reveal_place` and :meth:`reveal`.
 
     Attributes:
         scheme: The driver's name.
