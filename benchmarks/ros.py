@@ -69,7 +69,7 @@ def measure(
     """
     python = ros_python or os.environ.get("SKYLOOP_ROS_PYTHON", sys.executable)
     if subprocess.run([python, "-c", "import rclpy, skyloop"], capture_output=True, check=False).returncode:
-        raise UnsupportedError(f"{python} has no rclpy with Skyloop: pip install 'skyloop[ros]', or --ros-python")
+        raise UnsupportedError(f"{python} has no rclpy with Skyloop: skyloop install ros, or --ros-python")
     machine = Machine.here()
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         environment = _environment(Path(folder))
