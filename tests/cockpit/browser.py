@@ -77,8 +77,8 @@ class Deck:
         return shown
 
     def overview(self, **options: Any) -> DronePage:
-        """The page with all drones."""
-        page = self._new_page("", options)
+        """The page with all drones; one that is opened has the panels beside its picture."""
+        page = self._new_page(PANELS, options)
         shown = DronePage(page, "")
         page.goto(f"{self.address}#/")
         return shown

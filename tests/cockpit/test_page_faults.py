@@ -200,7 +200,7 @@ def test_the_emergency_stop_is_held_shown_as_it_counts_and_names_the_drone(deck:
     with skyloop.connect("left", name="a", on_exit="hover") as left, skyloop.connect("right", name="b") as right:
         left.takeoff()
         right.takeoff()
-        page.page.locator('.pane[data-drone="left"] .pane-head').click()
+        page.page.locator('.pane[data-drone="left"] .pane-head h2').click()
         page.until(lambda: "left" in own.inner_text(), "it names the one that is chosen")
         for _ in range(4):
             own.click()  # as by chance

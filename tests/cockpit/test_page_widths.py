@@ -105,6 +105,7 @@ def share(page: DronePage, selector: str) -> float:
 
 
 def test_the_picture_is_first_and_the_panels_are_a_press_away(deck: Deck) -> None:
+    deck.own_cockpit()  # with no cards of drones that other tests flew above the picture
     deck.proxy("first")
     page = deck.page("first", panels=False, viewport={"width": 1440, "height": 900})
     assert share(page, ".pictures") > 0.6
