@@ -42,6 +42,7 @@ WRONG = """([drone, least]) => {
 }"""
 TO = """([name, block]) =>
   document.querySelector(`.pane[data-drone="${CSS.escape(name)}"]`).scrollIntoView({block})"""
+DRAWN = "() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))"
 WIDER = "document.documentElement.scrollWidth - innerWidth"
 
 
@@ -51,7 +52,7 @@ def wrong(page: DronePage, drone: str, least: float = 24.0) -> Any:
 
 def resize(page: DronePage, width: int, height: int) -> None:
     page.page.set_viewport_size({"width": width, "height": height})
-    page.page.evaluate("() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+    page.page.evaluate(DRAWN)
 
 
 def sweep(page: DronePage, drones: tuple[str, ...], least: float = 24.0) -> str:
@@ -63,7 +64,7 @@ def sweep(page: DronePage, drones: tuple[str, ...], least: float = 24.0) -> str:
             for block in ("start", "end") if drone else ("",):
                 if drone:
                     page.page.evaluate(TO, [drone, block])
-                    page.page.wait_for_timeout(16)
+                    page.page.evaluate(DRAWN)
                 said = wrong(page, drone, least)
                 found += [f"{width}×{height} {drone} {block}: {one}" for one in said]
         if page.page.evaluate(WIDER) > 0:
@@ -93,7 +94,9 @@ def test_two_drones_and_all_of_them(deck: Deck) -> None:
         deck.proxy(name)
     page = deck.page("left", "right")
     assert sweep(page, ("left", "right")) == ""
-    assert sweep(deck.overview(has_touch=True), (), FINGER_PX) == ""
+    all_of_them = deck.overview(has_touch=True)
+    all_of_them.page.locator(".safety .own").wait_for(state="attached")
+    assert sweep(all_of_them, (), FINGER_PX) == ""
 
 
 def share(page: DronePage, selector: str) -> float:
