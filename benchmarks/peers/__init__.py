@@ -38,7 +38,7 @@ PEERS: Final = {
         "pip install ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs, in an environment of its own, "
         "whose interpreter --ros-python names",
     ),
-    "fabric": Peer(NETWORK.title, "zenoh", "eclipse-zenoh", "pip install 'skyloop[network]'", NETWORK.module),
+    "fabric": Peer(NETWORK.title, "zenoh", "eclipse-zenoh", "skyloop install network", NETWORK.module),
     "zenoh": Peer("Zenoh", "zenoh", "eclipse-zenoh", "pip install eclipse-zenoh"),
     "zeromq": Peer("ZeroMQ", "zmq", "pyzmq", "pip install pyzmq"),
 }

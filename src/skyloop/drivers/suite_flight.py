@@ -73,10 +73,8 @@ class Flight:
             AssertionError: It was not awake, or not up within the suite's ``takeoff_timeout_s``.
         """
         if "takeoff" in self.actions:
-            links = self.sink.links
-            assert self.sink.wait(lambda: not links[-1][1].startswith(WAKING_UP), self.suite.takeoff_timeout_s), links[
-                -1
-            ]
+            links, timeout_s = self.sink.links, self.suite.takeoff_timeout_s
+            assert self.sink.wait(lambda: not links[-1][1].startswith(WAKING_UP), timeout_s), links[-1]
             self.driver.apply(Takeoff())
             settled = (FlightState.HOVERING, FlightState.FLYING)
             self.until(lambda f: f.state in settled, self.suite.takeoff_timeout_s, "hovering after take-off")
