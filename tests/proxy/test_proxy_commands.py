@@ -16,6 +16,7 @@ from skyloop.messages import (
     EmergencyStop,
     Event,
     EventKind,
+    Fate,
     Feedback,
     FlightState,
     GetStatistics,
@@ -256,6 +257,26 @@ def test_a_landing_goes_to_a_vehicle_that_is_not_heard_whatever_it_showed_before
     assert bench.driver.told == []
     pilot.command(Land())
     assert bench.driver.told == [Land()]
+
+
+def test_a_landing_is_told_to_be_done_only_by_what_was_heard_since(bench: Bench) -> None:
+    """A vehicle that stood when it was heard last was told to have landed as soon as the landing was sent."""
+    pilot = bench.pilot()
+    bench.driver.answers = False
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.run(0.5, lambda: pilot.command(Idle()))
+    pilot.command(Land())
+    assert bench.driver.told == [Land()]
+    bench.run(0.5, lambda: pilot.command(Land(), repeat=True))
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert outcome.fate is Fate.UNDER_WAY
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.LANDED)
+    bench.tick()
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert outcome.fate is Fate.COMPLETED
 
 
 def test_a_landing_that_nobody_carries_out_does_not_keep_the_failsafes_hover_back(bench: Bench) -> None:

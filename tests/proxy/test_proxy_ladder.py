@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 
 from skyloop.messages import (
+    AnyAction,
     Attitude,
     EventKind,
     Failsafe,
+    Fate,
     Feedback,
     FlightState,
     Hover,
@@ -95,6 +97,114 @@ def test_the_ladder_goes_on_to_ask_for_its_landing_while_the_vehicle_is_not_hear
     bench.driver.report(state=FlightState.LANDING)
     bench.run(1.0)
     assert bench.driver.told == []
+
+
+@pytest.mark.parametrize("noticed", [True, False])
+def test_a_pilots_landing_survives_a_broken_link(bench: Bench, noticed: bool) -> None:
+    """It ended with the link, the vehicle was told to hover when that was back, and the pilot waited for ever."""
+    pilot, witness = bench.airborne(), bench.join("witness")
+    bench.driver.answers = False
+    pilot.command(Land())
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    if noticed:
+        bench.run(4.0, lambda: pilot.command(Idle(), repeat=True))
+        assert len(bench.driver.told) > 10, "a driver keeps it for 3 s only"
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.HOVERING)
+    bench.run(0.6, lambda: pilot.command(Idle(), repeat=True))
+    assert set(bench.driver.told) == {Land()}
+    bench.driver.told.clear()
+    bench.run(0.6, lambda: pilot.command(Idle(), repeat=True))
+    assert len(bench.driver.told) >= 2
+    assert set(bench.driver.told) == {Land()}, "it is in the air, and nobody wants anything else"
+    assert steps(witness) == []
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert outcome.fate is Fate.UNDER_WAY
+    bench.driver.report(state=FlightState.LANDED)
+    bench.tick()
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert outcome.fate is Fate.COMPLETED
+    bench.driver.told.clear()
+    bench.driver.report(state=FlightState.HOVERING)
+    bench.run(1.0, lambda: pilot.command(Idle(), repeat=True))
+    assert bench.driver.told == [], "it is over"
+
+
+def landing_in_the_dark(bench: Bench) -> App:
+    """A pilot who asked for a landing before the link broke; by now it is back, and the vehicle hovers."""
+    pilot = bench.airborne()
+    bench.driver.answers = False
+    pilot.command(Land())
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.run(0.5, lambda: pilot.command(Idle(), repeat=True))
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.HOVERING)
+    return pilot
+
+
+@pytest.mark.parametrize("action", [Hover(), Takeoff(), Velocity(0.5)], ids=lambda action: action.name)
+def test_a_newer_command_ends_such_a_landing(bench: Bench, action: AnyAction) -> None:
+    pilot = landing_in_the_dark(bench)
+    pilot.command(action)
+    bench.driver.told.clear()
+    bench.run(0.4, lambda: pilot.command(action, repeat=True))
+    assert Land() not in bench.driver.told
+
+
+def test_a_newer_command_ends_such_a_landing_also_where_it_is_refused(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.answers = False
+    pilot.command(Land())
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.tick()
+    pilot.command(Velocity(0.5))
+    bench.tick()
+    assert bench.driver.told[-1] == Hover()
+    bench.driver.link(LinkState.UP)
+    bench.driver.told.clear()
+    bench.run(0.4, lambda: pilot.command(Idle(), repeat=True))
+    assert set(bench.driver.told) == {Hover()}
+
+
+def test_what_the_library_does_by_itself_does_not_end_such_a_landing(bench: Bench) -> None:
+    pilot = landing_in_the_dark(bench)
+    pilot.command(Hover(), automatic=True)
+    bench.run(0.4, lambda: pilot.command(Hover(), automatic=True, repeat=True))
+    assert set(bench.driver.told) == {Land()}
+
+
+def test_who_takes_the_vehicle_meanwhile_is_left_alone(bench: Bench) -> None:
+    """Also where the pilot's own repeats go on, which are no new decision."""
+    pilot = bench.airborne()
+    bench.driver.answers = False
+    pilot.command(Land())
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.run(0.5, lambda: pilot.command(Land(), repeat=True))
+    bench.driver.told.clear()
+    bench.driver.left = "LOITER"
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(0.5, lambda: pilot.command(Land(), repeat=True))
+    assert bench.driver.told == []
+
+
+def test_a_landing_that_was_asked_for_in_the_dark_is_done_when_the_vehicle_is_heard() -> None:
+    """One that only the software can fly is refused while nothing shows how it moves."""
+    with Bench({"velocity"}) as software:
+        software.driver.report(altitude_m=2.0, state=FlightState.FLYING)
+        pilot = software.pilot()
+        pilot.command(Hover())
+        software.driver.link(LinkState.LOST)
+        software.tick()
+        pilot.command(Land())
+        assert pilot.refusals() == [Refusal.VEHICLE_LINK_LOST]
+        software.driver.link(LinkState.UP)
+        software.driver.report(altitude_m=2.0, state=FlightState.FLYING)
+        software.driver.told.clear()
+        software.run(0.1)
+        assert software.driver.told[-1] == Velocity(up=-0.4)
 
 
 def test_the_next_pilot_takes_such_a_landing_over(bench: Bench) -> None:

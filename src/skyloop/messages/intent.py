@@ -42,7 +42,7 @@ ENDINGS: Final[dict[Fate, str]] = {
     Fate.LANDED: "the vehicle landed or disarmed, whoever made it",
     Fate.EMERGENCY: "there was an emergency, or somebody stopped the motors",
     Fate.AUTHORITY: "the authority was granted anew, lost or given back",
-    Fate.LINK: "the link to the vehicle broke or came back, or the application's own was lost",
+    Fate.LINK: "the link to the vehicle broke or came back, which ends no landing, or the application's own was lost",
     Fate.FAILSAFE: "a failsafe took over",
     Fate.OTHERS: "somebody else took the vehicle",
     Fate.SLEPT: "the proxy's computer slept",

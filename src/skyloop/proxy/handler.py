@@ -403,7 +403,9 @@ class CommandHandler:
         applied_ns = self._count_applied(command)
         ladder = self.ladder
         if command.automatic:
-            goes_on = ladder.step is Failsafe.LAND
+            goes_on = ladder.lands_on or ladder.step is Failsafe.LAND
+        elif kind is Land:
+            goes_on = ladder.lands_on
         else:
             goes_on = ladder.step is Failsafe.HOVER and kind is Hover and not vehicle.link_up
         if not (goes_on or ladder.idle):
@@ -502,6 +504,9 @@ class CommandHandler:
         self._tell(session, intent)
         if type(command.action) is Takeoff:
             self._withdraw_takeoff(now_ns)
+        if self.ladder.lands_on and type(command.action) is not Land and not command.automatic:
+            self._apply_failsafe(self.ladder.fresh_command(), now_ns)  # the landing is not wanted any more
+            self.ladder.hand_over(now_ns)
         return self._refuse(session, command, reason, why)
 
     def _end_intents(self, fate: Fate, now_ns: int, why: str = "", reason: Refusal | None = None) -> None:
@@ -519,7 +524,8 @@ class CommandHandler:
         if not intent.over:
             if state is not intent.state:
                 self._observe_flight(now_ns)  # a landing may be others': then that is what ended it
-            intent.observe(state, now_ns)
+            feedback = self._vehicle.feedback_now
+            intent.observe(state, now_ns, None if feedback is None else feedback.captured_ns)
             if intent.over:
                 self._tell(session, intent)
                 if intent.fate is not Fate.COMPLETED:
@@ -620,12 +626,21 @@ class CommandHandler:
         """Act on what happened to the vehicle's link since it was last observed.
 
         Intents end when it breaks and when it is back, so that nothing asked for in between is done later. Hover is
-        given both times: a driver must not go on with an old set-point.
+        given both times: a driver must not go on with an old set-point. A pilot's landing lasts, as nothing is safer.
         """
         breaks = self._vehicle.link_breaks
-        if breaks != self._breaks_seen:
-            self._breaks_seen = breaks
+        if breaks == self._breaks_seen:
+            return
+        self._breaks_seen = breaks
+        landing = self._landing
+        if landing is None or (landing.automatic and not landing.begun):
             self._start_over(Fate.LINK, now_ns)
+            return
+        if landing.begun or self._vehicle.link_up:
+            self.ladder.land_on(now_ns)
+        else:
+            self.ladder.hand_over(now_ns)
+        self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
         """Act on a sleep of the computer: all that is known is older than its clock says."""
@@ -703,13 +718,12 @@ class CommandHandler:
         self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
         state = self._executor.state
-        airborne = self.flight.flies(state)
         landing = None if self._vehicle.link_up else self._landing
-        if airborne and landing is not None and landing.begun:
-            state = FlightState.LANDING  # as far as anybody can tell: no hover takes its pilot's landing back
+        if landing is not None and landing.begun:
+            self.ladder.land_on(now_ns)  # no hover takes its pilot's landing back
         inputs = FailsafeInputs(
             state=state,
-            airborne=airborne,
+            airborne=self.flight.flies(state),
             last_command_ns=self.authority.last_command_ns,
             pilot=self._pilot,
             link_up=self._vehicle.link_up,

@@ -166,7 +166,7 @@ class CommandChecks:
         policy = STATE_POLICIES[kind][state]
         if new and kind is ReturnToStart:
             self.back = None
-        if automatic and (state is FlightState.LANDING or self._ladder.step is Failsafe.LAND):
+        if automatic and (state is FlightState.LANDING or self._ladder.lands_on or self._ladder.step is Failsafe.LAND):
             policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
             policy = StatePolicy.APPLY  # that it lands, or stands, was before: it may have heard something else since

@@ -159,7 +159,7 @@ class FailsafeLadder:
             told = replace(inputs, state=FlightState.LANDING)
         step, reason = due(now_ns, told, self.settings, barred=self.barred, battery_low=low)
         if _RANK[step] > _RANK[self.step]:
-            returns = step is Failsafe.LAND and self._should_return(reason) and inputs.state is not FlightState.LANDING
+            returns = step is Failsafe.LAND and self._should_return(reason) and told.state is not FlightState.LANDING
             why = inputs.return_problem if returns else ""
             effects += self._begin(StepChange(step, reason, returns and not why, why), now_ns)
         elif self.returning and self.barred:
@@ -197,8 +197,13 @@ class FailsafeLadder:
         if not isinstance(self._wanted, Land | ReturnToStart):
             self._want(Hover(), now_ns)
 
+    @property
+    def lands_on(self) -> bool:
+        """Whether it goes on with a pilot's landing."""
+        return isinstance(self._wanted, Land) and self.step is Failsafe.NONE
+
     def land_on(self, now_ns: int) -> None:
-        """The pilot leaves, who has asked for a landing that is under way: go on with it."""
+        """Go on with a landing that is under way: its pilot leaves, or the link to the vehicle is lost."""
         if not isinstance(self._wanted, Land | ReturnToStart):
             self._want(Land(), now_ns)
 

@@ -47,6 +47,7 @@ class Intent:
     state: FlightState  #: the vehicle's, when it was asked for or looked at last
     fate: Fate = Fate.UNDER_WAY
     begun: bool = False  #: the vehicle was made to do it
+    automatic: bool = False  #: the library asked for it by itself
     withdrew: bool = False  #: it ended a take-off that had not left the ground
     reason: Refusal | None = None
     text: str = ""
@@ -75,8 +76,8 @@ class Intent:
         if not (kind is ResetEmergency or (kind in (Hover, Land) and reason in _PASSING)):
             self.end(Fate.REFUSED, why, reason)
 
-    def observe(self, state: FlightState, now_ns: int) -> None:
-        """End or complete it by what the vehicle does."""
+    def observe(self, state: FlightState, now_ns: int, shown_ns: int | None = None) -> None:
+        """End or complete it by what the vehicle does; ``shown_ns``: when that was so, None for now."""
         before = self.state
         if state is not FlightState.UNKNOWN:  # what was known before that still counts
             self.state = state
@@ -85,7 +86,9 @@ class Intent:
         kind = type(self.action)
         if state is FlightState.LANDED:
             if kind is Land:
-                if not self.withdrew or now_ns - self.asked_ns >= SETTLED_NS:
+                # That it stood before it was asked for proves nothing: it may be in the air by now.
+                shown = shown_ns is None or shown_ns >= self.asked_ns
+                if shown and (not self.withdrew or now_ns - self.asked_ns >= SETTLED_NS):
                     self.end(Fate.COMPLETED)
             elif before.airborne:
                 self.end(Fate.COMPLETED if kind is ReturnToStart else Fate.LANDED)
@@ -155,7 +158,7 @@ class Intents:
             older.end(self._ended if number <= self._floor else Fate.REPLACED)
             return older, False
         newest.end(Fate.WITHDRAWN if type(command.action) is Idle else Fate.REPLACED)
-        self.newest = newest = Intent(number, command.action, now_ns, state)
+        self.newest = newest = Intent(number, command.action, now_ns, state, automatic=command.automatic)
         return newest, True
 
     @property
