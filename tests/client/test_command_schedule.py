@@ -22,6 +22,7 @@ from skyloop.messages import (
     Hover,
     Idle,
     Land,
+    Outcome,
     ResetEmergency,
     Takeoff,
     Velocity,
@@ -261,6 +262,22 @@ def test_manoeuvres_are_not_repeated_for_ever() -> None:
     commander.ask(EmergencyStop(), 0)
     assert commander.next(0) == EmergencyStop()
     assert commander.next(11_000_000_000) == Idle()
+
+
+@pytest.mark.parametrize(
+    ("state", "lasts"),
+    [(FlightState.LANDING, True), (FlightState.HOVERING, True), (FlightState.UNKNOWN, False)],
+)
+def test_a_landing_is_repeated_for_as_long_as_the_proxy_goes_on_with_it(state: FlightState, lasts: bool) -> None:
+    """From high up it takes minutes. After 60 s nobody asked for it any more, and its caller still waited."""
+    commander = CommandSchedule()
+    intent = commander.ask(Land(), 0)
+    under_way = Feedback(captured_ns=0, state=state, outcome=Outcome(7, intent))
+    for second in range(100):
+        commander.observe(under_way, second * 10**9, 7)
+        action = commander.next(second * 10**9)
+    assert action == (Land() if lasts else Idle()), "where nothing shows the landing, nothing shows its end either"
+    assert commander.next(200 * 10**9) == Idle(), "nobody tells of it any more"
 
 
 def test_a_failsafe_ends_the_set_point_but_not_the_calls_after_it() -> None:

@@ -54,7 +54,7 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
 }
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(21.0),  # the proxy ends it after 20 s, and tells whether it may be asked for again
-    Land: nanoseconds(60.0),
+    Land: nanoseconds(60.0),  # since the proxy told last that it is under way
     EmergencyStop: nanoseconds(8.0),  # the driver goes on for 10 s: a late repeat must not press it again
     ResetEmergency: nanoseconds(2.0),
 }
@@ -214,8 +214,11 @@ class CommandSchedule:
         """
         kind, outcome = type(self.action), feedback.outcome
         done_in = _DONE_IN.get(kind)
-        if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent) and outcome.over:
-            self._end(outcome)
+        if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent):
+            if outcome.over:
+                self._end(outcome)
+            elif kind is Land and feedback.state is not FlightState.UNKNOWN:
+                self._asked_ns = now_ns  # the proxy goes on with it, however long it takes
         if done_in is None:
             if feedback.state is FlightState.EMERGENCY:
                 self.clear(Fate.EMERGENCY)
