@@ -135,6 +135,7 @@ class FakeDriver(Driver):
             raise DriverError(f"{action.name}: {self.refuses}")
 
     def left_to(self) -> str:
+        self._may_fail("left_to")
         return self.left
 
     def _repeat(self, action: AnyAction) -> AnyAction:

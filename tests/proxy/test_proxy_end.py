@@ -121,6 +121,59 @@ def test_one_that_fails_to_close_keeps_no_other_one_from_its_end(monkeypatch: py
         assert broken.proxy.end(), "it ends once"
 
 
+def broken(*_: object) -> None:
+    raise RuntimeError("it is broken")
+
+
+@pytest.mark.parametrize(
+    "step",
+    ["keep_warm", "handler.leave_hovering", "overview.end", "_requests.stop", "publisher.streams.end", "server.stop"],
+)
+def test_a_step_of_the_end_that_fails_keeps_no_other_one_from_being_taken(
+    monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """The driver stayed open, and the vehicle in the air was told nothing."""
+    with Bench() as bench:
+        bench.airborne()
+        stopped: list[str] = []
+        stop = bench.server.stop
+        monkeypatch.setattr(bench.server, "stop", lambda: (stop(), stopped.append("server")))
+        *path, name = step.split(".")
+        owner: object = bench.proxy
+        for part in path:
+            owner = getattr(owner, part)
+        monkeypatch.setattr(owner, name, broken)
+        with pytest.raises(RuntimeError, match="it is broken"):
+            bench.proxy.end()
+        assert bench.driver.closed
+        assert step == "server.stop" or stopped == ["server"]
+        assert step == "handler.leave_hovering" or bench.driver.told[-1] == Hover()
+
+
+def test_a_landing_at_the_end_that_fails_leaves_it_hovering(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench.airborne()
+    monkeypatch.setattr(bench.proxy.handler, "order_landing", broken)
+    assert not bench.proxy.end(5.0)
+    assert bench.driver.told[-1] == Hover()
+    assert bench.driver.closed
+    assert "the landing at the end of proxy bench failed" in caplog.text
+
+
+def test_what_fails_where_a_proxy_is_given_up_goes_to_the_log(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An exception in one of its threads ended in the interpreter's hook, or kept the rest from being given back."""
+    monkeypatch.setattr(bench.proxy, "keep_warm", broken)
+    monkeypatch.setattr(bench.server, "stop", broken)
+    bench.proxy.end(reason="its driver hangs", hangs=True)
+    assert bench.driver.closed
+    assert caplog.text.count("proxy bench was given up, and not all of it could be given back") == 2
+    monkeypatch.undo()
+    bench.server.stop()
+
+
 def test_a_take_off_that_was_just_asked_for_is_called_off(bench: Bench) -> None:
     """The vehicle does not show it yet; where it rises all the same, it is landed."""
     bench.driver.answers = False

@@ -319,6 +319,15 @@ def test_a_driver_that_fails_is_tried_again_at_a_bounded_pace(bench: Bench) -> N
     assert bench.driver.told == [Hover()]
 
 
+def test_a_driver_that_fails_to_say_who_flies_keeps_no_failsafe_back(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.driver.fail = {"left_to"}
+    bench.run(5.1)
+    assert bench.driver.told == [Velocity(0.5), Hover(), Land()]
+    assert pilot.told(EventKind.DRIVER_ERROR)
+
+
 def test_nothing_is_done_on_the_ground(bench: Bench) -> None:
     pilot = bench.pilot()
     bench.run(6.0)

@@ -57,6 +57,7 @@ class ActionExecutor:
         #: Whether what the vehicle does on the way to a place must be checked: then the software autopilot flies there.
         self.guarded = False
         self._driver = driver
+        self._left_to = ""  # as the driver said last
         self._vehicle = publisher
         self.gave_up = ""  #: why the vehicle refused to go on with a software take-off; the reader clears it
 
@@ -73,7 +74,11 @@ class ActionExecutor:
     def observe(self, now_ns: int) -> Changed | None:
         """Look at the vehicle; return what has changed about whose flight it is."""
         vehicle = self._vehicle
-        return self.flight.observe(vehicle.reported_state, self._driver.left_to(), now_ns, self._shown(now_ns))
+        try:
+            self._left_to = self._driver.left_to()
+        except Exception as error:  # noqa: BLE001  the failsafe comes after this, whatever the driver's code does
+            vehicle.driver_failed("left_to", error)
+        return self.flight.observe(vehicle.reported_state, self._left_to, now_ns, self._shown(now_ns))
 
     def _shown(self, now_ns: int) -> Feedback | None:
         """The newest sample, where it shows how the vehicle is now."""

@@ -298,12 +298,14 @@ class CommandHandler:
         """The proxy ends now: leave what flies hovering, as far as the vehicle can by itself."""
         with self._lock:
             self.ladder.order_landing()
-            self._observe_flight(now_ns)
-            executor, withdrew = self._executor, self._withdraw_takeoff(now_ns)
-            lands = executor.state is FlightState.LANDING and (Land in executor.native or not withdrew)
-            if self.flight.ours and executor.airborne and not lands:
-                executor.leave(now_ns)
-            self._left = True
+            try:
+                self._observe_flight(now_ns)
+                executor, withdrew = self._executor, self._withdraw_takeoff(now_ns)
+                lands = executor.state is FlightState.LANDING and (Land in executor.native or not withdrew)
+                if self.flight.ours and executor.airborne and not lands:
+                    executor.leave(now_ns)
+            finally:
+                self._left = True
 
     @property
     def airborne(self) -> bool:

@@ -12,6 +12,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
@@ -259,10 +260,17 @@ class Proxy:
 
         Returns:
             Whether nothing of the proxy's flies any more.
+
+        Raises:
+            Exception: What one of the steps raised, when all are done. Where the driver hangs that goes to the log.
         """
         if not self._started or self.ended:
             return True
-        landed = not hangs and self._land(within_s, hurry)
+        try:
+            landed = not hangs and self._land(within_s, hurry)
+        except Exception:  # noqa: BLE001  what it can't land is left hovering, and closed
+            _log.exception("the landing at the end of proxy %s failed", self.name)
+            landed = False
         if unless_flying and not landed:
             return False
         with self._life_lock:
@@ -270,22 +278,18 @@ class Proxy:
                 return landed
             self.ended = True
         self._stopping.set()
-        if not hangs:  # first of all: nothing is obeyed any more, nor steered
-            if self._ticker is not None and self._ticker.is_alive():
-                self._ticker.join()
-            self.handler.leave_hovering(self.clock())
         severity = Severity.ERROR if hangs else Severity.WARNING
-        self.events.publish(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", severity)
-        self.overview.end()
-        try:
-            if hangs:
-                self._abandon()
-            else:
-                self._close()
-        finally:
-            for kept in (self._trail, self._record):
+        with ExitStack() as steps:  # from the last to the first, each of them whatever another one raises
+            for kept in (self._record, self._trail):
                 if kept is not None:
-                    kept.close()
+                    steps.callback(kept.close)
+            steps.callback(self._abandon if hangs else self._close)
+            steps.callback(self.overview.end)
+            steps.callback(self.events.publish, EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", severity)
+            if not hangs:  # first of all: nothing is obeyed any more, nor steered
+                steps.callback(lambda: self.handler.leave_hovering(self.clock()))
+                if self._ticker is not None and self._ticker.is_alive():
+                    self._ticker.join()
         return landed
 
     def _land(self, within_s: float, hurry: Callable[[], bool]) -> bool:
@@ -300,28 +304,40 @@ class Proxy:
         return not handler.airborne
 
     def _close(self) -> None:
-        self.keep_warm(0.0)
-        self._requests.stop()
-        try:
-            self.driver.close()
-        finally:
-            self.publisher.streams.end()
-            self.server.stop()
+        with ExitStack() as steps:  # from the last to the first
+            steps.callback(self.server.stop)
+            steps.callback(self.publisher.streams.end)
+            steps.callback(self.driver.close)
+            steps.callback(self._requests.stop)
+            steps.callback(self.keep_warm, 0.0)
 
     def forked(self) -> None:
         """Leave the vehicle and the clients to the parent process; in a child made by ``os.fork``."""
         self.ended = True
 
     def _abandon(self) -> None:
-        """Give back what can be, without waiting for what hangs."""
-        self.keep_warm(0.0)
-        parts = (self.server.stop, self.driver.close, self._requests.stop)
-        threads = [threading.Thread(target=part, name="skyloop-abandoned", daemon=True) for part in parts]
+        """Give back what can be, without waiting for what hangs; what fails goes to the log."""
+        parts: tuple[Callable[[], object], ...] = (
+            self.server.stop,
+            self.driver.close,
+            self._requests.stop,
+            partial(self.keep_warm, 0.0),
+        )
+        threads = [
+            threading.Thread(target=self._give_back, args=(part,), name="skyloop-abandoned", daemon=True)
+            for part in parts
+        ]
         for thread in threads:
             thread.start()
         deadline_s = time.monotonic() + _ABANDON_S
         for thread in threads:
             thread.join(max(0.0, deadline_s - time.monotonic()))
+
+    def _give_back(self, part: Callable[[], object]) -> None:
+        try:
+            part()
+        except BaseException:  # noqa: BLE001  nothing else would ever tell
+            _log.exception("proxy %s was given up, and not all of it could be given back", self.name)
 
     def __enter__(self) -> Proxy:
         self.start()
