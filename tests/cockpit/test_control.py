@@ -336,8 +336,9 @@ def test_a_place_that_the_proxy_refuses_is_told_with_its_reason(client: TestClie
             pilot.wait("done", do="goto")
 
 
+@pytest.mark.parametrize(("said", "method"), [("reset", "reset_emergency"), ("fly", "velocity")])
 def test_what_takes_the_place_of_a_flight_and_is_refused_leaves_it_hovering(
-    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch, said: str, method: str
 ) -> None:
     """Its place stayed in force, and nobody watched the flight there any more."""
     with page(client) as pilot:
@@ -345,13 +346,13 @@ def test_what_takes_the_place_of_a_flight_and_is_refused_leaves_it_hovering(
         pilot.say("goto", x=50, y=0, z=1)
         until(lambda: node.flyer.state is FlightState.FLYING)
 
-        def refuse(self: PilotConnection) -> bool:
+        def refuse(self: PilotConnection, **_: float) -> bool:
             raise RefusedError("not now")
 
-        monkeypatch.setattr(PilotConnection, "reset_emergency", refuse)
+        monkeypatch.setattr(PilotConnection, method, refuse)
         with pilot.staying():
-            pilot.say("reset")
-            assert pilot.wait("refused", do="reset")["why"] == "not now"
+            pilot.say(said)
+            assert pilot.wait("refused", do=said)["why"] == "not now"
             until(lambda: node.flyer.state is FlightState.HOVERING)
 
 

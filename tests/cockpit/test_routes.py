@@ -11,12 +11,13 @@ import pytest
 
 from skyloop.cockpit import control_session
 from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.routes import MOST_CHECKED, CheckedRoutes, RouteFiles
 from skyloop.control.route import Route, RouteWaypoint
 from skyloop.control.route_check import Conditions, check_route
 from skyloop.errors import RefusedError, UnknownNameError, UsageError
-from skyloop.messages import FlightState, Hover
+from skyloop.messages import AnyAction, FlightState, Hover
 from tests.cockpit.fake import ORIGIN, Node, Nodes, cockpit, until
 from tests.cockpit.test_control import Page, page
 from tests.cockpit.testclient import TestClient
@@ -190,3 +191,29 @@ def test_a_page_that_falls_silent_or_commands_something_else_pauses_the_route(cl
             until(lambda: node.flyer.state is FlightState.FLYING)
     until(lambda: node.flyer.state in (FlightState.HOVERING, FlightState.LANDING, FlightState.LANDED))
     assert node.flyer.place[0] < 10.0, "a page that is gone flies nowhere"
+
+
+@pytest.mark.parametrize(("first", "then"), [("route", "route_skip"), ("goto", "route_resume")])
+def test_a_route_that_can_not_be_steered_leaves_the_vehicle_hovering(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch, first: str, then: str
+) -> None:
+    """It flew on to where it had been sent before, and nobody watched that any more."""
+    number = checked(client, {**TRIANGLE, "waypoints": [{"x": 40, "y": 0, "z": 0.5}, {"x": 40, "y": 1, "z": 0.5}]})[
+        "id"
+    ]
+    with page(client) as pilot:
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.say("route", id=number)
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            if first == "goto":
+                pilot.say("goto", x=-40, y=0, z=1)
+                until(lambda: node.flyer.place[0] < -0.2)
+
+            def refuse(self: PilotConnection, _: AnyAction) -> bool:
+                raise RefusedError("not now")
+
+            monkeypatch.setattr(PilotConnection, "command", refuse)
+            pilot.say(then)
+            assert pilot.wait("refused", do=then)["why"] == "not now"
+            until(lambda: node.flyer.state is FlightState.HOVERING)

@@ -267,8 +267,8 @@ class ControlSession:
             if self._steering:
                 self.let_go(why)
             raise RefusedError(why)
-        self._end_flight("the sticks were moved")
-        pilot.velocity(forward=command.forward, left=command.left, up=command.up, yaw_rate=command.yaw_rate)
+        with self._in_place_of(pilot, "the sticks were moved"):
+            pilot.velocity(forward=command.forward, left=command.left, up=command.up, yaw_rate=command.yaw_rate)
         self._steering = True
         self._restart_silence_timer()
 
@@ -298,13 +298,16 @@ class ControlSession:
         self._restart_silence_timer()
 
     def _steer_route(self, command: AnyCommand, act: Callable[[RouteSession], None]) -> None:
-        self._held()
-        route = self._route
+        pilot, route = self._held(), self._route
         if route is None or route.law.over:
             raise RefusedError("no route is flown from this page")
         if isinstance(command, ResumeRoute):
             self._end_flight()
-        act(route)
+        try:
+            act(route)
+        except SkyloopError:  # where it was sent before nobody watches it any more
+            pilot.let_go("its route can't be steered")
+            raise
         self._acknowledge(command)
         self._restart_silence_timer()
 
