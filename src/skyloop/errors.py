@@ -32,7 +32,11 @@ from typing import Final, Self
 
 
 def shortened(text: str, most: int) -> str:
-    """Return a text of at most ``most`` characters, with its beginning and its end: causes stand at either."""
+    """Return a text of at most ``most`` characters, with its beginning and its end: causes stand at either.
+
+    What can't be sent as UTF-8, as of a file name that is none, becomes a question mark.
+    """
+    text = text.encode("utf-8", "replace").decode("utf-8")
     if len(text) <= most:
         return text
     ending = (most - 3) // 2

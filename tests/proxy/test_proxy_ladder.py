@@ -328,6 +328,28 @@ def test_a_driver_that_fails_to_say_who_flies_keeps_no_failsafe_back(bench: Benc
     assert pilot.told(EventKind.DRIVER_ERROR)
 
 
+@pytest.mark.parametrize("where", ["command", "link", "others"])
+def test_words_of_a_driver_that_can_not_be_sent_keep_nothing_back(bench: Bench, where: str) -> None:
+    """The name of a file that is no UTF-8: no feedback was published any more, and a step of the ladder was not told."""
+    pilot = bench.airborne()
+    odd = "/dev/tty\udcff"
+    if where == "command":
+        bench.driver.refuses = odd
+        pilot.command(Velocity(0.5))
+        bench.driver.refuses = ""
+    elif where == "link":
+        bench.driver.link(LinkState.DEGRADED, odd)
+    else:
+        bench.driver.left = odd
+        bench.driver.report(state=FlightState.FLYING)
+        bench.run(0.1)
+    seq = pilot.last_feedback().seq
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(0.7)
+    assert pilot.last_feedback().seq > seq
+    assert (Hover() in bench.driver.told) is (where != "others")
+
+
 def test_nothing_is_done_on_the_ground(bench: Bench) -> None:
     pilot = bench.pilot()
     bench.run(6.0)

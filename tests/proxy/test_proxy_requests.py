@@ -10,6 +10,7 @@ from skyloop.messages import (
     AnyRequest,
     Done,
     EventKind,
+    FlightState,
     GetParameter,
     GetStatistics,
     Hello,
@@ -281,6 +282,34 @@ def test_an_action_that_waited_behind_a_slow_driver_is_not_done_long_after_it_wa
         assert isinstance(app.answer(value), ParameterValue)
         assert len(written) == 2
         assert isinstance(app.ask(SetParameter("flip", "left", app.lease)), ParameterValue)
+
+
+@pytest.mark.parametrize("why", ["closing", "battery", "failsafe", "others", ""])
+def test_nothing_is_done_once_while_something_else_has_the_vehicle(why: str) -> None:
+    """A flip was written to the driver while the vehicle came down because its proxy ended."""
+    flip = Parameter("flip", ParameterType.TEXT, "none", choices=("none", "left"), momentary=True)
+    with Bench(parameters=[flip, FPS]) as bench:
+        done: list[object] = []
+        bench.driver.while_setting = lambda: done.append("set")
+        pilot = bench.airborne()
+        if why == "closing":
+            bench.proxy.handler.order_landing(bench.clock())
+        elif why == "battery":
+            bench.driver.report(battery=0.05)
+        elif why == "failsafe":
+            bench.driver.link(LinkState.LOST)
+        elif why == "others":
+            bench.driver.left = "LOITER"
+            bench.driver.report(state=FlightState.FLYING)
+        bench.tick()
+        answer = pilot.ask(SetParameter("flip", "left", pilot.lease))
+        if why:
+            assert isinstance(answer, Refused)
+            assert answer.code is Refusal.WRONG_STATE
+            assert done == []
+            assert isinstance(pilot.ask(SetParameter("camera.fps", 20, pilot.lease)), ParameterValue)
+        else:
+            assert isinstance(answer, ParameterValue)
 
 
 def test_a_repeated_request_does_not_undo_a_release(bench: Bench) -> None:

@@ -6,7 +6,7 @@ Not thread-safe: the command handler's lock is held around every call, which kee
 from __future__ import annotations
 
 from skyloop.drivers.base import Driver
-from skyloop.errors import DriverError, RefusedError
+from skyloop.errors import DriverError, RefusedError, shortened
 from skyloop.messages import (
     ACTION_NAMES,
     Action,
@@ -22,6 +22,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.messages.feedback import MAX_LINK_TEXT
 from skyloop.proxy.core.autopilot import Autopilot, software_actions
 from skyloop.proxy.core.flight import STALE_NS, Changed, Flight
 from skyloop.proxy.publisher import VehiclePublisher
@@ -75,7 +76,7 @@ class ActionExecutor:
         """Look at the vehicle; return what has changed about whose flight it is."""
         vehicle = self._vehicle
         try:
-            self._left_to = self._driver.left_to()
+            self._left_to = shortened(self._driver.left_to(), MAX_LINK_TEXT // 2)
         except Exception as error:  # noqa: BLE001  the failsafe comes after this, whatever the driver's code does
             vehicle.driver_failed("left_to", error)
         return self.flight.observe(vehicle.reported_state, self._left_to, now_ns, self._shown(now_ns))

@@ -53,7 +53,7 @@ from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.authority_events import EventContext, authority_event
 from skyloop.proxy.core.command_checks import CommandChecks
-from skyloop.proxy.core.failsafe import BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
+from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import Whose
 from skyloop.proxy.core.flight_events import (
@@ -188,6 +188,18 @@ class CommandHandler:
         with self._lock:
             flies = self._executor.airborne
             return self.checks.airspace.ceiling_problem(altitude, self._vehicle.feedback_now) if flies else ""
+
+    def problem_with_moment(self) -> str:
+        """Return why the vehicle must not do something once now, such as a flip, for a person; empty if it may."""
+        with self._lock:
+            ladder, others = self.ladder, self.flight.others
+            if ladder.barred == "closing" or (ladder.barred and self._executor.airborne):
+                return f"only landing is possible: {REASONS[ladder.barred]}"
+            if ladder.step is not Failsafe.NONE:
+                return (
+                    f"a failsafe has the vehicle, because {REASONS.get(ladder.reason, ladder.reason)}: command it first"
+                )
+            return f"{others}: hover, take off or land first to take it over" if others else ""
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and carry it out, on the thread that received it."""

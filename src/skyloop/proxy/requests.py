@@ -94,7 +94,10 @@ class JobThread:
 
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
-            job()
+            try:
+                job()
+            except Exception:  # noqa: BLE001  the next ones still get their answers
+                _log.exception("a request could not be answered")
 
 
 class RequestDispatcher:
@@ -274,8 +277,8 @@ class ParameterRequests:
 
     def set(self, session: Session, request: SetParameter, now_ns: int) -> AnyReply:
         """Write one for the holder of the authority. Raises what :meth:`Parameters.set` raises."""
-        waited_ns = self._clock() - now_ns
-        if waited_ns > MOMENT_NS and self._parameters.get(request.name).momentary:
+        waited_ns, momentary = self._clock() - now_ns, self._parameters.get(request.name).momentary
+        if momentary and waited_ns > MOMENT_NS:
             why = f"{request.name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
             return Refused(Refusal.STALE, why)
         if request.name in self._free and session.role is Role.PILOT:
@@ -283,6 +286,8 @@ class ParameterRequests:
         if not self._handler.holds(session, request.lease):
             code = Refusal.FOREIGN_LEASE if request.lease else Refusal.NO_AUTHORITY
             return Refused(code, "writing a parameter needs the authority: request it, and name its lease")
+        if momentary and (problem := self._handler.problem_with_moment()):
+            return Refused(Refusal.WRONG_STATE, f"{request.name} is not done now: {problem}")
         if request.name == "limits.altitude" and isinstance(request.value, int | float):
             problem = self._handler.problem_with_ceiling(float(request.value))
             if problem:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds
+from skyloop.errors import shortened
 from skyloop.messages import (
     AnyAction,
     Command,
@@ -110,7 +111,7 @@ class Intent:
         fate = self.fate  # first, as another thread may end it now
         if not self.text:
             return Outcome(app_id, max(0, self.number), fate)
-        text = f"{name}: {self.action.name} refused: {self.text}"[:MAX_OUTCOME_TEXT]
+        text = shortened(f"{name}: {self.action.name} refused: {self.text}", MAX_OUTCOME_TEXT)
         return Outcome(app_id, self.number, fate, self.reason, text)
 
 
