@@ -6,6 +6,7 @@ import contextlib
 import logging
 import math
 import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -15,6 +16,7 @@ import pytest
 
 import skyloop
 from skyloop.client import Authority, Drone, Swarm
+from skyloop.client.commands import cancelled
 from skyloop.client.connect import choose
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import open_drone
@@ -473,6 +475,22 @@ def test_what_can_not_be_chosen() -> None:
     for wrong in ("", 3, {"a": ""}, {"": "sim://"}):
         with pytest.raises(UsageError):
             choose([wrong], lambda: RUNNING)  # type: ignore[list-item]
+
+
+def test_where_there_is_no_thread_for_all_what_is_left_is_done_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The end of a swarm raised "can't start new thread", and some were not landed."""
+    begin, begun = threading.Thread.start, list[str]()
+
+    def start(thread: threading.Thread) -> None:
+        if thread.name.startswith("skyloop-swarm") and begun:
+            raise RuntimeError("can't start new thread")
+        begun.append(thread.name)
+        begin(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    results, errors = in_parallel({"a": lambda: 1, "b": lambda: 2, "c": lambda: 3})
+    assert (results, errors) == ({"a": 1, "b": 2, "c": 3}, {})
+    assert not cancelled.get()(), "the caller's own"
 
 
 def test_what_is_done_in_parallel_ends_whatever_one_of_them_does() -> None:

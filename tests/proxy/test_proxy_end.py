@@ -121,6 +121,24 @@ def test_one_that_fails_to_close_keeps_no_other_one_from_its_end(monkeypatch: py
         assert broken.proxy.end(), "it ends once"
 
 
+def test_where_there_is_no_thread_for_all_the_rest_ends_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Bench() as first, Bench() as second:
+        first.airborne()
+        second.airborne()
+        begin, begun = threading.Thread.start, list[str]()
+
+        def start(thread: threading.Thread) -> None:
+            if thread.name == "skyloop-end" and begun:
+                raise RuntimeError("can't start new thread")
+            begun.append(thread.name)
+            begin(thread)
+
+        monkeypatch.setattr(threading.Thread, "start", start)
+        end_all([first.proxy, second.proxy], 0.0, reason="it is late", hurry=lambda: False)
+        assert (first.driver.closed, second.driver.closed) == (True, True)
+        assert (first.driver.told[-1], second.driver.told[-1]) == (Hover(), Hover())
+
+
 def broken(*_: object) -> None:
     raise RuntimeError("it is broken")
 

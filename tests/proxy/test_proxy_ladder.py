@@ -330,7 +330,7 @@ def test_a_driver_that_fails_to_say_who_flies_keeps_no_failsafe_back(bench: Benc
 
 @pytest.mark.parametrize("where", ["command", "link", "others"])
 def test_words_of_a_driver_that_can_not_be_sent_keep_nothing_back(bench: Bench, where: str) -> None:
-    """The name of a file that is no UTF-8: no feedback was published any more, and a step of the ladder was not told."""
+    """The name of a file that is no UTF-8: feedback ended, and a step of the ladder was not told."""
     pilot = bench.airborne()
     odd = "/dev/tty\udcff"
     if where == "command":

@@ -7,6 +7,7 @@ import threading
 import time
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import copy_context
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Literal, Self, TypeVar, get_args
@@ -694,7 +695,7 @@ def _what(actions: Mapping[str, AnyAction]) -> str:
 def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict[str, Exception]]:
     """Run all jobs at the same time, each on a thread of its own, and wait for the last.
 
-    The threads are daemons. An interrupt of the waiting ends their waits for commands, see
+    The threads are daemons; what gets none is done on this one. An interrupt of the waiting ends their waits for commands, see
     :data:`skyloop.client.commands.cancelled`; what else they do ends by itself.
 
     Args:
@@ -715,13 +716,19 @@ def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict
         except BaseException as error:  # noqa: BLE001  (raised below, on the caller's thread)
             raised[name] = error
 
-    threads = [
-        threading.Thread(target=work, args=(name, job), name=f"skyloop-swarm-{name}", daemon=True)
-        for name, job in jobs.items()
-    ]
-    for thread in threads:
-        thread.start()
+    threads: list[threading.Thread] = []
+    left: list[str] = []
+    for name, job in jobs.items():
+        thread = threading.Thread(target=work, args=(name, job), name=f"skyloop-swarm-{name}", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError:  # there is none to be had: a drone has to land all the same
+            left.append(name)
+        else:
+            threads.append(thread)
     try:
+        for name in left:
+            copy_context().run(work, name, jobs[name])
         for thread in threads:
             thread.join()
     except BaseException:  # Ctrl-C: a take-off must not be carried out later

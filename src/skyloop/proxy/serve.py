@@ -216,9 +216,18 @@ def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Ca
         except Exception as error:  # noqa: BLE001  it is raised when all have ended
             raised.append(error)
 
-    threads = [threading.Thread(target=end, args=(proxy,), name="skyloop-end") for proxy in proxies]
-    for thread in threads:
-        thread.start()
+    threads: list[threading.Thread] = []
+    left: list[Proxy] = []
+    for proxy in proxies:
+        thread = threading.Thread(target=end, args=(proxy,), name="skyloop-end")
+        try:
+            thread.start()
+        except RuntimeError:  # there is none to be had: it ends all the same
+            left.append(proxy)
+        else:
+            threads.append(thread)
+    for proxy in left:
+        end(proxy)
     for thread in threads:
         while thread.is_alive():  # looks up now and then, for signals
             thread.join(_POLL_S)
