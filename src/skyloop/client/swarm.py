@@ -695,8 +695,8 @@ def _what(actions: Mapping[str, AnyAction]) -> str:
 def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict[str, Exception]]:
     """Run all jobs at the same time, each on a thread of its own, and wait for the last.
 
-    The threads are daemons; what gets none is done on this one. An interrupt of the waiting ends their waits for commands, see
-    :data:`skyloop.client.commands.cancelled`; what else they do ends by itself.
+    The threads are daemons; what gets none is done on this one. An interrupt of the waiting ends their waits for
+    commands, see :data:`skyloop.client.commands.cancelled`; what else they do ends by itself.
 
     Args:
         jobs: By name.
