@@ -207,6 +207,22 @@ def test_a_landing_that_was_asked_for_in_the_dark_is_done_when_the_vehicle_is_he
         assert software.driver.told[-1] == Velocity(up=-0.4)
 
 
+def test_a_position_that_jumps_is_told_to_end_no_landing_that_goes_on_without_its_pilot(bench: Bench) -> None:
+    pilot, witness = bench.airborne(), bench.join("witness")
+    bench.driver.answers = False
+    bench.driver.report(position_m=(0.0, 0.0, 1.0))
+    bench.tick()
+    pilot.command(Land())
+    pilot.ask(ReleaseAuthority())
+    bench.clock.advance(0.02)
+    bench.driver.report(position_m=(20.0, 0.0, 1.0))
+    bench.tick()
+    (text,) = messages(witness, "position_jumped")
+    assert text.endswith("it goes on to land")
+    bench.run(1.0)
+    assert set(bench.driver.told) == {Land()}
+
+
 def test_the_next_pilot_takes_such_a_landing_over(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.answers = False

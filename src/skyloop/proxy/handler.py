@@ -681,7 +681,7 @@ class CommandHandler:
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
-            lands = self._landing is not None  # wherever it is
+            lands = self._landing is not None or self.ladder.lands_on  # wherever it is
             event = position_jumped_event(airspace.jumped_m, lands=lands)
             self._events.publish_repeated((0, "jumped"), lambda: event)
             if not lands:
