@@ -155,7 +155,12 @@ def test_a_step_of_the_end_that_fails_keeps_no_other_one_from_being_taken(
         bench.airborne()
         stopped: list[str] = []
         stop = bench.server.stop
-        monkeypatch.setattr(bench.server, "stop", lambda: (stop(), stopped.append("server")))
+
+        def stop_and_note() -> None:
+            stop()
+            stopped.append("server")
+
+        monkeypatch.setattr(bench.server, "stop", stop_and_note)
         *path, name = step.split(".")
         owner: object = bench.proxy
         for part in path:
