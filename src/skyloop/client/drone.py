@@ -320,7 +320,8 @@ class Drone:
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the present position.
 
-        While this waits, a landing that was ended by a failsafe, a lost link or a lost lease is commanded again.
+        While this waits, a landing that was ended by a failsafe, a lost link or a lost lease is commanded again. Where
+        the vehicle's own link breaks the proxy goes on with the landing by itself, also if nobody waits.
 
         Args:
             wait: Wait until the vehicle has landed; else only send the command.
