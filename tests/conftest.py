@@ -97,7 +97,7 @@ def trusted_networks() -> Iterator[None]:
     """Load the tests' own ONNX files without a child process that tries each first; tests/security tries them."""
     with pytest.MonkeyPatch.context() as patch:
         if find_spec("onnxruntime"):
-            patch.setattr("skyloop.vision.onnx.try_alone", lambda path: None)
+            patch.setattr("skyloop.vision.onnx.try_alone", lambda *files, tracker="": None)
         yield
 
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator, Coroutine, Iterator
 from typing import Any
 
+import msgspec
 import pytest
 
 import skyloop.client
@@ -159,6 +160,27 @@ def test_frames_that_are_too_old_do_not_begin_the_time_anew(proxy: ScriptedProxy
     run(look())
 
 
+def test_frames_follow_a_proxy_that_is_restarted_with_another_camera(proxy: ScriptedProxy) -> None:
+    def restart() -> None:
+        proxy.until(lambda: proxy.server.subscribers("video/front") == 1, "the first subscription")
+        top = msgspec.structs.replace(proxy.capabilities.cameras[0], name="top")
+        proxy.capabilities = msgspec.structs.replace(proxy.capabilities, cameras=(top,))
+        proxy.stop()
+        proxy.start()
+        proxy.until(lambda: proxy.server.subscribers("video/top") >= 1, "the new camera's subscription")
+        _send(proxy, 200, "top")
+
+    async def look() -> None:
+        async with aio.connect("me") as drone:
+            restarting = background(restart)
+            async for frame in drone.frames(timeout_s=WAIT_S):
+                assert frame.camera == "top"
+                break
+            restarting.join(WAIT_S)
+
+    run(look())
+
+
 def test_what_is_waited_for_ends_when_the_drone_is_closed(proxy: ScriptedProxy) -> None:
     async def look() -> None:
         async with aio.connect("me") as drone:
@@ -177,10 +199,10 @@ def test_what_is_waited_for_ends_when_the_drone_is_closed(proxy: ScriptedProxy) 
     run(look())
 
 
-def _send(proxy: ScriptedProxy, count: int) -> None:
+def _send(proxy: ScriptedProxy, count: int, *camera: str) -> None:
     pause = threading.Event()
     for seq in range(1, count):
-        proxy.frame(seq)
+        proxy.frame(seq, *camera)
         pause.wait(0.005)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from skyloop.control import PolicyNetwork
 from skyloop.errors import FileFormatError
-from skyloop.vision import OnnxDetector, onnx
+from skyloop.vision import LearnedTracker, OnnxDetector, onnx
 from skyloop.vision.simulated import SIMULATED_WEIGHTS
 from tests.control.test_onnx_policy import write as write_policy
 
@@ -96,6 +97,17 @@ def test_a_loop_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_tensor_of_gigabytes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"huge\.onnx is refused: it takes more than .* 4 GiB"):
         PolicyNetwork(huge(tmp_path / "huge.onnx"))
+
+
+@pytest.mark.parametrize("make", [endless, huge])
+def test_weights_of_a_tracker_are_tried_alone_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[Path], Path]
+) -> None:
+    """OpenCV loads them, which has limits of its own for some of this, and none for the rest."""
+    pytest.importorskip("cv2")
+    monkeypatch.setattr(onnx, "CPU_S", 4)
+    with pytest.raises(FileFormatError, match=r"weights\.onnx (is refused|can't be loaded as the weights of)"):
+        LearnedTracker(make(tmp_path / "weights.onnx"))
 
 
 def test_what_is_no_network_is_told_as_before(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from skyloop.client.authority import TakeoverAnswer, TakeoverWay
 from skyloop.client.channels import VideoOptions
 from skyloop.client.commands import by_name
 from skyloop.client.connect import ConnectOptions
+from skyloop.client.drone import LOOK_S
 from skyloop.client.frame import Arrival
 from skyloop.client.logbook import Logbook
 from skyloop.client.mailbox import Mailbox
@@ -379,29 +380,32 @@ class Drone:
         Raises:
             NoAnswerError: If no frame comes within ``timeout_s``.
         """
-        channel = self.sync._core.channel(camera, **how)
-        notifier = LoopNotifier()
-        came = notifier.came
-        max_age_s = how.get("max_age_s")
-        mailbox: Mailbox[Arrival] = Mailbox(notifier=notifier)
-        deadline = notifier.loop.time() + timeout_s
-        with self.sync._core.closing(mailbox), channel.into(mailbox):
-            while not self.sync.closed:
-                try:
-                    await asyncio.wait_for(came.wait(), deadline - notifier.loop.time())
-                except TimeoutError:
-                    raise self.sync._core.no_frame(channel.camera.name, timeout_s) from None
-                came.clear()
-                arrival = mailbox.take()
-                if arrival is None:
-                    continue
-                if arrival.header.encoding is Encoding.JPEG:
-                    frame = await in_thread(lambda arrival=arrival: channel.picture(arrival, max_age_s))  # type: ignore[misc]
-                else:
-                    frame = channel.picture(arrival, max_age_s)
-                if frame is not None:
-                    yield frame
-                    deadline = notifier.loop.time() + timeout_s
+        core, notifier = self.sync._core, LoopNotifier()
+        came, loop = notifier.came, notifier.loop
+        max_age_s, deadline = how.get("max_age_s"), loop.time() + timeout_s
+        now = core.channel(camera, **how)
+        while not self.sync.closed:
+            channel, mailbox = now, Mailbox[Arrival](notifier=notifier)
+            with core.closing(mailbox), channel.into(mailbox):
+                while not self.sync.closed and now is channel:
+                    try:
+                        await asyncio.wait_for(came.wait(), min(LOOK_S, deadline - loop.time()))
+                    except TimeoutError:
+                        if loop.time() >= deadline:
+                            raise core.no_frame(channel.camera.name, timeout_s) from None
+                        now = core.channel(camera, **how)  # another, once the proxy was started with other cameras
+                        continue
+                    came.clear()
+                    arrival = mailbox.take()
+                    if arrival is None:
+                        continue
+                    if arrival.header.encoding is Encoding.JPEG:
+                        frame = await in_thread(lambda c=channel, a=arrival: c.picture(a, max_age_s))  # type: ignore[misc]
+                    else:
+                        frame = channel.picture(arrival, max_age_s)
+                    if frame is not None:
+                        yield frame
+                        deadline = loop.time() + timeout_s
 
     def result(self, processor: str, *, max_age_s: float | None = None) -> client.Result | None:
         """Return a processor's newest result without waiting; see :meth:`skyloop.Drone.result`."""

@@ -5,12 +5,24 @@ ViTTrack (``cv2.TrackerVit``) is one ONNX file, NanoTrack (``cv2.TrackerNano``) 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from skyloop.errors import FileFormatError, UnsupportedError, UsageError
+from skyloop.vision import onnx
 from skyloop.vision.opencv import opencv
 from skyloop.vision.tracking import Box, Image, Tracker, TrackResult
+
+
+def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
+    """Return OpenCV's tracker of a name with its weights: one file of ViTTrack, two of NanoTrack."""
+    settings = getattr(cv, f"{name}_Params")()
+    if len(files) == 1:
+        (settings.net,) = files
+    else:
+        settings.backbone, settings.neckhead = files
+    return getattr(cv, f"{name}_create")(settings)
 
 
 class LearnedTracker(Tracker):
@@ -32,29 +44,25 @@ class LearnedTracker(Tracker):
             MissingExtraError: OpenCV is not installed.
             UnsupportedError: This OpenCV was built without that tracker.
             UsageError: A file is not there.
-            FileFormatError: A file is not the weights of that tracker.
+            FileFormatError: A file is not the weights of that tracker, or takes too much to load (tried in a child
+                process, as in :func:`skyloop.vision.onnx.load_network`).
         """
         self._cv: Any = opencv("tracking")
         self._lost_below = lost_below
         name = "TrackerVit" if head is None else "TrackerNano"
-        make = getattr(self._cv, f"{name}_create", None)
-        parameters = getattr(self._cv, f"{name}_Params", None)
-        if make is None or parameters is None:
+        if not (hasattr(self._cv, f"{name}_create") and hasattr(self._cv, f"{name}_Params")):
             raise UnsupportedError(
                 f"this OpenCV, {self._cv.__version__}, has no {name}: install opencv-python-headless 4.10 or newer"
             )
-        settings = parameters()
-        if head is None:
-            settings.net = _existing(weights)
-            given = settings.net
-        else:
-            settings.backbone, settings.neckhead = _existing(weights), _existing(head)
-            given = f"{settings.backbone}, {settings.neckhead}"
+        self._name, files = name, [_existing(path) for path in (weights, head) if path is not None]
+        self._given = ", ".join(files)
+        onnx.try_alone(*files, tracker=name)
         try:
-            self._tracker: Any = make(settings)
+            self._tracker: Any = load_tracker(self._cv, name, files)
         except self._cv.error as error:
-            raise FileFormatError(f"{given} can't be loaded as the weights of {name}: {_reason(error)}") from error
-        self._name, self._given = name, given
+            raise FileFormatError(
+                f"{self._given} can't be loaded as the weights of {name}: {_reason(error)}"
+            ) from error
 
     def _start(self, image: Image, box: Box) -> None:
         x, y, width, height = (round(part) for part in box)

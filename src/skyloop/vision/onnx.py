@@ -1,4 +1,4 @@
-"""Networks from ONNX files, run by ONNX Runtime on the processor.
+"""Networks from ONNX files, run on the processor by ONNX Runtime, or by OpenCV as trackers.
 
 A file is a program of a stranger's: before it is loaded here, a child process loads and runs it within limits.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +21,7 @@ _OWN: Final = Path(__file__).with_name("weights")
 #: Modules are looked up where this process does, and not in the working directory: strangers' files may lie there.
 _CHILD: Final = (
     "import sys; sys.path[:] = sys.argv[3:]; "
-    "from skyloop.vision.onnx import run_alone; run_alone(sys.argv[1], int(sys.argv[2]))"
+    "from skyloop.vision.onnx import run_alone; run_alone(int(sys.argv[1]), *sys.argv[2].splitlines())"
 )
 
 
@@ -57,13 +58,18 @@ def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exc
         raise FileFormatError(f"{path} can't be loaded as an ONNX file: {reason(error)}") from error
 
 
-def try_alone(path: Path) -> None:
+def try_alone(*files: Path | str, tracker: str = "") -> None:
     """Load and run a network in a child process within limits.
+
+    Args:
+        files: One; of a tracker one or two.
+        tracker: Name of OpenCV's tracker that they are the weights of; empty: ONNX Runtime loads the file.
 
     Raises:
         FileFormatError: It can't be loaded, or not within the limits.
     """
-    command = [sys.executable, "-c", _CHILD, str(path), str(CPU_S), *(one for one in sys.path if isinstance(one, str))]
+    path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
+    command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]
     limits = f"{CPU_S} s of the processor and {MEMORY >> 30} GiB of memory to load it and to run it once"
     try:
         ended = subprocess.run(
@@ -72,35 +78,45 @@ def try_alone(path: Path) -> None:
     except subprocess.TimeoutExpired:
         raise FileFormatError(f"{path} is refused: it was not ready within {_WAIT_S:g} s") from None
     if ended.returncode == _REFUSED:
-        raise FileFormatError(f"{path} can't be loaded as an ONNX file: {ended.stdout.strip()}")
+        kind = f"the weights of {tracker}" if tracker else "an ONNX file"
+        raise FileFormatError(f"{path} can't be loaded as {kind}: {ended.stdout.strip()}")
     if ended.returncode != 0:
         last = (ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"])[-1][:300]
         why = f"signal {-ended.returncode}" if ended.returncode < 0 else last
         raise FileFormatError(f"{path} is refused: it takes more than {limits} ({why})")
 
 
-def run_alone(path: str, cpu_s: int) -> None:
+def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
     """Load a network and run it on zeros, within limits; the whole of a child process's life."""
-    import numpy as np
-
     if sys.platform != "win32":
         import resource
 
-        memory = MEMORY + 4 * Path(path).stat().st_size
+        memory = MEMORY + 4 * sum(Path(path).stat().st_size for path in files)
         for kind, most in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_AS, memory)):
             _, allowed = resource.getrlimit(kind)  # who is allowed less can't ask for more
             limit = most if allowed == resource.RLIM_INFINITY else min(most, allowed)
             resource.setrlimit(kind, (limit, limit))
+    try:
+        run = _tracker(tracker, files) if tracker else _network(files[0])
+    except Exception as error:  # noqa: BLE001  it is raised again where the network was asked for
+        print(reason(error))
+        sys.exit(_REFUSED)
+    try:
+        run()
+    except Exception as error:
+        if isinstance(error, MemoryError) or "alloc" in str(error).lower():
+            raise
+
+
+def _network(path: str) -> Callable[[], object]:
+    """Load a network, and return what runs it on zeros."""
+    import numpy as np
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    try:
-        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # noqa: BLE001  it is raised again where the network was asked for
-        print(reason(error))
-        sys.exit(_REFUSED)
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     kinds = {"tensor(float16)": np.float16, "tensor(uint8)": np.uint8, "tensor(int64)": np.int64}
     feed = {
         each.name: np.zeros(
@@ -109,11 +125,18 @@ def run_alone(path: str, cpu_s: int) -> None:
         )
         for each in session.get_inputs()
     }
-    try:
-        session.run(None, feed)
-    except Exception as error:
-        if isinstance(error, MemoryError) or "alloc" in str(error).lower():
-            raise
+    return lambda: session.run(None, feed)
+
+
+def _tracker(name: str, files: Sequence[str]) -> Callable[[], object]:
+    """Load a tracker's weights, and return what tracks with them in a black image."""
+    import numpy as np
+
+    from skyloop.vision.learned import load_tracker
+    from skyloop.vision.opencv import opencv
+
+    tracker, image = load_tracker(opencv("tracking"), name, files), np.zeros((240, 320, 3), np.uint8)
+    return lambda: (tracker.init(image, (140, 100, 40, 40)), tracker.update(image))
 
 
 def reason(error: Exception) -> str:
