@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.drivers.base import ExternalPose
+from skyloop.drivers.byte_stream import Rank
 from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import PoseMessage
-from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession
+from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession, rank_of
 from skyloop.drivers.mavlink.setpoints import STEP_NS, Goal
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
@@ -707,6 +708,34 @@ def test_a_vehicle_that_no_longer_reads_is_not_up_before_it_has_answered() -> No
     bench.answer(m.MAV_CMD_SET_MESSAGE_INTERVAL)
     bench.go_on(0.1)
     assert bench.link() is LinkState.UP
+
+
+def test_a_vehicle_that_no_longer_reads_gets_no_set_points_before_it_has_answered() -> None:
+    """Nothing shows that the port, opened again, carries anything: what waits there would be followed late."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.session.broken(ConnectionError("the vehicle no longer reads what is sent"), bench.clock())
+    bench.go_on(0.5)
+    bench.said.clear()
+    for _ in range(10):
+        bench.apply(Velocity(forward=0.5))
+        bench.go_on(0.1)
+    assert not bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
+    bench.apply(Land())
+    bench.go_on(0.1)
+    assert (m.MAV_CMD_DO_SET_MODE, 1, 9, 0, 0) in bench.commands(), "what is repeated is sent all the same"
+    bench.answer(m.MAV_CMD_DO_SET_MODE)
+    bench.apply(Hover())
+    bench.go_on(0.1)
+    assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
+
+
+def test_an_emergency_stop_goes_before_all_else() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.session.command(EmergencyStop(), bench.clock())
+    assert [packet.rank for packet in bench.session.poll(bench.clock())].count(Rank.STOP) == 1
+    assert rank_of(m.MAVLink_command_long_message(1, 1, m.MAV_CMD_COMPONENT_ARM_DISARM, 0, *[0.0] * 7)) is Rank.COMMAND
 
 
 # Nothing comes, and what is sent may arrive --------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from skyloop.drivers.mavlink.microservices import (
 )
 from skyloop.drivers.mavlink.options import ConnectionKind, MavlinkOptions, Peer, limits_text, takeoff_height
 from skyloop.drivers.mavlink.parameters import ParameterExchange
-from skyloop.drivers.mavlink.setpoints import SetpointController
+from skyloop.drivers.mavlink.setpoints import CUT, SetpointController
 from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
 from skyloop.drivers.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.drivers.motor_stop import MotorStop
@@ -70,7 +70,8 @@ def rank_of(message: Message) -> Rank:
     """Return how important a message to the vehicle is on a slow line."""
     kind = message.get_type()
     if kind == "COMMAND_LONG" and message.command in _URGENT:
-        return Rank.COMMAND
+        stops = (message.command, (message.param1, message.param2)) == (CUT.number, CUT.arguments)
+        return Rank.STOP if stops else Rank.COMMAND
     if kind in _SETPOINTS:
         return Rank.SETPOINT
     return Rank.POSE if kind in _POSES else Rank.QUERY
@@ -348,6 +349,8 @@ class MavlinkSession(VehicleSession):
         messages = (
             self.setpoints.messages(vehicle, now_ns) if self.setpoints is not None and vehicle is not None else []
         )
+        if not self._heard_by_it:
+            messages = []  # they would wait somewhere, and be followed when somebody reads again
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 
     def _heartbeats(self, peer: Peer, now_ns: int) -> list[Packet]:
