@@ -16,6 +16,7 @@ from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import PoseMessage
 from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession, rank_of
 from skyloop.drivers.mavlink.setpoints import STEP_NS, Goal
+from skyloop.drivers.mavlink.telemetry import VehicleState
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
 from skyloop.messages import (
@@ -736,6 +737,19 @@ def test_an_emergency_stop_goes_before_all_else() -> None:
     bench.session.command(EmergencyStop(), bench.clock())
     assert [packet.rank for packet in bench.session.poll(bench.clock())].count(Rank.STOP) == 1
     assert rank_of(m.MAVLink_command_long_message(1, 1, m.MAV_CMD_COMPONENT_ARM_DISARM, 0, *[0.0] * 7)) is Rank.COMMAND
+
+
+def test_a_take_off_is_decided_by_one_state_of_the_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, read = Bench(Vehicle(ARDUPILOT)).found(), list[int]()
+    state = MavlinkSession.vehicle_state
+
+    def count(session: MavlinkSession, now_ns: int) -> VehicleState | None:
+        read.append(now_ns)
+        return state(session, now_ns)
+
+    monkeypatch.setattr(MavlinkSession, "vehicle_state", count)
+    bench.session.command(Takeoff(), bench.clock())
+    assert len(read) == 1
 
 
 # Nothing comes, and what is sent may arrive --------------------------------------------------------------------------

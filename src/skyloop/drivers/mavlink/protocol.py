@@ -166,9 +166,10 @@ class MavlinkSession(VehicleSession):
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
             return action  # nothing comes of it; pilots on the ground send it all the time
-        if isinstance(action, Takeoff) and self._wakes_up(self.vehicle_state(now_ns), now_ns):
+        vehicle = self.vehicle_state(now_ns)
+        if isinstance(action, Takeoff) and self._wakes_up(vehicle, now_ns):
             raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))
-        applied = self.setpoints.apply(action, self.vehicle_state(now_ns), now_ns, alone=alone, new=new)
+        applied = self.setpoints.apply(action, vehicle, now_ns, alone=alone, new=new)
         self._keep(action, now_ns)
         due_ns = self.setpoints.due_ns(now_ns)
         self.due_ns = min(self.due_ns, now_ns if due_ns is None else max(now_ns, due_ns))
