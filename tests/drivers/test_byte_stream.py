@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import socket
 import tty
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.byte_stream import STUCK_NS, LinePace, Rank, SerialStream, line_speed
+from skyloop.drivers.byte_stream import STUCK_NS, LinePace, Rank, SerialStream, TcpStream, line_speed
 from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
 
@@ -234,6 +235,50 @@ def test_a_port_that_does_not_tell_what_waits_is_written_to_as_before(
         stream.write(bytes(40), Rank.STOP)
         assert stream.dropped == 0
         assert read_all(far) == 20 * 90 + 40
+
+
+@pytest.fixture
+def peer() -> Iterator[socket.socket]:
+    """A server that accepts one connection, and has room for little."""
+    with socket.socket() as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        yield server
+
+
+def received(connection: socket.socket) -> tuple[bytes, bool]:
+    """Return everything that comes, and whether the connection was ended properly."""
+    came = b""
+    connection.settimeout(5.0)
+    with connection:
+        try:
+            while more := connection.recv(65_536):
+                came += more
+        except ConnectionResetError:
+            return came, False
+    return came, True
+
+
+def test_what_a_connection_holds_when_it_is_closed_is_not_delivered_later(peer: socket.socket) -> None:
+    """The vehicle's network comes back when nobody flies it any more: it must not be armed then."""
+    stream = TcpStream("127.0.0.1", peer.getsockname()[1], ManualClock())
+    connection, _ = peer.accept()
+    with suppress(ConnectionError):
+        stream.write(bytes(1 << 16), Rank.COMMAND)
+        stream.write(b"arm", Rank.COMMAND)
+    stream.close()
+    came, ended = received(connection)
+    assert not came.endswith(b"arm")
+    assert not ended
+
+
+def test_the_last_words_of_a_connection_are_delivered(peer: socket.socket) -> None:
+    stream = TcpStream("127.0.0.1", peer.getsockname()[1])
+    connection, _ = peer.accept()
+    stream.write(b"disarm", Rank.COMMAND)
+    stream.close()
+    assert received(connection) == (b"disarm", True)
 
 
 def test_a_slow_line_carries_set_points_before_poses_and_commands_before_all() -> None:

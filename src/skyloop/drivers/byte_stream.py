@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import re
 import socket
+import struct
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
@@ -20,7 +22,8 @@ CONNECT_S: Final = 1.0
 STUCK_NS: Final = nanoseconds(0.5)  #: a connection that has no room for so long is no longer read
 _MOST: Final = 65_536  # bytes read at once
 _BITS: Final = 10  # that a serial line takes for a byte
-_DRAIN_S: Final = 0.1  # that closing a serial port may take
+_DRAIN_S: Final = 0.1  # that closing a connection may take
+_UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection ends: nothing older is delivered
 _OVERDUE_NS: Final = nanoseconds(0.1)  # a line is stalled if bytes wait so long after it should have carried them
 #: Size of the longest frame of MAVLink and MSP [bytes]. Parsers of flight controllers read as many bytes as a frame
 #: announces and don't look for another frame among them, so a frame that may be cut is filled up before a stop.
@@ -178,6 +181,13 @@ class ByteStream(ABC):
         """Empty the output buffer, which may cut a frame; return whether it did, as far as that is known."""
         return False
 
+    def _drain(self, waiting: Callable[[], int]) -> bool:
+        """Wait a moment for what was written to leave; return whether it did."""
+        until_s = time.monotonic() + _DRAIN_S
+        while self._full_ns is None and waiting() and time.monotonic() < until_s:
+            time.sleep(0.005)
+        return self._full_ns is None and not waiting()
+
     @abstractmethod
     def _write(self, data: bytes) -> int:
         """Write what there is room for and return how many bytes that were; raise BlockingIOError for none."""
@@ -203,6 +213,8 @@ class TcpStream(ByteStream):
         super().__init__(LinePace(None), clock)
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # not on macOS
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNACKNOWLEDGED_MS)
         self._socket.setblocking(False)
 
     def fileno(self) -> int:
@@ -227,8 +239,20 @@ class TcpStream(ByteStream):
         return self._socket.send(data)
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection. What was not received is discarded: the system would go on sending it for minutes."""
+        if not self._drain(self._unacknowledged):
+            with suppress(OSError):
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
+
+    def _unacknowledged(self) -> int:
+        with suppress(Exception):  # not available, or the connection is gone
+            import fcntl
+            import termios
+
+            count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
+            return count
+        return 0
 
 
 class SerialStream(ByteStream):
@@ -294,10 +318,7 @@ class SerialStream(ByteStream):
 
     def close(self) -> None:
         """Close the port. What nobody reads is thrown away: the system would wait for it, with some ports for 30 s."""
-        until_s = time.monotonic() + (_DRAIN_S if self._full_ns is None else 0.0)
-        while self._waiting() and time.monotonic() < until_s:
-            time.sleep(0.005)
-        if self._full_ns is not None or self._waiting():
+        if not self._drain(self._waiting):
             self._discard()
         self._port.close()
 
