@@ -835,6 +835,36 @@ def test_an_emergency_stop_outlives_what_is_known_of_the_vehicle() -> None:
     assert "stop_given_up" in [event.data.get("reason") for event in bench.sink.events]
 
 
+def cuts(bench: Bench) -> int:
+    return [each[:3] for each in bench.commands()].count((m.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, 21196.0))
+
+
+def test_an_emergency_stop_of_a_vehicle_that_was_never_heard_is_sent_and_kept_until_it_is_found() -> None:
+    """As when its proxy was restarted in flight."""
+    bench = Bench(Vehicle(ARDUPILOT, system=7), options("mavlink://udpout:10.0.0.5:14550?parameters=no&sysid=7"))
+    assert bench.apply(EmergencyStop()) == EmergencyStop()
+    bench.go_on(1.0, silent=True)
+    assert [each.target_system for each in bench.said if each.get_type() == "COMMAND_LONG"][:1] == [7]
+    assert cuts(bench) >= 9
+    bench.flying("GUIDED")
+    bench.go_on(0.5)
+    assert cuts(bench) >= 4
+    bench.vehicle.armed = False
+    bench.go_on(0.5)
+    assert bench.state() is FlightState.EMERGENCY
+
+
+def test_an_emergency_stop_of_a_vehicle_that_is_found_much_later_is_given_up() -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.apply(EmergencyStop())
+    bench.go_on(11.0, silent=True)
+    bench.said.clear()
+    bench.flying("GUIDED")
+    bench.go_on(1.0)
+    assert not cuts(bench)
+    assert "stop_given_up" in [event.data.get("reason") for event in bench.sink.events]
+
+
 def test_a_vehicle_on_the_ground_that_is_not_heard_is_called_each_second() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     bench.go_on(3.0, silent=True)

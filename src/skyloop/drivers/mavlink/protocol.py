@@ -26,7 +26,7 @@ from skyloop.drivers.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, VehicleEvent, VehicleSession
 from skyloop.errors import DriverError
-from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Severity, Takeoff, Value
+from skyloop.messages import AnyAction, EmergencyStop, EventKind, FlightState, Idle, LinkState, Severity, Takeoff, Value
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
@@ -99,7 +99,7 @@ class MavlinkSession(VehicleSession):
         self.codec = Codec(options.own_system, OWN_COMPONENT, key=options.key)
         self.telemetry = Telemetry()
         self.parameters = ParameterExchange()
-        self.commands = CommandSender()
+        self.commands = CommandSender((options.system or 1, options.component))
         self.clock = VehicleClock()
         self.autopilot: AutopilotProfile | None = None  #: None until it is recognised, and for one not known here
         self.setpoints: SetpointController | None = None  #: None until then, and for what can't be flown
@@ -162,6 +162,10 @@ class MavlinkSession(VehicleSession):
         Raises:
             DriverError: The vehicle can't be flown, can't do this now, or somebody else has it.
         """
+        if isinstance(action, EmergencyStop) and self._kind is None:  # found in flight, maybe, in a moment
+            self._stop.press(now_ns)
+            self.due_ns = now_ns
+            return action
         if self.setpoints is None:
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
@@ -327,6 +331,9 @@ class MavlinkSession(VehicleSession):
             stops = self.setpoints.step_stop(None, now_ns)
             if stops or self.setpoints.step_blind(now_ns):
                 out += self.commands.pop_messages()
+        elif self._stop.step(None, now_ns):
+            self.commands.request(CUT, now_ns, 0.0)
+            out += self.commands.pop_messages()
         packets += [
             Packet(self._encoded(message), peer, rank_of(message)) for message in out if self._axes.sent(message)
         ]
