@@ -67,6 +67,7 @@ class MspSession(VehicleSession):
         self.reported = Reported()
         self.sticks_hz: float | None = None  #: acknowledged
         self.unknown = 0  #: frames that answer nothing
+        self.urgent = False  #: what was due last is an emergency stop
         self._parser = Parser()
         self._questions = Questions()
         self._identification: Identification | None = None
@@ -306,7 +307,7 @@ class MspSession(VehicleSession):
         return made
 
     def _due_sticks(self, now_ns: int) -> bytes:
-        urgent = self._step_stop(now_ns)
+        self.urgent = urgent = self._step_stop(now_ns)
         if self.setup is None or not (urgent or (self._may_steer and now_ns >= self._sticks_due_ns)):
             return b""
         while self._sticks and now_ns - self._sticks[0] >= STICKS_LOST_NS:
