@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from contextlib import suppress
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import pytest
 
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
+from skyloop.drivers.msp.motion import Motion
 from skyloop.drivers.msp.setpoints import Phase, Report, SetpointController
 from skyloop.emulators.msp.board import bit
 from skyloop.emulators.msp.settings import BoardSettings
@@ -100,6 +102,60 @@ def test_a_descent_from_height_is_not_taken_for_the_ground() -> None:
     assert bench.board.armed
     assert bench.height_m > 1.0
     assert bench.climb_m_s == pytest.approx(-0.6, abs=0.1)
+
+
+NOISES = (0.05, 0.1, 0.2)  # of the climb [m/s]; that of a position of 1 cm is 0.056 m/s
+SEEDS = 20
+
+
+def descent(climb: float, noise: float, seed: int, seconds: float) -> tuple[SetpointController, list[float]]:
+    """One that is asked to sink at 0.4 m/s, and what it does; the throttle, as share of the one that carries it."""
+    setpoints, chance, now_ns, shares = SetpointController(), random.Random(seed), NS_PER_S, []
+    setpoints.on_report(Report(True), now_ns)
+    setpoints.adopt(0.3, now_ns)
+    setpoints.apply(Attitude(climb=-0.4), now_ns)
+    for tick in range(round(seconds / 0.02)):
+        now_ns += NS_PER_S // 50
+        true = climb if tick > 50 else -0.4
+        setpoints.on_motion(Motion(climb_m_s=true + chance.gauss(0.0, noise), height_m=0.5, precise=True))
+        setpoints.channels(now_ns)
+        if setpoints.phase is Phase.STANDING:
+            break
+        shares.append(setpoints.throttle / (setpoints.hover or 1.0))
+    return setpoints, shares
+
+
+@pytest.mark.parametrize("noise", [0.0, *NOISES])
+def test_a_touch_down_is_seen_through_the_noise_of_positions(noise: float) -> None:
+    """It stayed armed while its throttle fell: 0.6 s of noise below 0.1 m/s never came."""
+    for seed in range(SEEDS):
+        setpoints, shares = descent(0.0, noise, seed, 1.0 + 3.0)
+        assert setpoints.phase is Phase.STANDING, seed
+        assert setpoints.hover == pytest.approx(0.3, rel=0.2), "the throttle that carries it is not unlearnt"
+        assert len(shares) * 0.02 > 1.0 + 0.6
+
+
+@pytest.mark.parametrize("noise", [0.0, *NOISES])
+def test_a_slow_sink_is_not_taken_for_a_touch_down(noise: float) -> None:
+    for seed in range(SEEDS):
+        setpoints, shares = descent(-0.15, noise, seed, 30.0)
+        assert setpoints.phase is Phase.FLYING, seed
+        assert min(shares) > 0.7, "nothing is taken away"
+
+
+@pytest.mark.parametrize("climb", [-0.15, -0.4])
+@pytest.mark.parametrize("noise", NOISES)
+def test_a_landing_by_noisy_positions(noise: float, climb: float) -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.noise_m = noise / 5.6
+    bench.fly(climb=climb)
+    while bench.height_m > 0.06:
+        bench.run(0.1)
+        assert bench.board.armed
+        assert bench.height_m < 0.3 or bench.climb_m_s > climb - 0.15
+    bench.until(lambda: not bench.board.armed, 3.0)
+    assert bench.height_m < 0.06
 
 
 @pytest.mark.parametrize("world_speed", [1.0, 0.6, 0.45, 0.3])
@@ -419,8 +475,17 @@ def test_what_does_not_disarm_by_a_stop_is_not_told_to_have_landed() -> None:
         told.add(setpoints.flight_state())
     assert [event.data["reason"] for event in setpoints.pop_events()] == ["stop_given_up"]
     assert told == {FlightState.UNKNOWN}
+    for _ in range(2):
+        with pytest.raises(DriverError, match="still armed"):
+            setpoints.apply(ResetEmergency(), now_ns)
+        assert setpoints.flight_state() is FlightState.UNKNOWN
+        assert "still armed" in setpoints.ask_takeoff(now_ns)
+        assert setpoints.channels(now_ns)[:4].count(1000) == 1, "no throttle"
+        setpoints.lost()
     setpoints.on_report(Report(False), now_ns)
     assert setpoints.flight_state() is FlightState.LANDED
+    setpoints.apply(ResetEmergency(), now_ns)
+    assert "still armed" not in setpoints.ask_takeoff(now_ns)
 
 
 def test_a_stop_pressed_in_a_long_loss_does_not_disarm_what_flies_when_the_link_is_back() -> None:
