@@ -129,6 +129,11 @@ class SetpointController:
         """Changes when something else is to be sent."""
         return self._decision, self._stick, self.stop.active
 
+    @property
+    def flies_unheard(self) -> bool:
+        """Whether it flew when it was heard last, and may still."""
+        return not self.receiving and self._was_in_air
+
     def flight_state(self) -> FlightState:
         """Return the flight state for feedback."""
         if self.stop.shown:
@@ -231,6 +236,10 @@ class SetpointController:
         self._decision, self.watch.sinking = Decision.STAY, False
         self._steering, self.left_alone = False, True
         return True
+
+    def forget_flight(self) -> None:
+        """Take it for landed: it was not heard, and sent nothing, for as long as it takes it to land by itself."""
+        self._was_in_air = self._steering = False
 
     # What is received ---------------------------------------------------------------------------------------------
 
