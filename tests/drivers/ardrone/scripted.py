@@ -70,6 +70,11 @@ class ScriptedDrone:
             self.commands.append(command)
             self._obey(command)
 
+    def land(self) -> None:
+        """By itself."""
+        self.state &= ~State.FLYING
+        self.control = ControlState.LANDED
+
     def hear_bit(self) -> None:
         """Another program's emergency bit stayed set, and is known."""
         self._ref = Ref.EMERGENCY

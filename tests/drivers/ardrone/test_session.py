@@ -580,3 +580,54 @@ def test_motors_that_another_program_releases_soon_are_stopped_again() -> None:
     rig.run(2.0)
     rig.drone.state = rig.drone.state & ~State.EMERGENCY | State.FLYING
     assert rig.until(lambda: State.EMERGENCY in rig.drone.state, 2.0) < 0.8
+
+
+# What stands does not take off by what it was ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stall_s", [0.5, 0.9, 4.0])
+def test_a_drone_that_landed_while_the_driver_stood_still_stays_there(stall_s: float) -> None:
+    """It hears nothing for 2 s and lands. Navdata of its flight wait for whoever wakes up, and told it to take off."""
+    rig = flying()
+    rig.session.command(Hover(), rig.clock.now_ns)
+    rig.run(0.2)
+    waiting = []
+    for step in range(round(stall_s * 15)):
+        rig.clock.advance(1 / 15)
+        if step == round(stall_s * 10):
+            rig.drone.land()
+        waiting.append(rig.drone.navdata())
+    before = len(rig.drone.commands)
+    for number, datagram in enumerate(waiting):
+        rig.session.on_navdata(datagram, rig.clock.advance(0.0005))
+        if number % 3 == 0:  # between two bursts
+            rig.session.command(Hover(), rig.clock.now_ns)
+            rig.drone.take(rig.session.poll(rig.clock.now_ns))
+        assert State.FLYING not in rig.drone.state
+    rig.run(2.0)
+    assert len(rig.drone.commands) > before + 20
+    assert State.FLYING not in rig.drone.state
+
+
+def test_a_drone_that_is_not_heard_for_a_moment_is_not_told_to_take_off() -> None:
+    rig = flying()
+    rig.lost = lambda: True
+    rig.run(0.5)
+    rig.drone.land()
+    rig.late = lambda up: 0.0 if up else 10.0
+    rig.lost = lambda: False
+    rig.run(0.4)
+    assert State.FLYING not in rig.drone.state
+    rig.late = lambda _up: 0.0
+    rig.run(0.5)
+    assert State.FLYING not in rig.drone.state
+
+
+def test_a_drone_that_flies_is_told_to_again_after_a_gap() -> None:
+    rig = flying()
+    rig.lost = lambda: True
+    rig.run(0.5)
+    rig.lost = lambda: False
+    rig.run(0.5)
+    references = [command for command in rig.drone.commands if command.name == "REF"]
+    assert Ref(int(references[-1].arguments[0])) & Ref.TAKEOFF

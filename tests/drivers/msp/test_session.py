@@ -562,6 +562,22 @@ def test_a_climb_that_is_lost_before_the_lift_off_ends_the_take_off() -> None:
     assert "no longer measured" in bench.texts("no_takeoff")[0]
 
 
+def test_the_throttle_is_not_raised_while_the_flight_controller_is_not_heard() -> None:
+    """Poses still told its climb, and the take-off went on asking for one."""
+    bench = Bench()
+    bench.ready()
+    bench.fly(climb=0.5)
+    bench.until(lambda: bench.session.setpoints.phase is Phase.SPOOLING, 2.0)
+    bench.deaf = True
+    for _ in range(150):
+        with suppress(DriverError):
+            bench.session.command(Attitude(climb=0.5), bench.clock.now_ns)
+        bench.tick()
+    assert "nothing is received" in bench.texts("no_takeoff")[0]
+    assert not bench.board.armed
+    assert bench.height_m < 0.06
+
+
 def test_one_that_was_started_just_now_says_what_it_waits_for() -> None:
     """``connect()`` returned seconds before it could be armed, and nothing said so."""
     bench = Bench(BoardSettings(boot_s=5.0))

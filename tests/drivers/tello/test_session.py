@@ -133,6 +133,22 @@ def test_a_take_off_that_a_landing_withdraws_before_it_shows_is_landed(after_s: 
     assert not [text for text in rig.said if text.startswith(("rc", "land", "takeoff"))]
 
 
+def test_a_drone_that_falls_over_in_its_take_off_is_not_started_again() -> None:
+    """It was, while somebody walked up to it: until 8 s had passed since the take-off was asked for."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.TAKING_OFF, 4.0)
+    rig.bench.logic.receive(b"emergency", PILOT)
+    rig.take_said()
+    rig.until(lambda: rig.state is FlightState.LANDED, 5.0)
+    rig.run(8.0)
+    assert "takeoff" not in rig.said
+    assert rig.reasons.count("no_takeoff") == 1
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+
+
 def test_a_drone_that_refuses_to_take_off_is_told() -> None:
     rig = Rig()
     rig.ready()

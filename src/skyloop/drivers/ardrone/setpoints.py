@@ -135,6 +135,10 @@ class Condition:
         return bool(self.state & State.EMERGENCY)
 
 
+#: After so long without navdata a drone may stand that flew: it lands by itself where it hears nothing for 2 s.
+SILENT_NS: Final = nanoseconds(0.25)
+
+
 class Decision(Enum):
     """What is wanted of take-off and landing."""
 
@@ -166,6 +170,7 @@ class SetpointController:
         self._changed_ns = 0  # when it changed, was asked for, or an emergency was over
         self._passed_ns = 0  # of the drone's time since then, up to the newest navdata
         self._received_ns = 0
+        self._late_ns = 0  # so old are navdata that waited, and come in a row after a gap
         self._warned_blind = False
         self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
         self._events: list[VehicleEvent] = []
@@ -279,7 +284,14 @@ class SetpointController:
             passed_ns: The drone's own time since the navdata before; None: as much as here. What was on its way for
                 long, and comes at once, is no news.
         """
-        self._passed_ns += now_ns - self._received_ns if passed_ns is None else passed_ns
+        gap_ns = now_ns - self._received_ns
+        passed_ns = gap_ns if passed_ns is None else passed_ns
+        self._passed_ns += passed_ns
+        in_a_row = 2 * gap_ns < passed_ns  # else nothing waits any more
+        if gap_ns >= SILENT_NS and self._received_ns:
+            self._late_ns = gap_ns - passed_ns
+        elif self._late_ns:
+            self._late_ns = max(0, self._late_ns + gap_ns - passed_ns) if in_a_row else 0
         if self.condition is None or (self._emergency and not condition.emergency):
             self._changed_ns, self._passed_ns = now_ns, 0  # navdata have to go on saying so: these may be old
         self._emergency = condition.emergency
@@ -365,5 +377,7 @@ class SetpointController:
             return Ref(0)
         if self.condition is None:
             return None  # it goes on with whatever it does
+        if self.condition.flying and max(self._late_ns, now_ns - self._received_ns) >= SILENT_NS:
+            return None  # as one that stands would take off
         by_itself = self.condition.control is ControlState.LANDING and not self._landing_is_ours
         return Ref.TAKEOFF if self.condition.flying and not by_itself else Ref(0)

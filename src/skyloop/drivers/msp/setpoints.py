@@ -402,8 +402,9 @@ class SetpointController:
             self._enter(Phase.STANDING, now_ns)
             return
         motion = self._motion
-        if motion.climb_m_s is None:
-            self._give_up("its climb is no longer measured", now_ns)
+        if motion.climb_m_s is None or not self.receiving:
+            lacking = "nothing is received from it" if motion.precise else "its climb is no longer measured"
+            self._give_up(lacking, now_ns)
             return
         high, fast = LIFTED[motion.precise]
         if motion.climb_m_s > fast or (motion.height_m is not None and motion.height_m > high):

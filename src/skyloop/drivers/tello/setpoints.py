@@ -245,9 +245,13 @@ class SetpointController:
 
     def on_state(self, now_ns: int) -> None:
         """Handle that the watch has seen a new state."""
-        phase = self.watch.phase
+        phase, rose = self.watch.phase, self._was_in_air and self._decision is Decision.TAKE_OFF
         self.receiving, self._state_ns = True, now_ns
         self._was_in_air = phase.airborne
+        if rose and phase is FlightState.LANDED:  # it fell over, or was stopped: a take-off begins once
+            self._decide(Decision.STAY, now_ns)
+            text = "the drone began to take off, and its motors stopped: it is not started again"
+            self._events.append(message(text, "no_takeoff", Severity.WARNING))
         shown = {Decision.TAKE_OFF: FlightState.HOVERING, Decision.LAND: FlightState.LANDED}.get(self._decision)
         if phase is shown and not (self._decision is Decision.LAND and now_ns < self._rises_until_ns):
             self._decide(Decision.STAY, now_ns)
