@@ -199,7 +199,9 @@ class Rig:
 
     def _deliver(self, *, up: bool) -> None:
         now_ns = self.clock.now_ns
-        come = sorted((each for each in self._under_way if each[0] <= now_ns and each[1] is up), key=lambda each: each[0])
+        come = sorted(
+            (each for each in self._under_way if each[0] <= now_ns and each[1] is up), key=lambda each: each[0]
+        )
         for each in come[:1]:  # one at a step, as what was held back comes
             self._under_way.remove(each)
             if up:

@@ -37,6 +37,7 @@ class Bench:
     """A drone on the ground, seen by cameras if ``poses``; ``cut``: nothing passes; ``deaf``: no reply passes.
 
     ``world_speed``: of the simulated world, beside the clock of board and driver. ``noise_m``: of the poses' height.
+    ``unanswered``: functions whose replies do not pass.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class Bench:
         self.sink = RecordingSink()
         self.poses = poses
         self.cut = self.deaf = False
+        self.unanswered: set[int] = set()
         self.world_speed = 1.0
         self.noise_m = 0.0
         self._random = random.Random(3)
@@ -109,7 +111,7 @@ class Bench:
         for frame in self._parser.feed(data):
             self.sent.append(frame)
             reply = self.board.answer(frame, self.clock.now_ns)
-            if reply is not None and not self.deaf:
+            if reply is not None and not self.deaf and frame.function not in self.unanswered:
                 self.session.receive(encode(reply), self.clock.now_ns)
 
     def _look(self) -> None:

@@ -417,6 +417,39 @@ def test_sticks_are_held_back_while_none_is_acknowledged() -> None:
     assert sent <= 21, "not the 25 of a healthy link: what waits would be obeyed late"
 
 
+@pytest.mark.parametrize("function", [Function.BOXNAMES, Function.MODE_RANGES, Function.RX_MAP])
+def test_what_is_found_again_in_flight_is_not_steered_by_guesses(function: Function) -> None:
+    """One lost answer made its arm switch or its order of sticks unknown: it was disarmed in the air."""
+    bench = Bench()
+    bench.take_off()
+    bench.fly(climb=0.8)
+    bench.run(2.0)
+    bench.fly()
+    bench.deaf = True
+    bench.until(lambda: bench.sink.link_state is LinkState.LOST, 2.0)
+    bench.deaf = False
+    bench.unanswered = {function}
+    for _ in range(45):
+        bench.run(0.1)
+        assert bench.board.armed
+    assert abs(bench.climb_m_s) < 0.3
+    assert len(bench.texts("setup_unread")) == 1
+    bench.unanswered = set()
+    bench.run(2.5)
+    assert bench.board.armed
+    assert len(bench.texts("firmware")) == 2, "they were read at last"
+
+
+def test_what_does_not_tell_the_order_of_its_sticks_is_asked_until_it_does() -> None:
+    bench = Bench()
+    bench.unanswered = {Function.RX_MAP}
+    bench.run(5.0)
+    assert LinkState.UP not in {state for state, _ in bench.sink.links}
+    assert not [frame for frame in bench.sent if frame.function == Function.SET_RAW_RC]
+    bench.unanswered = set()
+    bench.until(lambda: bench.sink.link_state is LinkState.UP, 5.0)
+
+
 # Stops ---------------------------------------------------------------------------------------------------------------
 
 

@@ -1,10 +1,10 @@
 """Set-points to ``REF`` and ``PCMD``: what is sent to the drone at each tick. Pure.
 
 ``REF`` has take-off, landing and emergency as bits that must be repeated until navdata shows the new state. The
-emergency bit toggles each time that it is set after it was clear: what is asked for sets it once, and it is then repeated
-set, which makes up for lost packets, until navdata shows the change. It is set once more only when navdata that the
-drone made later show no effect: one toggle too many would undo the first. ``PCMD`` takes roll (positive to the right), pitch (negative nose down), climb (positive up) and yaw
-rate (positive clockwise), each from -1 to 1: shares of the limits that the drone is configured with.
+emergency bit toggles when it is set after it was clear. It is set once for what is asked for, and repeated for what gets
+lost, until navdata shows the change; again only after navdata that the drone made later showed no effect, as one toggle
+too many would undo the first. ``PCMD`` takes roll (positive to the right), pitch (negative nose down), climb (positive
+up) and yaw rate (positive clockwise), each from -1 to 1: shares of the limits that the drone is configured with.
 """
 
 from __future__ import annotations
