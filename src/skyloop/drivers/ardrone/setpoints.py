@@ -1,10 +1,11 @@
 """Set-points to ``REF`` and ``PCMD``: what is sent to the drone at each tick. Pure.
 
 ``REF`` has take-off, landing and emergency as bits that must be repeated until navdata shows the new state. The
-emergency bit toggles when it is set after it was clear. It is set once for what is asked for, and repeated for what gets
-lost, until navdata shows the change; again only after navdata that the drone made later showed no effect, as one toggle
-too many would undo the first. ``PCMD`` takes roll (positive to the right), pitch (negative nose down), climb (positive
-up) and yaw rate (positive clockwise), each from -1 to 1: shares of the limits that the drone is configured with.
+emergency bit toggles when it is set after it was clear. It is set once for what is asked for, and repeated as packets
+get lost, until navdata shows the change; again only after navdata that the drone made later showed no effect, as one
+toggle too many would undo the first. ``PCMD`` takes roll (positive to the right), pitch (negative nose down), climb
+(positive up) and yaw rate (positive clockwise), each from -1 to 1: shares of the limits that the drone is configured
+with.
 """
 
 from __future__ import annotations
