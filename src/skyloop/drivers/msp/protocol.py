@@ -74,6 +74,7 @@ class MspSession(VehicleSession):
         self._telemetry: Telemetry | None = None
         self._known = False  # who it is was asked since it was found
         self._refused_variant = ""
+        self._unread = ""  # what it did not tell of its settings
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns
         self._sticks: deque[int] = deque()  # when those without an acknowledgement were sent
@@ -370,7 +371,17 @@ class MspSession(VehicleSession):
             self._set_link_state(LinkState.DEGRADED, text)
 
     def _on_setup(self, setup: Setup) -> None:
-        self.setup, self._known = setup, True
+        assert self._identification is not None
+        if self._identification.missing:  # its throttle or arm switch would be guessed: it is asked again
+            missing = ", ".join(self._identification.missing)
+            if missing != self._unread:
+                text = (
+                    f"the flight controller did not tell the {missing}: it is asked again, and not steered by guesses"
+                )
+                self._publish_event(message(text, "setup_unread", Severity.WARNING))
+            self._unread = missing
+            return
+        self.setup, self._known, self._unread = setup, True, ""
         self.reported.cells = setup.cells
         diagnostics = setup.diagnose(override=self.options.override)
         self.setpoints.set_up(setup, hindrances(diagnostics))
