@@ -251,6 +251,33 @@ def following(client: TestClient, node: Node) -> Iterator[Marker]:
             yield pilot
 
 
+def test_a_hand_over_that_both_want_ends_in_no_refusal(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+    """Who gave it while it flew after a target was told that it had lost control, and of refusals of idle by lease."""
+    with following(client, node) as giver, page(client) as asker:
+        with giver.staying():
+            giver.select()  # the next target is being drawn
+        asker.say("take", priority=8, ask=True)
+        [asked] = giver.wait("asked")["questions"]
+        giver.say("answer", id=asked["id"], grant=True)
+        told = giver.wait("authority", mine=False)
+        assert told["given"]
+        assert told["why"] == f"{asked['by']} has control now"
+        giver.say("ping", n=6)
+        giver.wait("pong", n=6)
+        assert [one["problem"] for one in giver.told if one.get("state") == "ended"] == [NO_CONTROL]
+        assert asker.wait("authority", mine=True)["holder"] == asked["by"]
+        until(lambda: node.flyer.state is FlightState.HOVERING, "it hovers before it changes hands")
+        with asker.staying():
+            asker.say("fly", up=0.1)
+            until(lambda: count(node, Velocity(up=0.1)))
+            giver.say("ping", n=7)
+            giver.wait("pong", n=7)
+            asker.say("hover")
+            asker.wait("done", do="hover")
+        for pilot in (giver, asker):
+            assert [one for one in pilot.told if one["type"] == "refused"] == []
+
+
 @pytest.mark.parametrize(
     ("do", "values", "then"),
     [
