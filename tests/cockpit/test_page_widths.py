@@ -170,7 +170,7 @@ def test_an_alarm_covers_nothing(deck: Deck) -> None:
 
 
 #: Which controls, pictures and maps lie elsewhere while a banner is shown, and when it is not.
-MOVED = """(selector) => {
+MOVED = """(selectors) => selectors.flatMap((selector) => {
   const boxes = () => [...document.querySelectorAll("button, input, select, a, .pill, .tile, .map, .video")]
     .filter((one) => one.checkVisibility({visibilityProperty: true}) && !one.closest(".said, .page-said, .alarm-chip"))
     .map((one) => {
@@ -186,8 +186,8 @@ MOVED = """(selector) => {
   const without = boxes();
   banner.hidden = hidden;
   if (!text) banner.textContent = "";
-  return shown.filter((one) => !without.includes(one));
-}"""
+  return shown.filter((one) => !without.includes(one)).map((one) => `${selector}: ${one}`);
+})"""
 
 
 def moved(page: DronePage, *banners: str) -> str:
@@ -198,7 +198,7 @@ def moved(page: DronePage, *banners: str) -> str:
         for down in (0, 150):
             page.page.evaluate(f"scrollTo(0, {down})")
             page.page.evaluate(DRAWN)
-            found += [f"{width} {one}: {each}" for one in banners for each in page.page.evaluate(MOVED, one)]
+            found += [f"{width} {one}" for one in page.page.evaluate(MOVED, banners)]
     return "\n".join(found)
 
 
@@ -223,14 +223,22 @@ window.WebSocket = class extends WebSocket {
 """
 
 
-def test_what_is_said_of_all_drones_moves_nothing(deck: Deck) -> None:
-    deck.proxy("told")
-    one, all_of_them = deck.page("told", panels=False), deck.overview(DEAF)
-    for page, place in ((one, ".said"), (all_of_them, ".overview-head")):
-        landed(page)
-        assert page.page.locator(f"{place} .safety-message").is_visible()
-        assert moved(page, ".safety-message") == ""
-    assert moved(one, ".alarms", ".alarm-chip", ".notice") == ""
-    all_of_them.page.evaluate("window.deaf = true")
-    all_of_them.page.locator(".lost").wait_for()
-    assert moved(all_of_them, ".lost") == ""
+def test_what_is_said_of_one_drone_or_all_moves_nothing(deck: Deck) -> None:
+    for name in ("told", "beside"):
+        deck.proxy(name)
+    page = deck.page("told", panels=False)
+    landed(page)
+    assert page.page.locator(".said .safety-message").is_visible()
+    page.page.locator(".card").nth(1).wait_for()
+    assert moved(page, ".safety-message", ".alarms", ".alarm-chip", ".notice", ".card-alarm") == ""
+
+
+def test_what_is_said_above_all_drones_moves_nothing(deck: Deck) -> None:
+    deck.proxy("listed")
+    page = deck.overview(DEAF)
+    landed(page)
+    assert page.page.locator(".overview-head .safety-message").is_visible()
+    assert moved(page, ".safety-message") == ""
+    page.page.evaluate("window.deaf = true")
+    page.page.locator(".lost").wait_for()
+    assert moved(page, ".lost") == ""
