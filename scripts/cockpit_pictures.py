@@ -404,7 +404,6 @@ def open_page(chromium: Browser, address: str, size: ViewportSize, scheme: Schem
     context = chromium.new_context(
         viewport=size, color_scheme=scheme, has_touch=size in TOUCHED, is_mobile=size in TOUCHED
     )
-    context.add_init_script("localStorage.setItem('skyloop-panels', 'true')")
     page = context.new_page()
     page.goto(address)
     return page
