@@ -16,7 +16,6 @@ from rich.live import Live
 from rich.text import Text
 
 from skyloop.cli.demo_follow import FOLLOW_EXAMPLE, follow_anything
-from skyloop.cli.demo_paper import PAPER_EXAMPLE, paper
 from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
 from skyloop.cli.demo_report import DemoReport, TruthMeter
 from skyloop.errors import LinkError, UsageError
@@ -32,7 +31,6 @@ _FIRST_PICTURE_S = 10.0
 _REFRESH_HZ = 4
 
 demo = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
-demo.command("paper", short_help="The paper's test flight and its figures", epilog=PAPER_EXAMPLE)(paper)
 demo.command("follow-anything", short_help="Follow a person who walks about", epilog=FOLLOW_EXAMPLE)(follow_anything)
 
 
@@ -58,7 +56,7 @@ def follow(
 ) -> None:
     """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands.
 
-    skyloop demo follow-anything follows a person without any marker; skyloop demo paper flies the paper's experiment.
+    skyloop demo follow-anything follows a person without any marker.
     """
     if context.invoked_subcommand is not None:
         for given in context.params:

@@ -47,7 +47,6 @@ EXTRAS: Final = (
 NEEDS: Final = {
     "demo": ("sim", "vision", "cockpit"),
     "demo follow-anything": ("sim", "vision", "detect", "cockpit"),
-    "demo paper": ("sim", "cockpit", "record", "control", "bench"),
     "fly": ("sim", "vision"),
     "fly follow": ("vision", "detect"),
     "detect": ("detect", "vision"),

@@ -1,8 +1,9 @@
-"""``skyloop demo paper``: the paper's test flight on a simulated AR.Drone, recorded, and its table and figures."""
+"""``python -m benchmarks.paper``: the paper's test flight on a simulated AR.Drone, its table and its figures."""
 
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -16,17 +17,18 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from benchmarks.one_command import one_command
+from skyloop.cli.app import run
 from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
+    from benchmarks.paper.evaluation import Experiment
+    from benchmarks.paper.flight import PaperFlight
     from skyloop.bench import tables
     from skyloop.bench.machine import Machine
-    from skyloop.bench.paper.evaluation import Experiment
-    from skyloop.bench.paper.flight import PaperFlight
     from skyloop.client import Drone
 
-PAPER_EXAMPLE: Final = "Example: skyloop demo paper --minutes 1 --output experiment"
 RECORDING: Final = "flight.mcap"
 LEAST_MINUTES: Final = 0.05
 CAMERA: Final = "front"
@@ -101,8 +103,8 @@ def _prepared(output: Path | None) -> Path:
 
 
 def _evaluated(console: Console, folder: Path, machine: Machine, load: float | None) -> Experiment:
-    from skyloop.bench.paper import report
-    from skyloop.bench.paper.evaluation import evaluate
+    from benchmarks.paper import report
+    from benchmarks.paper.evaluation import evaluate
 
     with console.status("working out the figures"):
         results = evaluate(folder / RECORDING, machine, load)
@@ -136,7 +138,7 @@ class _Flight:
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> None:
         """``port`` None: the default one of pages. Raises the errors of connecting, of recording and of take-off."""
-        from skyloop.bench.paper.flight import DelayLog, PaperFlight
+        from benchmarks.paper.flight import DelayLog, PaperFlight
         from skyloop.client import connect
         from skyloop.cockpit.child import CockpitProcess
         from skyloop.motion_capture import mocap
@@ -215,3 +217,7 @@ def _status(drone: Drone, flight: PaperFlight) -> str:
         holder = drone.authority.holder
         return f"{holder} flies" if flight.away and holder != "paper" else "on its way back"
     return f"{flight.reached} waypoints, {flight.off_m * 1e2:.0f} cm off, RMS {flight.error.rms_m * 1e2:.1f} cm"
+
+
+if __name__ == "__main__":
+    run(one_command(paper), sys.argv[1:], "benchmarks.paper")

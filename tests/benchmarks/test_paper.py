@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import skyloop
+from benchmarks.paper import evaluation, report
+from benchmarks.paper.evaluation import RECORDER, Experiment, distances_to_round, evaluate, numbered
+from benchmarks.paper.flight import PaperFlight
+from benchmarks.paper.marks import CORNERS
 from skyloop.bench.contenders import OURS
-from skyloop.bench.paper import evaluation, report
-from skyloop.bench.paper.evaluation import RECORDER, Experiment, distances_to_round, evaluate, numbered
-from skyloop.bench.paper.flight import PaperFlight
-from skyloop.bench.paper.marks import CORNERS
 from skyloop.bench.schedule import CHANNELS, COMMAND, FEEDBACK, VIDEO
 from skyloop.control.position import Fix, fix_of
 from skyloop.errors import FileFormatError
@@ -24,10 +24,11 @@ from skyloop.transport.testing import wait_until
 from tests.test_demo import Running
 
 MINUTES = 0.1
+PAPER = [sys.executable, "-m", "benchmarks.paper"]
 
 
 def paper(*options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "skyloop", "demo", "paper", *options]
+    command = [*PAPER, *options]
     return subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
 
 
@@ -89,7 +90,7 @@ def test_delays_and_path_are_those_of_a_flight(flown: Path) -> None:
 @pytest.mark.process
 def test_a_drone_that_was_put_down_takes_off_again_and_ctrl_c_ends_in_good_order(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs matplotlib: skyloop install bench")
-    with Running("paper", "--minutes", "1", "--headless", "--output", str(tmp_path / "out")) as demo:
+    with Running("--minutes", "1", "--headless", "--output", str(tmp_path / "out"), command=PAPER) as demo:
         name = demo.until(r"is\s+up\s+as\s+(\S+)\s", 40)[1]
         demo.until("flying through", 40)
         with skyloop.connect(name, authority=skyloop.Authority(priority=2), name="page", on_exit="hover") as other:

@@ -7,7 +7,7 @@ from collections import deque
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
-from skyloop.bench.paper.marks import (
+from benchmarks.paper.marks import (
     APPLICATION,
     CORNERS,
     FEEDBACK_HEARD,

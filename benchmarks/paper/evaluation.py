@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.paper.marks import APPLICATION, CORNERS, FEEDBACK_HEARD, TARGET, VIDEO_HEARD
 from skyloop.bench.contenders import OURS
 from skyloop.bench.delays import Cell, Delays, Series
 from skyloop.bench.machine import Machine
-from skyloop.bench.paper.marks import APPLICATION, CORNERS, FEEDBACK_HEARD, TARGET, VIDEO_HEARD
 from skyloop.bench.schedule import COMMAND, FEEDBACK, FRAME_PERIOD_S, PACKET_PERIOD_S, VIDEO, Size
 from skyloop.bench.statistics import summarize
 from skyloop.clock import NS_PER_S
@@ -124,7 +124,7 @@ def evaluate(
     found = _gather(recording, known.name, known.clock_offset_ns, progress)
     received = found.received
     if found.application is None or found.size is None or not received[FEEDBACK].sent_ns:
-        raise FileFormatError(f"{path} is no recording of the paper's experiment: skyloop demo paper makes one")
+        raise FileFormatError(f"{path} is no recording of the paper's experiment: python -m benchmarks.paper makes one")
     for echo in found.echoes:
         if echo.app_id == found.application and not isinstance(echo.asked, Idle):
             received[COMMAND].add(echo.sent_ns, echo.applied_ns - echo.sent_ns, echo.seq)
