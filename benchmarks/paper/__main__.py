@@ -23,10 +23,10 @@ from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
+    from benchmarks.measuring import tables
     from benchmarks.paper.evaluation import Experiment
     from benchmarks.paper.flight import PaperFlight
-    from skyloop.bench import tables
-    from skyloop.bench.machine import Machine
+    from skyloop.bench import Machine
     from skyloop.client import Drone
 
 RECORDING: Final = "flight.mcap"
@@ -71,7 +71,7 @@ def paper(
 
     Ctrl-C lands, and the figures are of what was flown until then.
     """
-    from skyloop.bench.machine import Machine
+    from skyloop.bench import Machine
 
     console = Console(highlight=False)
     folder = _prepared(output)
@@ -87,7 +87,7 @@ def paper(
 
 def _prepared(output: Path | None) -> Path:
     """Make the folder; check before anything flies what would otherwise fail only afterwards."""
-    from skyloop.bench.figures import check_installed as check_figures
+    from benchmarks.measuring.figures import check_installed as check_figures
     from skyloop.recording.child import check_installed as check_recording
 
     check_figures()

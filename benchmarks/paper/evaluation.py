@@ -12,12 +12,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.measuring.contenders import OURS
+from benchmarks.measuring.delays import Cell, Delays, Series
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, FRAME_PERIOD_S, PACKET_PERIOD_S, VIDEO, Size
+from benchmarks.measuring.statistics import summarize
 from benchmarks.paper.marks import APPLICATION, CORNERS, FEEDBACK_HEARD, TARGET, VIDEO_HEARD
-from skyloop.bench.contenders import OURS
-from skyloop.bench.delays import Cell, Delays, Series
-from skyloop.bench.machine import Machine
-from skyloop.bench.schedule import COMMAND, FEEDBACK, FRAME_PERIOD_S, PACKET_PERIOD_S, VIDEO, Size
-from skyloop.bench.statistics import summarize
+from skyloop.bench import Machine
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError
 from skyloop.files import MAX_RESULTS, read_json

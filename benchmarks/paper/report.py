@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 import numpy as np
 
+from benchmarks.measuring import tables
+from benchmarks.measuring.contenders import OURS
+from benchmarks.measuring.delays import PAPER_MEAN_MS
+from benchmarks.measuring.figures import new_figure, paper_figures, save
+from benchmarks.measuring.schedule import FEEDBACK, VIDEO
 from benchmarks.paper.evaluation import RECORDER, Experiment
 from benchmarks.paper.marks import CORNERS
-from skyloop.bench import tables
-from skyloop.bench.contenders import OURS
-from skyloop.bench.delays import PAPER_MEAN_MS
-from skyloop.bench.figures import new_figure, paper_figures, save
-from skyloop.bench.schedule import FEEDBACK, VIDEO
 from skyloop.files import write as write_file
 from skyloop.recording.review.page import Page, facts, table
 from skyloop.recording.review.svg import Line, TimeAxis, limits

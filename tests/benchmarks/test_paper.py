@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import skyloop
+from benchmarks.measuring.contenders import OURS
+from benchmarks.measuring.schedule import CHANNELS, COMMAND, FEEDBACK, VIDEO
 from benchmarks.paper import evaluation, report
 from benchmarks.paper.evaluation import RECORDER, Experiment, distances_to_round, evaluate, numbered
 from benchmarks.paper.flight import PaperFlight
 from benchmarks.paper.marks import CORNERS
-from skyloop.bench.contenders import OURS
-from skyloop.bench.schedule import CHANNELS, COMMAND, FEEDBACK, VIDEO
 from skyloop.control.position import Fix, fix_of
 from skyloop.errors import FileFormatError
 from skyloop.transport.testing import wait_until

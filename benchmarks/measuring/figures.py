@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from skyloop.bench.contenders import FLOOR, OURS
-from skyloop.bench.delays import PAPER_MEAN_MS, Delays, Series
-from skyloop.bench.schedule import CHANNELS, COMMAND, VIDEO
+from benchmarks.measuring.contenders import FLOOR, OURS
+from benchmarks.measuring.delays import PAPER_MEAN_MS, Delays, Series
+from benchmarks.measuring.schedule import CHANNELS, COMMAND, VIDEO
 from skyloop.errors import MissingExtraError
 from skyloop.files import replacing
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.bench.schedule import CHANNELS, COMMAND, LARGE, VIDEO, WARM_UP_S, Turn, paced
-from skyloop.bench.waypoints import SPEED_M_S, WAYPOINTS_M, fly
+from benchmarks.measuring.schedule import CHANNELS, COMMAND, LARGE, VIDEO, WARM_UP_S, Turn, paced
+from benchmarks.measuring.waypoints import SPEED_M_S, WAYPOINTS_M, fly
 
 
 def test_deadlines_are_absolute() -> None:

@@ -1,16 +1,16 @@
-"""The results of ``skyloop bench`` as tables, for the terminal and for the page."""
+"""The results of the delays as tables, for the terminal and for the page."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from skyloop.bench.contenders import FLOOR, OURS
-from skyloop.bench.delays import PAPER_MEAN_MS, Delays
-from skyloop.bench.loop import STAGES, TOTAL, Loop
-from skyloop.bench.schedule import CHANNELS, SMALL, VIDEO
-from skyloop.bench.statistics import Summary
-from skyloop.bench.targets import Verdict
+from benchmarks.measuring.contenders import FLOOR, OURS
+from benchmarks.measuring.delays import PAPER_MEAN_MS, Delays
+from benchmarks.measuring.loop import STAGES, TOTAL, Loop
+from benchmarks.measuring.schedule import CHANNELS, SMALL, VIDEO
+from benchmarks.measuring.statistics import Summary
+from benchmarks.measuring.targets import Verdict
 
 UNKNOWN: Final = "–"
 

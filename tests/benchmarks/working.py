@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skyloop.bench.workers import Pipe
+from benchmarks.measuring.workers import Pipe
 
 
 def fails(pipe: Pipe) -> None:

@@ -7,9 +7,9 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from skyloop.bench.contract import Arrivals, application_side, vehicle_side
-from skyloop.bench.schedule import CHANNELS, SETTLE_S, WARM_UP_S, Turn
-from skyloop.bench.workers import STARTS_WITHIN_S, Workers
+from benchmarks.measuring.contract import Arrivals, application_side, vehicle_side
+from benchmarks.measuring.schedule import CHANNELS, SETTLE_S, WARM_UP_S, Turn
+from benchmarks.measuring.workers import STARTS_WITHIN_S, Workers
 
 _LATE_S: Final = 20.0  # for an answer on a busy machine
 _AHEAD_NS: Final = 50_000_000
@@ -20,7 +20,7 @@ class Pair:
 
     Args:
         workers: Starts the processes, and ends them.
-        module: Holds the contender's ends; see :mod:`skyloop.bench.contract`.
+        module: Holds the contender's ends; see :mod:`benchmarks.measuring.contract`.
         address: A folder of its own for its sockets.
         python: The interpreter that it runs under.
         application_module: Holds the application's end, if that is another module.

@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from skyloop.bench import tables
-from skyloop.bench.delays import Delays
-from skyloop.bench.targets import judge_delays
+from benchmarks.measuring import tables
+from benchmarks.measuring.delays import Delays
+from benchmarks.measuring.targets import judge_delays
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -53,7 +53,7 @@ def test_the_comparison_names_everybody(made_up: Delays) -> None:
 def test_figures_are_written(made_up: Delays, tmp_path: Path) -> None:
     if importlib.util.find_spec("matplotlib") is None:
         pytest.skip("matplotlib is not installed")
-    from skyloop.bench.figures import draw
+    from benchmarks.measuring.figures import draw
 
     files = draw(made_up, tmp_path)
     assert [file.name for file in files] == [
@@ -72,7 +72,7 @@ def test_without_matplotlib_it_says_what_to_install(
 ) -> None:
     import sys
 
-    from skyloop.bench.figures import draw
+    from benchmarks.measuring.figures import draw
     from skyloop.errors import MissingExtraError
 
     monkeypatch.setitem(sys.modules, "matplotlib", None)

@@ -18,9 +18,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.bench.schedule import COMMAND, FEEDBACK, SETTLE_S, VIDEO, Size, Turn, paced
-from skyloop.bench.waypoints import Setpoint, fly
-from skyloop.bench.workers import Pipe
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, SETTLE_S, VIDEO, Size, Turn, paced
+from benchmarks.measuring.waypoints import Setpoint, fly
+from benchmarks.measuring.workers import Pipe
 
 Image = NDArray[np.uint8]
 #: Called for each sample that its receiver has: its channel, and when it was sent [ns, monotonic].

@@ -10,14 +10,6 @@ import numpy as np
 SMALL_SHARE = 0.01  #: of the period: the paper counts how many delays are below it
 
 
-class Spread(msgspec.Struct, frozen=True):
-    """A distribution of times in µs."""
-
-    median_us: float
-    p99_us: float
-    samples: int
-
-
 class Summary(msgspec.Struct, frozen=True):
     """A distribution of delays of samples that were sent at a period."""
 
@@ -36,19 +28,6 @@ class Summary(msgspec.Struct, frozen=True):
     def mean_of_period(self) -> float:
         """The mean as a share of the period."""
         return self.mean_us / 1e3 / self.period_ms
-
-
-def spread(delays_ns: Sequence[float]) -> Spread:
-    """Return the median and the 99th percentile of some times.
-
-    Args:
-        delays_ns: The times [ns].
-
-    Raises:
-        ValueError: There are none: something did not flow.
-    """
-    values = _microseconds(delays_ns)
-    return Spread(float(np.median(values)), float(np.percentile(values, 99)), len(delays_ns))
 
 
 def summarize(delays_ns: Sequence[float], *, sent: int, period_s: float) -> Summary:

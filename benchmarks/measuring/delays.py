@@ -1,4 +1,4 @@
-"""``skyloop bench delays``: the paper's experiment, in turns with the bare hand-over and other libraries."""
+"""``python -m benchmarks.peers``: the paper's experiment, in turns with the bare hand-over and other libraries."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Final
 
 import msgspec
 
-from skyloop.bench.contenders import FLOOR, OURS, Contender
-from skyloop.bench.contract import Arrivals
-from skyloop.bench.machine import Machine
-from skyloop.bench.pair import Pair
-from skyloop.bench.schedule import CHANNELS, Size, Turn
-from skyloop.bench.statistics import Summary, summarize
-from skyloop.bench.workers import Workers
+from benchmarks.measuring.contenders import FLOOR, OURS, Contender
+from benchmarks.measuring.contract import Arrivals
+from benchmarks.measuring.pair import Pair
+from benchmarks.measuring.schedule import CHANNELS, Size, Turn
+from benchmarks.measuring.statistics import Summary, summarize
+from benchmarks.measuring.workers import Workers
+from skyloop.bench import Machine
 from skyloop.errors import LinkError
 from skyloop.files import MAX_RESULTS, read_json
 
@@ -141,4 +141,4 @@ def load(path: Path) -> Delays:
     Raises:
         FileFormatError: It is anything else.
     """
-    return read_json(path, Delays, "the results of bench delays", MAX_RESULTS)
+    return read_json(path, Delays, "the results of benchmarks.peers", MAX_RESULTS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -13,14 +14,19 @@ from textwrap import shorten
 from types import TracebackType
 from typing import Any, Final, Protocol, Self
 
+import skyloop
 from skyloop.errors import LinkError, NoAnswerError
 
 STARTS_WITHIN_S: Final = 30.0
 ENDS_WITHIN_S: Final = 5.0
 _WHAT_LENGTH: Final = 80
-_PACKAGES: Final = Path(__file__).parents[2]  # where ``skyloop`` is found
+#: Where ``benchmarks`` and ``skyloop`` are found.
+_PACKAGES: Final = f"{Path(__file__).parents[2]}{os.pathsep}{Path(skyloop.__file__).parents[1]}"
 # At the end of the path: another interpreter has its own packages, made for its own version, before ours.
-_BOOT: Final = "import sys; sys.path.append(sys.argv[1]); from skyloop.bench.workers import child; child(sys.argv[2])"
+_BOOT: Final = (
+    "import os, sys; sys.path += sys.argv[1].split(os.pathsep); "
+    "from benchmarks.measuring.workers import child; child(sys.argv[2])"
+)
 
 
 class Pipe(Protocol):
@@ -45,7 +51,7 @@ class Worker:
         self.pipe, theirs = multiprocessing.Pipe()
         with theirs:
             number = theirs.fileno()
-            self._process = subprocess.Popen([*command, "-c", _BOOT, str(_PACKAGES), str(number)], pass_fds=[number])
+            self._process = subprocess.Popen([*command, "-c", _BOOT, _PACKAGES, str(number)], pass_fds=[number])
         self.pid = self._process.pid
         self._what = shorten(" ".join([work.__name__, *map(str, arguments[:1])]), _WHAT_LENGTH, placeholder=" …")
         self.pipe.send((work.__module__, work.__qualname__, arguments))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from skyloop.bench.contenders import FLOOR, OURS
-from skyloop.bench.delays import Delays
-from skyloop.bench.schedule import COMMAND, FEEDBACK, LARGE, SMALL, VIDEO, Size
-from skyloop.bench.statistics import Summary
+from benchmarks.measuring.contenders import FLOOR, OURS
+from benchmarks.measuring.delays import Delays
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, LARGE, SMALL, VIDEO, Size
+from benchmarks.measuring.statistics import Summary
 
 #: Medians, Skyloop's to the floor's, at most; by size of the frames and channel.
 FLOOR_MEDIAN: Final = {(SMALL, COMMAND): 1.4, (SMALL, FEEDBACK): 1.4, (SMALL, VIDEO): 1.4, (LARGE, VIDEO): 1.1}

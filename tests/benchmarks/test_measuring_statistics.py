@@ -1,4 +1,4 @@
-"""Distributions, the machine's description and the stamps in commands: all pure."""
+"""Distributions of delays, and what a process takes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.bench.machine import Machine, cpu_model, cpu_time_s, numbers_of, os_name
-from skyloop.bench.statistics import spread, summarize
-from skyloop.bench.vehicle import stamp_of, stamped
+from benchmarks.measuring.machine import cpu_time_s
+from benchmarks.measuring.statistics import summarize
+from skyloop.bench import spread
 
 
 def test_a_summary_by_hand() -> None:
@@ -42,24 +42,6 @@ def test_a_channel_without_samples_is_no_figure() -> None:
         summarize([], sent=3, period_s=1.0)
 
 
-def test_the_machine_without_names() -> None:
-    assert cpu_model("processor : 0\nmodel name\t: AMD  EPYC 7\nmodel name\t: other\n") == "AMD EPYC 7"
-    assert cpu_model("Hardware : BCM2711") == ""
-    assert os_name('NAME="Debian"\nPRETTY_NAME="Debian GNU/Linux 12 (bookworm)"\n') == "Debian GNU/Linux 12 (bookworm)"
-    assert os_name("") == ""
-    assert numbers_of("6.1.0-13-amd64-built-by-somebody") == "6.1.0"
-    here = str(Machine.here())
-    assert os.uname().nodename not in here
-    assert f"{Machine.here().cores} cores" in here
-
-
 def test_processor_time_of_a_process() -> None:
     assert cpu_time_s(os.getpid()) > 0.0
     assert cpu_time_s(2**22 + 1) == 0.0  # more than a process can have as its number
-
-
-@given(st.integers(0, 2**60), st.integers(0, 10**12))
-def test_a_command_carries_its_time_to_the_last_bit(sent_ns: int, later_ns: int) -> None:
-    up = stamped(sent_ns)
-    assert 0.0 <= up < 0.02
-    assert stamp_of(up, sent_ns + later_ns) == sent_ns

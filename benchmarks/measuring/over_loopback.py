@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from skyloop.bench.contract import Received
-from skyloop.bench.ours import Application as NearApplication
-from skyloop.bench.ours import Listening, proxy_name
-from skyloop.bench.ours import Vehicle as NearVehicle
-from skyloop.bench.vehicle import CAMERA, BenchVehicle
+from benchmarks.measuring.contract import Received
+from benchmarks.measuring.ours import Application as NearApplication
+from benchmarks.measuring.ours import Listening, proxy_name
+from benchmarks.measuring.ours import Vehicle as NearVehicle
+from skyloop.bench import CAMERA, BenchVehicle
 from skyloop.client import connect
 from skyloop.proxy import Proxy
 from skyloop.transport.fabric import FabricServer, FabricSettings

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from itertools import cycle
 from typing import Final, NamedTuple
 
-from skyloop.bench.schedule import PACKET_PERIOD_S
+from benchmarks.measuring.schedule import PACKET_PERIOD_S
 
 WAYPOINTS_M: Final = ((0.0, 0.0), (3.0, 0.0), (3.0, 3.0), (0.0, 3.0))
 SPEED_M_S: Final = 1.0

@@ -1,4 +1,4 @@
-"""``skyloop bench loop``: from the capture of a frame until the command that it caused is applied, by stage."""
+"""``python -m benchmarks.loop``: from the capture of a frame until the command that it caused is applied, by stage."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from skyloop.bench.contract import vehicle_side
-from skyloop.bench.machine import Machine
-from skyloop.bench.ours import proxy_name
-from skyloop.bench.schedule import SETTLE_S, VIDEO, WARM_UP_S, Size, Turn
-from skyloop.bench.statistics import Summary, summarize
-from skyloop.bench.vehicle import CAMERA, stamp_of, stamped
-from skyloop.bench.workers import STARTS_WITHIN_S, Pipe, Workers
+from benchmarks.measuring.contract import vehicle_side
+from benchmarks.measuring.ours import proxy_name
+from benchmarks.measuring.schedule import SETTLE_S, VIDEO, WARM_UP_S, Size, Turn
+from benchmarks.measuring.statistics import Summary, summarize
+from benchmarks.measuring.workers import STARTS_WITHIN_S, Pipe, Workers
+from skyloop.bench import CAMERA, Machine, stamp_of, stamped
 from skyloop.client import Drone, Frame, connect
 from skyloop.control import Controller
 from skyloop.errors import LinkError
@@ -89,7 +88,7 @@ def measure(seconds: float, sizes: Sequence[Size], progress: Progress = lambda _
     turns = [Turn(number, seconds / rounds, size, FRAME_PERIOD_S) for number in range(rounds) for size in sizes]
     trips: dict[Size, list[Trip]] = {size: [] for size in sizes}
     with tempfile.TemporaryDirectory(prefix="bench-") as folder, Workers() as workers:
-        vehicle = workers.start(vehicle_side, "skyloop.bench.ours", folder)
+        vehicle = workers.start(vehicle_side, "benchmarks.measuring.ours", folder)
         application = workers.start(control, proxy_name(folder))
         for worker in (vehicle, application):
             worker.answer(STARTS_WITHIN_S)
@@ -176,4 +175,4 @@ def load(path: Path) -> Loop:
     Raises:
         FileFormatError: It is anything else.
     """
-    return read_json(path, Loop, "the results of bench loop", MAX_RESULTS)
+    return read_json(path, Loop, "the results of benchmarks.loop", MAX_RESULTS)
