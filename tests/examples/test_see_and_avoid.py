@@ -1,4 +1,4 @@
-"""Fuzzy inference by table, and the rules of see-and-avoid by what they must never do."""
+"""Fuzzy inference by table, the rules of see-and-avoid by what they must never do, and its law."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from see_and_avoid import FuzzyController, Rule, Trapezoid, avoidance, triangles
 
-from skyloop.control.avoid import avoidance
-from skyloop.control.fuzzy import FuzzyController, Rule, Trapezoid, triangles
 from skyloop.errors import UnknownNameError, UsageError
 
 

@@ -1,25 +1,37 @@
-"""See and avoid: fly ahead, and past obstacles of a known colour, by fuzzy rules.
+"""See and avoid: fly ahead, and past orange pillars, by fuzzy rules over where the nearest is and how wide it looks.
+
+python examples/behaviours/see_and_avoid.py             # in a simulated hall
+python examples/behaviours/see_and_avoid.py alpha 6     # a running proxy, 6 m ahead
+
+A behaviour of one's own, with its law and the technique that the law is made of.
 
 An obstacle is detected by its colour, and kept out of the middle of the image by a fuzzy controller, as in
 Olivares-Mendez, Campoy, Mellado-Bataller and Mejias, "See-and-avoid quadcopter using fuzzy control optimized by
 cross-entropy", FUZZ-IEEE 2012. Here the rules take its bearing and apparent width, and give the sideways speed.
+
+The rules are zero-order Takagi-Sugeno: each concludes a number, and the output is the mean of these, weighted by how
+true the rules are; the truth of a rule is the product of its conditions' (Takagi and Sugeno, "Fuzzy identification of
+systems and its applications to modeling and control", IEEE Trans. SMC 15(1), 1985).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+import skyloop
 from skyloop.clock import seconds
 from skyloop.control.airframe import Array, Part, VelocityLaw
 from skyloop.control.behaviour import Behaviour
-from skyloop.control.fuzzy import FuzzyController, Rule, triangles
 from skyloop.control.limiting import SetpointLimits, clamped
-from skyloop.errors import UsageError
+from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Polyline, Text
 from skyloop.messages.annotation import Colour, Shape
 from skyloop.messages.geometry import wrap_angle
@@ -30,6 +42,111 @@ if TYPE_CHECKING:
 
 _CLEAR: Colour = (64, 220, 100)
 _NEAR: Colour = (255, 120, 60)
+
+
+@dataclass(frozen=True, slots=True)
+class Trapezoid:
+    """Membership function: 0 up to ``a``, rising to 1 at ``b``, 1 up to ``c``, falling to 0 at ``d``.
+
+    Infinite ``a`` and ``b``, or ``c`` and ``d``, leave that side at 1.
+
+    Raises:
+        UsageError: The corners do not satisfy ``a`` ≤ ``b`` ≤ ``c`` ≤ ``d``.
+    """
+
+    a: float
+    b: float
+    c: float
+    d: float
+
+    def __post_init__(self) -> None:
+        if not self.a <= self.b <= self.c <= self.d:
+            raise UsageError(f"a trapezoid's corners must rise: {self.a}, {self.b}, {self.c}, {self.d}")
+
+    def __call__(self, value: float) -> float:
+        """Return the membership of a value, 0 to 1."""
+        if self.b <= value <= self.c:
+            return 1.0
+        if value < self.b:
+            return 0.0 if value <= self.a else (value - self.a) / (self.b - self.a)
+        return 0.0 if value >= self.d else (self.d - value) / (self.d - self.c)
+
+
+def triangles(peaks: Mapping[str, float]) -> dict[str, Trapezoid]:
+    """Return triangular terms of one variable, each 1 at its peak and 0 at the next ones.
+
+    All together add up to 1 everywhere; the outermost ones stay at 1 beyond their peaks.
+
+    Args:
+        peaks: Where each term is 1, by its name; at least two, in rising order.
+
+    Raises:
+        UsageError: There are fewer than two peaks, or they do not rise.
+    """
+    names, at = list(peaks), list(peaks.values())
+    if len(at) < 2 or any(not low < high for low, high in itertools.pairwise(at)):
+        raise UsageError(f"two peaks or more, each above the one before, not {dict(peaks)}")
+    lows, highs = [-math.inf, *at[:-1]], [*at[1:], math.inf]
+    return {
+        name: Trapezoid(low, -math.inf if low == -math.inf else peak, math.inf if high == math.inf else peak, high)
+        for name, low, peak, high in zip(names, lows, at, highs, strict=True)
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """If every variable is as in ``when``, the output is ``then``."""
+
+    when: Mapping[str, str]  #: term by variable; a variable that is not named may have any value
+    then: float
+
+
+class FuzzyController:
+    """Rules over variables with linguistic terms."""
+
+    def __init__(self, variables: Mapping[str, Mapping[str, Trapezoid]], rules: Sequence[Rule]) -> None:
+        """Check and store the rules.
+
+        Args:
+            variables: Membership functions by variable and term.
+            rules: At least one.
+
+        Raises:
+            UsageError: There is no rule.
+            UnknownNameError: A rule names a variable or term that does not exist.
+        """
+        if not rules:
+            raise UsageError("there is no rule")
+        for rule in rules:
+            for variable, term in rule.when.items():
+                if variable not in variables:
+                    raise UnknownNameError("fuzzy variable", variable, variables)
+                if term not in variables[variable]:
+                    raise UnknownNameError(f"term of {variable}", term, variables[variable])
+        self._variables = {name: dict(terms) for name, terms in variables.items()}
+        self._rules = tuple(rules)
+
+    def step(self, **values: float) -> float:
+        """Compute the output.
+
+        Args:
+            **values: One for each variable.
+
+        Returns:
+            The weighted mean of the rules' conclusions; 0 where no rule applies.
+
+        Raises:
+            UsageError: A variable has no value, or it is NaN.
+        """
+        missing = [name for name in self._variables if math.isnan(values.get(name, math.nan))]
+        if missing:
+            raise UsageError(f"no value of {', '.join(missing)}")
+        weights = [
+            math.prod(self._variables[name][term](values[name]) for name, term in rule.when.items())
+            for rule in self._rules
+        ]
+        total = sum(weights)
+        return sum(w * rule.then for w, rule in zip(weights, self._rules, strict=True)) / total if total > 0 else 0.0
 
 
 def avoidance() -> FuzzyController:
@@ -208,3 +325,22 @@ class SeeAndAvoid(Behaviour):
         colour = _NEAR if self.phase is AvoidPhase.AVOIDING else _CLEAR
         boxes: list[Shape] = [Polyline(one.outline, True, colour) for one in seen]
         return [*boxes, Text(f"{self.phase.value}, {self.ahead_m:.1f} m", (8.0, 16.0), colour)]
+
+
+def main(target: str = "sim://?world=pillars&cameras=front&fps=15", distance_m: float | str = 12.5) -> None:
+    rules = avoidance()
+    print("aside, 1 left to -1 right, by bearing (across, left positive) and width (down):")
+    bearings = (0.4, 0.2, 0.0, -0.2, -0.4)
+    print("      ", *(f"{bearing:6.1f}" for bearing in bearings))
+    for width in (0.1, 0.25, 0.5):
+        print(f"{width:6.2f}", *(f"{rules.step(bearing=bearing, width=width):6.2f}" for bearing in bearings))
+    with skyloop.connect(target) as drone:
+        drone.takeoff()
+        flight = SeeAndAvoid(drone, float(distance_m))
+        with drone.on_event(lambda event: print(event.text)):
+            print(flight.run(seconds=90.0))
+        print(f"{flight.ahead_m:.1f} m ahead", "and arrived" if flight.done else "")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
