@@ -46,7 +46,6 @@ EXTRAS: Final = (
 #: Commands that need several parts: who lacks one of them is told of all that are missing.
 NEEDS: Final = {
     "demo": ("sim", "vision", "cockpit"),
-    "demo follow-anything": ("sim", "vision", "detect", "cockpit"),
     "fly": ("sim", "vision"),
     "fly follow": ("vision", "detect"),
     "detect": ("detect", "vision"),

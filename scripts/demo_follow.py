@@ -1,7 +1,8 @@
-"""``skyloop demo follow-anything``: a simulated drone follows a person who walks about."""
+"""``python scripts/demo_follow.py``: a simulated drone follows a person who walks about; figures against the truth."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -16,18 +17,19 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from skyloop.cli.app import run
 from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
 from skyloop.cli.fly_follow import status_line
 from skyloop.errors import MissingExtraError, UsageError, install_command
 
 if TYPE_CHECKING:
-    from skyloop.cli.follow_truth import FollowReport, TargetTruth
+    from follow_truth import FollowReport, TargetTruth
+
     from skyloop.client import Drone, Frame
     from skyloop.control import FollowTarget
     from skyloop.vision import OnnxDetector
     from skyloop.vision.tracking import Box
 
-FOLLOW_EXAMPLE: Final = "Example: skyloop demo follow-anything --seconds 60"
 ENOUGH_IN_VIEW: Final = 0.9
 DETECTOR, LOOKS = "detector", "looks"
 _FIRST_PICTURE_S = 10.0
@@ -112,7 +114,8 @@ class _Demo:
 
     def fly(self, distance_m: float, looks: bool, page_shown: bool, port: int | None, browser: bool) -> FollowReport:
         """``port`` None: the default one of pages. Raises the errors of connecting and of take-off."""
-        from skyloop.cli.follow_truth import FollowReport, TargetTruth
+        from follow_truth import FollowReport, TargetTruth
+
         from skyloop.client import connect
         from skyloop.cockpit.child import CockpitProcess
         from skyloop.sim import load_world
@@ -220,3 +223,9 @@ def _follower(
         detector=detector,
         distance_m=report.distance_m,
     )
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app.command()(follow_anything)
+    run(app, sys.argv[1:], "demo_follow")

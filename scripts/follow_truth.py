@@ -1,4 +1,4 @@
-"""How well a simulated person or car is followed, against the truth: for ``skyloop demo follow-anything``."""
+"""How well a simulated person or car is followed, against the truth: for ``demo_follow.py``, ``follow_judge.py``."""
 
 from __future__ import annotations
 
