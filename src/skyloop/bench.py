@@ -1,6 +1,6 @@
-"""What a user can know of this machine: delays beside the bare hand-over of the same bytes, and the simulator's speed.
+"""Measures the user's machine: delays beside the bare hand-over of the same bytes, and the simulator's speed.
 
-``skyloop bench`` prints it. What the makers measure is in ``benchmarks/``, beside this package in the repository.
+``skyloop bench`` prints the results. The makers' measurements are in the repository's ``benchmarks/``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ Image = NDArray[np.uint8]
 Setpoint = tuple[float, float, float]  #: forward and left [m/s], yaw rate [rad/s]
 #: Called for each sample that its receiver has: its channel, and when it was sent [ns, monotonic].
 Received = Callable[[str, int], None]
-#: Called with the share that is done, 0 to 1, and what comes next.
+#: Called with the share that is done, 0 to 1, and the next measurement.
 Progress = Callable[[float, str], None]
 
 COMMAND: Final = "command"
@@ -209,7 +209,7 @@ class BenchVehicle(Driver):
         self.publish_feedback(time.monotonic_ns())
 
     def _close(self) -> None:
-        """There is nothing to give back."""
+        """Do nothing: no resources are held."""
 
     def _apply(self, action: AnyAction) -> AnyAction:
         now_ns = time.monotonic_ns()
@@ -257,7 +257,7 @@ class Vehicle:
         self._proxy.start()
 
     def _server(self, folder: str) -> tuple[str, TransportServer]:
-        """What it is called, and where it serves."""
+        """Return the proxy's name and its transport server."""
         name = proxy_name(folder)
         return name, LocalServer(name)
 
@@ -287,7 +287,7 @@ class Listening:
 
     def feedback(self, feedback: Feedback) -> None:
         """Report feedback that is new."""
-        if feedback.captured_ns > self._known_ns:  # the proxy repeats an old state when somebody took the authority
+        if feedback.captured_ns > self._known_ns:  # the proxy repeats the last state when the authority changes
             self._known_ns = feedback.captured_ns
             self._received(FEEDBACK, feedback.captured_ns)
 
@@ -303,8 +303,8 @@ class Listening:
 class Application:
     """The end with the user's drone; see :class:`Vehicle`, which is there first."""
 
-    looks = True  #: at the video
-    video = VideoOptions()  #: how it wants that
+    looks = True  #: whether it receives the video
+    video = VideoOptions()  #: the form of the video
 
     def __init__(self, folder: str, received: Received) -> None:
         self._drone = self._connect(folder)
@@ -364,7 +364,7 @@ class BareVehicle:
         self._socket.send(_STAMP.pack(sent_ns, width, height))
 
     def close(self) -> None:
-        self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread, should nobody have come
+        self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread if nobody has connected
         self._thread.join()
         self._listener.close()
         self._path.unlink()
@@ -374,7 +374,7 @@ class BareVehicle:
         try:
             self._socket, _ = self._listener.accept()
         except OSError:
-            return  # closed before anybody came
+            return  # closed before anybody connected
         with self._socket as sock:
             socket.send_fds(sock, [b"memory"], [self._descriptor])
             while packet := sock.recv(256):
@@ -478,7 +478,7 @@ def measure_delays(
     Args:
         seconds: How long each is measured with each size of frames [s].
         sizes: Width and height of the frames, at most :data:`LARGEST`.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
+        progress: Called with the share that is done, 0 to 1, and the next measurement's name.
 
     Raises:
         LinkError: The processes do not find each other, or nothing arrives.
@@ -526,7 +526,7 @@ class _Pair:
             self._pipes.append(ours)
 
     def measure(self, turn: _Turn) -> dict[str, list[int]]:
-        """Return the delays of what was sent in a turn and arrived [ns], by channel."""
+        """Return the delays of the samples that arrived in a turn [ns], by channel."""
         for pipe in self._pipes:  # the vehicle is there before the application
             pipe.send(turn)
             self._answer(pipe)
@@ -638,7 +638,7 @@ SIZES: Final = (1.0, 2.0)  #: pictures as wide as the cameras' own, and twice as
 CAMERAS_AT_ONCE: Final = 10
 DRAWING_WORLD: Final = "room"  #: furnished, with markers and a moving board
 FRAMES_PER_S: Final = 30.0  #: of each camera, by which the drones fly on between pictures
-#: Whole cycles of everything that is done every so many steps, so that every batch does the same work.
+#: A multiple of all periods in steps, so that every batch does the same work.
 BATCH_STEPS: Final = 100
 LEAST_ROUNDS: Final = 3  #: however short the time
 _TAKE_OFF_S: Final = 5.0
@@ -686,7 +686,7 @@ def measure_sim(seconds: float, progress: Progress = lambda _share, _what: None)
 
     Args:
         seconds: About how long, beside the time for making the scenes [s].
-        progress: Called with the share that is done, 0 to 1, and what is measured.
+        progress: Called with the share that is done, 0 to 1, and the present measurement's name.
     """
     from skyloop.sim.render.compiled import COMPILER
 
@@ -723,7 +723,7 @@ def _measure_physics(fleet: Fleet, seconds: float, progress: Callable[[float], N
 
 
 def _measure_pair(factor: float, seconds: float, progress: Callable[[float], None]) -> list[DrawingRow]:
-    """The two cameras of one drone in turn, so many times as wide as usual."""
+    """Draw for the two cameras of one drone in turn, with images ``factor`` times as wide as the cameras' own."""
     from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 
     models = [FRONT_CAMERA.scaled(factor), BOTTOM_CAMERA.scaled(factor)]
@@ -738,7 +738,7 @@ def _measure_pair(factor: float, seconds: float, progress: Callable[[float], Non
 
 
 def _measure_many(seconds: float, progress: Callable[[float], None]) -> DrawingRow:
-    """The front cameras of drones that see one another."""
+    """Draw for the front cameras of drones that see one another."""
     from skyloop.sim.camera import FRONT_CAMERA
 
     flight = Flight(CAMERAS_AT_ONCE, [(drone, FRONT_CAMERA) for drone in range(CAMERAS_AT_ONCE)])
@@ -752,7 +752,7 @@ def _drawing_row(cameras: str, model: CameraModel, pictures: int, times: list[in
 
 
 class Flight:
-    """Drones that circle in the furnished room, and their cameras, which expose one after the other.
+    """Drones that circle in the furnished room, and their cameras, which expose in turn.
 
     Args:
         drones: How many.
