@@ -35,12 +35,12 @@ from pathlib import Path
 from typing import Literal
 
 import browser
+from follow_truth import FrameTruth, TargetTruth
 from page_film import PageFilm, Shown
 from PIL import Image
 from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
 import skyloop
-from skyloop.cli.follow_truth import FrameTruth, TargetTruth
 from skyloop.clock import nanoseconds
 from skyloop.cockpit.child import CockpitProcess
 from skyloop.control.follow import FollowMarker
