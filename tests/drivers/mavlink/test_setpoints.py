@@ -870,6 +870,26 @@ def test_an_arming_that_shows_after_its_take_off_was_given_up_is_undone(autopilo
 
 
 @AUTOPILOTS
+@pytest.mark.parametrize("switched", [True, False])
+def test_who_arms_and_flies_it_right_after_a_take_off_was_given_up_is_left_alone(autopilot: int, switched: bool) -> None:
+    """A safety pilot takes over what did not start: it was told to land twice a second, for the whole flight."""
+    bench = arming(autopilot)
+    while not any("does not answer" in text for text in bench.texts):
+        bench.go_on(0.02)
+    bench.go_on(0.3)
+    bench.commands()
+    vehicle = bench.vehicle
+    vehicle.armed = True
+    if switched:
+        vehicle.mode = {ARDUPILOT: "STABILIZE", PX4: "POSCTL"}[autopilot]
+    bench.go_on(0.5)
+    assert bool(bench.commands()) is not switched, "only in that mode it may be our own arming that shows"
+    vehicle.landed, vehicle.place, vehicle.status = Landed.IN_AIR, (0.0, 0.0, -1.0), 4
+    bench.go_on(3.0)
+    assert bench.commands() == []
+
+
+@AUTOPILOTS
 def test_landing_before_an_arming_that_never_comes_ends_soon(autopilot: int) -> None:
     bench = arming(autopilot)
     bench.apply(Land())
