@@ -186,6 +186,21 @@ def test_a_stop_goes_before_what_waits_and_is_not_taken_for_the_end_of_a_cut_fra
         assert len(vehicle.feed(uart.read())) == 5, "a stop does not discard the one before"
 
 
+@pytest.mark.parametrize("bytes_per_s", [1000, 1500])
+def test_a_stop_arrives_on_a_line_that_is_slower_than_its_baud_rate(uart: Uart, bytes_per_s: int) -> None:
+    """Each repeat discarded the one before, of which only the zeros had been carried, and none ever arrived."""
+    clock, came = ManualClock(), b""
+    with closing(SerialStream(uart.device, 921_600, "x", "msp", clock)) as stream:
+        for tick in range(100):
+            stops = tick >= 50 and tick % 5 == 0
+            stream.write(b"S" * 40 if stops else b"s" * 40, Rank.STOP if stops else Rank.SETPOINT)
+            clock.advance(0.02)
+            came += uart.read(bytes_per_s // 50)
+            if b"S" * 40 in came:
+                break
+        assert tick < 50 + 25, "within half a second"
+
+
 def test_a_stop_finds_room_in_a_full_port(line: tuple[int, str]) -> None:
     """The end of the buffer is discarded for it, even where its size is not available."""
     pytest.importorskip("serial")

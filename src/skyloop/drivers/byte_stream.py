@@ -105,7 +105,7 @@ class ByteStream(ABC):
         self._full_ns: int | None = None  # since when there is no room, or the line is stalled
         self._whole = _LONGEST  # bytes written since a frame may have been cut
         self._cleared = False  # a full buffer was emptied for a stop, and nothing shows whether it is read since
-        self._stopping = False  # the last packet was a stop, which the next one must not discard
+        self._after_stop = 1 << 62  # bytes written since a stop: while more than that wait, it does, and none is discarded
 
     @abstractmethod
     def fileno(self) -> int:
@@ -132,7 +132,7 @@ class ByteStream(ABC):
         """
         now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
         self._pace.on_waiting(waiting, now_ns)
-        if stop and not self._stopping and waiting > _LONGEST:  # less is sent no later than what fills up a cut frame
+        if stop and _LONGEST < waiting <= self._after_stop:  # less is sent no later than what fills up a cut frame
             self._discard()
         stalled = self._cleared or self._pace.stalled(now_ns)
         sent = 0
@@ -152,7 +152,7 @@ class ByteStream(ABC):
         if sent:
             self._pace.on_written(sent, now_ns)
             self._whole += sent
-            self._stopping = stop
+            self._after_stop = 0 if stop else self._after_stop + sent
         self.dropped += not sent
         self._check_room(now_ns, room=bool(sent) and not stalled)
 
