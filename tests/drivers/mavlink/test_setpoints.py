@@ -871,7 +871,7 @@ def test_an_arming_that_shows_after_its_take_off_was_given_up_is_undone(autopilo
 
 @AUTOPILOTS
 @pytest.mark.parametrize("switched", [True, False])
-def test_who_arms_and_flies_it_right_after_a_take_off_was_given_up_is_left_alone(autopilot: int, switched: bool) -> None:
+def test_who_arms_and_flies_it_right_after_a_take_off_was_given_up_is_left(autopilot: int, switched: bool) -> None:
     """A safety pilot takes over what did not start: it was told to land twice a second, for the whole flight."""
     bench = arming(autopilot)
     while not any("does not answer" in text for text in bench.texts):

@@ -399,7 +399,7 @@ class SetpointController:
         return messages
 
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Disarm what a take-off that was given up has armed; what is in another mode, or rises, was armed by others."""
+        """Disarm what a take-off that was given up has armed; what rises, or is in another mode, others have armed."""
         if vehicle.airborne or vehicle.mode != self._autopilot.ARMING:
             self._disarms_until_ns = 0
         elif vehicle.armed and vehicle.airborne is False:
