@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from itertools import pairwise
 
 import pytest
@@ -465,6 +466,43 @@ def test_somebody_who_takes_the_vehicle_over_keeps_it(autopilot: int, mode: str)
     bench.apply(Hover())
     bench.go_on(1.2)
     assert bench.commands(), "a fresh decision takes it back"
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize("alone", [False, True])
+def test_who_holds_a_vehicle_that_lands_keeps_it_there(autopilot: int, alone: bool) -> None:
+    """Somebody stands below, and another station stops it; each repeat of the landing took it back."""
+    bench = steering(autopilot)
+    bench.apply(Land())
+    bench.vehicle.mode = LAND[autopilot][0]
+    bench.go_on(4.0)
+    bench.vehicle.mode = HOLD[autopilot][0]
+    bench.commands()
+    for _ in range(20):
+        bench.go_on(0.1)
+        with suppress(DriverError):
+            bench.apply(Land(), alone=alone, new=False)
+    assert bench.commands() == []
+    assert bench.session.setpoints is not None
+    assert bench.session.setpoints.ownership.others == HOLD[autopilot][0]
+    bench.go_on(0.6)
+    bench.apply(Land())
+    bench.go_on(0.1)
+    assert bench.commands() == [LAND[autopilot][1]], "a fresh decision takes it back"
+
+
+@AUTOPILOTS
+def test_a_landing_of_ours_is_asked_for_again_where_the_vehicle_is_found_holding(autopilot: int) -> None:
+    """What it does by itself while it hears nothing is nobody's decision."""
+    bench = steering(autopilot)
+    bench.apply(Land())
+    bench.vehicle.mode = LAND[autopilot][0]
+    bench.go_on(4.0)
+    bench.go_on(2.6, silent=True)
+    bench.vehicle.mode = HOLD[autopilot][0]
+    bench.commands()
+    bench.go_on(1.0)
+    assert LAND[autopilot][1] in bench.commands()
 
 
 @AUTOPILOTS

@@ -153,7 +153,8 @@ class SetpointController:
         if isinstance(action, Takeoff):
             self._take_off(vehicle, now_ns)
         elif isinstance(action, Land):
-            self._land(vehicle)
+            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # a repeat: others may end it
+                self._land(vehicle)
         elif isinstance(action, Hover):
             self._hover(vehicle, now_ns, alone=alone)
         else:
@@ -266,6 +267,7 @@ class SetpointController:
             started = self._takeoff is not None and self._takeoff.started
             self._end()
             self.goal = Goal.HOLD if started else Goal.NOTHING
+        self._entered, self._strayed_ns = False, None  # what it does by itself meanwhile is nobody's decision
         self.ownership.on_link_lost()
 
     def forget_landing(self) -> bool:
