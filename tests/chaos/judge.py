@@ -273,12 +273,15 @@ def _led_to(entry: Entry, asked: Entry | None, ended: Entry | None, faults: Sequ
 
 
 def _judge_stops(verdict: Verdict, pilot: Sequence[Entry], vehicle: Sequence[Entry]) -> None:
-    """An emergency stop is executed even if packets are lost."""
+    """An emergency stop is executed even if packets are lost. What stands disarmed when it is pressed stays so."""
     stood = [entry.at_ns for entry in vehicle if entry.what in ("disarmed", "state:emergency")]
+    turned = [entry for entry in vehicle if entry.what in ("armed", "disarmed")]
     for entry in pilot:
         if entry.what == "ask_stop":
             place = bisect_left(stood, entry.at_ns)
             after_s = (stood[place] - entry.at_ns) / 1e9 if place < len(stood) else float("inf")
+            before = [each.what for each in turned if each.at_ns <= entry.at_ns]
+            after_s = 0.0 if before[-1:] == ["disarmed"] else after_s
             verdict.stop_s.append(after_s)
             if after_s > STOP_S:
                 verdict.missed.append(f"emergency stop at {entry.at_ns / 1e9:.3f} s: it stood {after_s:.3f} s later")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import select
 import socket
+import struct
+import time
 import tty
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -13,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.byte_stream import STUCK_NS, LinePace, Rank, SerialStream, TcpStream, line_speed
+from skyloop.drivers.byte_stream import END_S, STUCK_NS, LinePace, Rank, SerialStream, TcpStream, line_speed
 from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
 
@@ -186,6 +188,21 @@ def test_a_stop_goes_before_what_waits_and_is_not_taken_for_the_end_of_a_cut_fra
         assert len(vehicle.feed(uart.read())) == 5, "a stop does not discard the one before"
 
 
+@pytest.mark.parametrize("bytes_per_s", [1000, 1500])
+def test_a_stop_arrives_on_a_line_that_is_slower_than_its_baud_rate(uart: Uart, bytes_per_s: int) -> None:
+    """Each repeat discarded the one before, of which only the zeros had been carried, and none ever arrived."""
+    clock, came = ManualClock(), b""
+    with closing(SerialStream(uart.device, 921_600, "x", "msp", clock)) as stream:
+        for tick in range(100):
+            stops = tick >= 50 and tick % 5 == 0
+            stream.write(b"S" * 40 if stops else b"s" * 40, Rank.STOP if stops else Rank.SETPOINT)
+            clock.advance(0.02)
+            came += uart.read(bytes_per_s // 50)
+            if b"S" * 40 in came:
+                break
+        assert tick < 50 + 25, "within half a second"
+
+
 def test_a_stop_finds_room_in_a_full_port(line: tuple[int, str]) -> None:
     """The end of the buffer is discarded for it, even where its size is not available."""
     pytest.importorskip("serial")
@@ -199,6 +216,21 @@ def test_a_stop_finds_room_in_a_full_port(line: tuple[int, str]) -> None:
         while select.select([far], [], [], 0.2)[0]:
             came += os.read(far, 65_536)
         assert came.endswith(b"stop")
+
+
+def test_a_stop_on_a_stalled_line_gets_a_moment_to_leave_when_the_port_is_closed(
+    uart: Uart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program that stops the motors and ends: what was written a moment before was discarded at once."""
+    clock, came = ManualClock(), bytearray()
+    stream = SerialStream(uart.device, 57_600, "x", "mavlink", clock)
+    for _ in range(12):
+        stream.write(bytes(60))
+        clock.advance(0.04)
+    stream.write(b"stop", Rank.STOP)
+    monkeypatch.setattr("skyloop.drivers.byte_stream.time.sleep", lambda _: came.extend(uart.read(29)))
+    stream.close()
+    assert came.endswith(b"stop")
 
 
 def test_a_port_is_empty_when_it_is_opened(uart: Uart) -> None:
@@ -279,6 +311,34 @@ def test_the_last_words_of_a_connection_are_delivered(peer: socket.socket) -> No
     stream.write(b"disarm", Rank.COMMAND)
     stream.close()
     assert received(connection) == (b"disarm", True)
+
+
+@pytest.mark.parametrize("last", [True, False])
+def test_the_last_words_may_be_lost_once(peer: socket.socket, monkeypatch: pytest.MonkeyPatch, last: bool) -> None:
+    """TCP sends again after 0.2 s what was not acknowledged; while a new connection waits to be opened nobody waits."""
+    stream = TcpStream("127.0.0.1", peer.getsockname()[1])
+    connection, _ = peer.accept()
+    stream.write(b"stop", Rank.STOP)
+    acknowledged_s = time.monotonic() + 0.3
+    monkeypatch.setattr(stream, "_unacknowledged", lambda: 4 * (time.monotonic() < acknowledged_s))
+    stream.drain_s = END_S if last else stream.drain_s
+    stream.close()
+    assert received(connection)[1] is last
+
+
+def test_a_connection_that_is_gone_is_not_waited_for(peer: socket.socket) -> None:
+    """The system went on to count what it did not receive, and the next connection waited for that."""
+    stream = TcpStream("127.0.0.1", peer.getsockname()[1], ManualClock())
+    connection, _ = peer.accept()
+    stream.write(bytes(1 << 14), Rank.COMMAND)
+    assert connection.recv(1)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    connection.close()
+    assert select.select([stream], [], [], 5.0)[0]
+    with pytest.raises(ConnectionError):
+        stream.read()
+    assert stream._unacknowledged() == 0
+    stream.close()
 
 
 def test_a_slow_line_carries_set_points_before_poses_and_commands_before_all() -> None:

@@ -227,6 +227,15 @@ def test_a_landing_that_neither_pilot_nor_failsafe_wanted_is_needless() -> None:
 # What lies between a vehicle and its proxy -----------------------------------------
 
 
+@pytest.mark.parametrize("armed", [False, True])
+def test_an_emergency_stop_of_what_stands_disarmed_is_not_missed(armed: bool) -> None:
+    """Failsafes landed it before, and nothing was left to disarm; but for a propeller that turns again."""
+    flight = TakeOff(entry(5.0, "ask_stop"))
+    flight.vehicle += [entry(3.0, "state:landed"), entry(3.1, "disarmed"), entry(6.0, "disarmed" if armed else "open")]
+    flight.vehicle[-1:-1] = [entry(4.0, "armed")] * armed
+    assert judge(flight.pilot, flight.vehicle, []).stop_s == [1.0 if armed else 0.0]
+
+
 def test_a_stop_is_known_among_frames_that_a_stream_cuts_anywhere() -> None:
     codec = Codec(255, 190)
 

@@ -493,6 +493,22 @@ def test_where_there_is_no_thread_for_all_what_is_left_is_done_in_turn(monkeypat
     assert not cancelled.get()(), "the caller's own"
 
 
+def test_an_interrupt_ends_what_is_done_in_turn_for_want_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in the first take-off: it was kept for later, and the next drone took off."""
+
+    def none(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading.Thread, "start", none)
+    begun = list[str]()
+    with pytest.raises(KeyboardInterrupt):
+        in_parallel({"a": interrupted, "b": lambda: begun.append("b")})
+    assert begun == []
+
+
 def test_what_is_done_in_parallel_ends_whatever_one_of_them_does() -> None:
     results, errors = in_parallel({"a": lambda: 1, "b": lambda: [].pop if False else 2})
     assert (results, errors) == ({"a": 1, "b": 2}, {})

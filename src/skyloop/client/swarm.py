@@ -729,6 +729,8 @@ def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict
     try:
         for name in left:
             copy_context().run(work, name, jobs[name])
+            if not isinstance(raised.get(name), Exception | None):
+                raise raised[name]  # Ctrl-C, on this thread: nothing else begins
         for thread in threads:
             thread.join()
     except BaseException:  # Ctrl-C: a take-off must not be carried out later

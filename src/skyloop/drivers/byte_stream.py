@@ -22,7 +22,8 @@ CONNECT_S: Final = 1.0
 STUCK_NS: Final = nanoseconds(0.5)  #: a connection that has no room for so long is no longer read
 _MOST: Final = 65_536  # bytes read at once
 _BITS: Final = 10  # that a serial line takes for a byte
-_DRAIN_S: Final = 0.1  # that closing a connection may take
+_DRAIN_S: Final = 0.1  # that closing a connection may take, while a new one is to be opened
+END_S: Final = 0.5  #: the same for good: a TCP packet that is lost is sent again 0.2 s later
 _UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection ends: nothing older is delivered
 _OVERDUE_NS: Final = nanoseconds(0.1)  # a line is stalled if bytes wait so long after it should have carried them
 #: Size of the longest frame of MAVLink and MSP [bytes]. Parsers of flight controllers read as many bytes as a frame
@@ -100,12 +101,13 @@ class ByteStream(ABC):
 
     def __init__(self, pace: LinePace, clock: Clock) -> None:
         self.dropped = 0
+        self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for what was written to leave
         self._pace = pace
         self._clock = clock
         self._full_ns: int | None = None  # since when there is no room, or the line is stalled
         self._whole = _LONGEST  # bytes written since a frame may have been cut
         self._cleared = False  # a full buffer was emptied for a stop, and nothing shows whether it is read since
-        self._stopping = False  # the last packet was a stop, which the next one must not discard
+        self._after_stop = 1 << 62  # bytes written since a stop: where more than that wait, it is among them
 
     @abstractmethod
     def fileno(self) -> int:
@@ -132,7 +134,7 @@ class ByteStream(ABC):
         """
         now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
         self._pace.on_waiting(waiting, now_ns)
-        if stop and not self._stopping and waiting > _LONGEST:  # less is sent no later than what fills up a cut frame
+        if stop and _LONGEST < waiting <= self._after_stop:  # less is sent no later than what fills up a cut frame
             self._discard()
         stalled = self._cleared or self._pace.stalled(now_ns)
         sent = 0
@@ -152,7 +154,7 @@ class ByteStream(ABC):
         if sent:
             self._pace.on_written(sent, now_ns)
             self._whole += sent
-            self._stopping = stop
+            self._after_stop = 0 if stop else self._after_stop + sent
         self.dropped += not sent
         self._check_room(now_ns, room=bool(sent) and not stalled)
 
@@ -183,10 +185,11 @@ class ByteStream(ABC):
 
     def _drain(self, waiting: Callable[[], int]) -> bool:
         """Wait a moment for what was written to leave; return whether it did."""
-        until_s = time.monotonic() + _DRAIN_S
-        while self._full_ns is None and waiting() and time.monotonic() < until_s:
+        until_s = time.monotonic() + self.drain_s
+        patient = self._full_ns is None or not self._after_stop  # a stop has just emptied it, and may leave yet
+        while patient and (waiting() or self._cleared) and time.monotonic() < until_s:
             time.sleep(0.005)
-        return self._full_ns is None and not waiting()
+        return patient and not (waiting() or self._cleared)
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
@@ -250,6 +253,7 @@ class TcpStream(ByteStream):
             import fcntl
             import termios
 
+            self._socket.getpeername()  # of one that is gone the system still counts what was not received
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count
         return 0

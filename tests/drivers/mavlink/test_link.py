@@ -13,13 +13,16 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
 
 from skyloop.drivers.base import Driver, ExternalPose, ServedLink
+from skyloop.drivers.byte_stream import END_S
 from skyloop.drivers.mavlink import MavlinkDriver
-from skyloop.drivers.mavlink.link import MavlinkLink
+from skyloop.drivers.mavlink.link import MavlinkLink, TcpClient
+from skyloop.drivers.mavlink.protocol import MavlinkSession
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
@@ -32,7 +35,7 @@ from skyloop.transport.testing import wait_until
 from skyloop.wire.mavlink.codec import Codec
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import Landed
-from tests.drivers.mavlink.scripted import ARDUPILOT, Vehicle
+from tests.drivers.mavlink.scripted import ARDUPILOT, Vehicle, options
 
 PATIENCE_S = 15.0
 
@@ -59,6 +62,15 @@ def opened(address: str) -> Iterator[tuple[Driver, RecordingSink]]:
 
 def up(sink: RecordingSink) -> None:
     assert sink.wait(lambda: sink.link_state is LinkState.UP, PATIENCE_S), sink.links
+
+
+def test_the_last_connection_has_more_time_to_deliver_what_was_sent() -> None:
+    link = MavlinkLink(MavlinkSession(options("mavlink://tcp:127.0.0.1:5760"), 0), lambda _: None)
+    link._connection = line = create_autospec(TcpClient, instance=True)
+    link._stopping.set()
+    link.end()
+    assert line.drain_s == END_S
+    line.close.assert_called_once()
 
 
 def test_udp_that_speaks_first() -> None:

@@ -731,6 +731,29 @@ def test_a_vehicle_that_no_longer_reads_gets_no_set_points_before_it_has_answere
     assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
 
 
+def test_a_vehicle_whose_only_answer_was_lost_is_asked_again() -> None:
+    """It told its version, so nothing more was asked, and no set-point was ever sent again."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.session.broken(ConnectionError("the vehicle no longer reads what is sent"), bench.clock())
+    bench.go_on(0.1)
+    bench.hear(version_of(1))
+    bench.said.clear()
+    bench.go_on(2.5)
+    assert asked_for_its_version(bench) >= 2
+    bench.answer(m.MAV_CMD_REQUEST_MESSAGE)
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP
+    bench.said.clear()
+    bench.go_on(2.0)
+    assert not asked_for_its_version(bench)
+
+
+def asked_for_its_version(bench: Bench) -> int:
+    told = [(each.command, each.param1) for each in bench.heard_of("COMMAND_LONG")]
+    return told.count((m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
+
+
 def test_an_emergency_stop_goes_before_all_else() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from itertools import pairwise
 
 import pytest
@@ -468,6 +469,43 @@ def test_somebody_who_takes_the_vehicle_over_keeps_it(autopilot: int, mode: str)
 
 
 @AUTOPILOTS
+@pytest.mark.parametrize("alone", [False, True])
+def test_who_holds_a_vehicle_that_lands_keeps_it_there(autopilot: int, alone: bool) -> None:
+    """Somebody stands below, and another station stops it; each repeat of the landing took it back."""
+    bench = steering(autopilot)
+    bench.apply(Land())
+    bench.vehicle.mode = LAND[autopilot][0]
+    bench.go_on(4.0)
+    bench.vehicle.mode = HOLD[autopilot][0]
+    bench.commands()
+    for _ in range(20):
+        bench.go_on(0.1)
+        with suppress(DriverError):
+            bench.apply(Land(), alone=alone, new=False)
+    assert bench.commands() == []
+    assert bench.session.setpoints is not None
+    assert bench.session.setpoints.ownership.others == HOLD[autopilot][0]
+    bench.go_on(0.6)
+    bench.apply(Land())
+    bench.go_on(0.1)
+    assert bench.commands() == [LAND[autopilot][1]], "a fresh decision takes it back"
+
+
+@AUTOPILOTS
+def test_a_landing_of_ours_is_asked_for_again_where_the_vehicle_is_found_holding(autopilot: int) -> None:
+    """What it does by itself while it hears nothing is nobody's decision."""
+    bench = steering(autopilot)
+    bench.apply(Land())
+    bench.vehicle.mode = LAND[autopilot][0]
+    bench.go_on(4.0)
+    bench.go_on(2.6, silent=True)
+    bench.vehicle.mode = HOLD[autopilot][0]
+    bench.commands()
+    bench.go_on(1.0)
+    assert LAND[autopilot][1] in bench.commands()
+
+
+@AUTOPILOTS
 def test_an_order_of_our_own_that_comes_late_is_nobody_elses(autopilot: int) -> None:
     """A pilot is back while the failsafe's mode is still on its way: it is asked for the mode that follows again."""
     bench = steering(autopilot)
@@ -867,6 +905,26 @@ def test_an_arming_that_shows_after_its_take_off_was_given_up_is_undone(autopilo
     bench.vehicle.armed = False
     bench.go_on(0.5)
     assert bench.state() is FlightState.LANDED
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize("switched", [True, False])
+def test_who_arms_and_flies_it_right_after_a_take_off_was_given_up_is_left(autopilot: int, switched: bool) -> None:
+    """A safety pilot takes over what did not start: it was told to land twice a second, for the whole flight."""
+    bench = arming(autopilot)
+    while not any("does not answer" in text for text in bench.texts):
+        bench.go_on(0.02)
+    bench.go_on(0.3)
+    bench.commands()
+    vehicle = bench.vehicle
+    vehicle.armed = True
+    if switched:
+        vehicle.mode = {ARDUPILOT: "STABILIZE", PX4: "POSCTL"}[autopilot]
+    bench.go_on(0.5)
+    assert bool(bench.commands()) is not switched, "only in that mode it may be our own arming that shows"
+    vehicle.landed, vehicle.place, vehicle.status = Landed.IN_AIR, (0.0, 0.0, -1.0), 4
+    bench.go_on(3.0)
+    assert bench.commands() == []
 
 
 @AUTOPILOTS

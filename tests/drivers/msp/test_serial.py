@@ -14,7 +14,7 @@ from unittest.mock import create_autospec
 
 import pytest
 
-from skyloop.drivers.byte_stream import Rank, TcpStream
+from skyloop.drivers.byte_stream import END_S, Rank, TcpStream
 from skyloop.drivers.msp import MspDriver
 from skyloop.drivers.msp.link import MspLink
 from skyloop.drivers.recording_sink import RecordingSink
@@ -120,6 +120,15 @@ def test_a_stop_is_sent_as_one_whatever_waits_on_the_line() -> None:
     link.command(EmergencyStop())
     link.end()
     assert ranks == [Rank.SETPOINT, Rank.STOP]
+
+
+def test_the_last_connection_has_more_time_to_deliver_what_was_sent() -> None:
+    link, line = MspLink(Bench().session, lambda _: None), create_autospec(TcpStream, instance=True)
+    link._connection = line
+    link._stopping.set()
+    link.end()
+    assert line.drain_s == END_S
+    line.close.assert_called_once()
 
 
 def test_without_pyserial_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

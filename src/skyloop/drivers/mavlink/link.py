@@ -10,7 +10,7 @@ from typing import Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import ServedLink
-from skyloop.drivers.byte_stream import ByteStream, SerialStream, TcpStream
+from skyloop.drivers.byte_stream import END_S, ByteStream, SerialStream, TcpStream
 from skyloop.drivers.mavlink.options import Address, ConnectionKind, Peer
 from skyloop.drivers.mavlink.protocol import MavlinkSession, Packet
 from skyloop.drivers.vehicle_link import ConnectionLink
@@ -294,6 +294,10 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
             else:
                 self._on_broken(error, now_ns)
         self.session.dropped = connection.dropped
+
+    def _on_end(self, connection: MavlinkConnection) -> None:
+        if isinstance(connection, ByteStream):
+            connection.drain_s = END_S
 
     # The connection ----------------------------------------------------------------------------------------------
 

@@ -351,7 +351,7 @@ class MavlinkSession(VehicleSession):
         return min(max(due_ns, tick_ns), next_ns)
 
     def _fly(self, vehicle: VehicleState | None, now_ns: int) -> list[Message]:
-        if self.version is None:
+        if self.version is None or not self._heard_by_it:
             self.commands.request(_ASK_VERSION, now_ns, VERSION_PACE_S)
         self._intervals.request_missing(self.telemetry, self.commands, now_ns)
         messages = (

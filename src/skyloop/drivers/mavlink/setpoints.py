@@ -54,6 +54,7 @@ FORCE: Final = 21196.0  #: "even in flight", of the command to disarm
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
+DISARM_NS: Final = nanoseconds(0.5)  #: an arming that is undone is asked about for so long after it was seen last
 STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
 HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
 
@@ -152,7 +153,8 @@ class SetpointController:
         if isinstance(action, Takeoff):
             self._take_off(vehicle, now_ns)
         elif isinstance(action, Land):
-            self._land(vehicle)
+            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # a repeat: others may end it
+                self._land(vehicle)
         elif isinstance(action, Hover):
             self._hover(vehicle, now_ns, alone=alone)
         else:
@@ -265,6 +267,7 @@ class SetpointController:
             started = self._takeoff is not None and self._takeoff.started
             self._end()
             self.goal = Goal.HOLD if started else Goal.NOTHING
+        self._entered, self._strayed_ns = False, None  # what it does by itself meanwhile is nobody's decision
         self.ownership.on_link_lost()
 
     def forget_landing(self) -> bool:
@@ -323,8 +326,8 @@ class SetpointController:
             return []
         if self.goal is Goal.TAKE_OFF:
             return self._step_takeoff(vehicle, now_ns)
-        if self.goal is Goal.NOTHING and vehicle.airborne is False and now_ns < self._disarms_until_ns:
-            self.goal = Goal.LAND if vehicle.armed else Goal.NOTHING
+        if self.goal is Goal.NOTHING and now_ns < self._disarms_until_ns:
+            self._undo_arming(vehicle, now_ns)
         if vehicle.airborne is False and self.goal is not Goal.LAND:
             self._flight_is_over()
         elif self.ownership.observe(vehicle, now_ns):
@@ -396,6 +399,14 @@ class SetpointController:
                 self.goal = Goal.LAND if vehicle.armed else Goal.NOTHING
                 self._disarms_until_ns = takeoff.arm_asked_ns + ARMED_NS
         return messages
+
+    def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
+        """Disarm what a take-off that was given up has armed; what rises, or is in another mode, others have armed."""
+        if vehicle.airborne or vehicle.mode != self._autopilot.ARMING:
+            self._disarms_until_ns = 0
+        elif vehicle.armed and vehicle.airborne is False:
+            self._disarms_until_ns = max(self._disarms_until_ns, now_ns + DISARM_NS)
+            self._commands.request(DISARM, now_ns)
 
     def _step_following(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
         assert self._setpoint is not None

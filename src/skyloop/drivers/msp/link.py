@@ -9,7 +9,7 @@ from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.byte_stream import ByteStream, Rank, SerialStream, TcpStream
+from skyloop.drivers.byte_stream import END_S, ByteStream, Rank, SerialStream, TcpStream
 from skyloop.drivers.msp.protocol import MspSession
 from skyloop.drivers.vehicle_link import ConnectionLink
 from skyloop.drivers.vehicle_session import SinkCallback
@@ -73,5 +73,6 @@ class MspLink(ConnectionLink[MspSession, ByteStream]):
             self._on_broken(error, now_ns)
 
     def _on_end(self, connection: ByteStream) -> None:
+        connection.drain_s = END_S
         with suppress(OSError):
             connection.write(self.session.last_words(self._clock()), Rank.COMMAND)
