@@ -114,7 +114,7 @@ def test_a_px4_that_ends_its_take_off_below_its_height_is_still_flown_from_here(
     vehicle = bench.vehicle
     vehicle.status, vehicle.mode, vehicle.landed, vehicle.place = 4, "AUTO.TAKEOFF", Landed.IN_AIR, (0.0, 0.0, -0.6)
     bench.go_on(1.2)
-    vehicle.mode, vehicle.place = "AUTO.LOITER", (0.0, 0.0, -0.7)
+    vehicle.mode, vehicle.place, vehicle.amsl_m = "AUTO.LOITER", (0.0, 0.0, -0.3), vehicle.amsl_m + 0.4  # moved home
     bench.go_on(0.9)
     vehicle.mode = "OFFBOARD"
     bench.go_on(0.3)

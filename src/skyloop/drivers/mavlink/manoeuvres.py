@@ -350,8 +350,10 @@ class TakeoffSequence:
         """Return whether somebody chose the mode for holding the position on the way up; a take-off ends in it, too."""
         if not (self._autopilot.TAKING_OFF and self.rose and self._seen and vehicle.mode == self._autopilot.HOLD):
             return False
-        least_m = min(CUT_SHORT * self._height_m, self._height_m - CUT_SHORT_M)
-        return vehicle.altitude_m is not None and vehicle.altitude_m < least_m
+        below_m = None if vehicle.altitude_m is None else self._height_m - vehicle.altitude_m
+        if self._climb_command is not None and vehicle.amsl_m is not None:
+            below_m = self._climb_command.arguments[6] - vehicle.amsl_m  # it may move its home on the way
+        return below_m is not None and below_m > max(CUT_SHORT * self._height_m, CUT_SHORT_M)
 
     def _observe_mode(self, vehicle: VehicleState, cut_short: bool, now_ns: int) -> None:
         """Notice that somebody chose another mode, on the ground already."""
