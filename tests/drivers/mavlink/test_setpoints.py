@@ -109,6 +109,20 @@ def test_px4_holds_is_armed_and_told_an_altitude_above_sea_level() -> None:
     assert bench.state() is FlightState.HOVERING
 
 
+def test_a_px4_that_ends_its_take_off_below_its_height_is_still_flown_from_here() -> None:
+    """A real one does at 0.7 of 1.5 m (NAV_MC_ALT_RAD). It was left to others, and so by the failsafes."""
+    bench = about_to_rise(PX4)
+    vehicle = bench.vehicle
+    vehicle.status, vehicle.mode, vehicle.landed, vehicle.place = 4, "AUTO.TAKEOFF", Landed.IN_AIR, (0.0, 0.0, -0.6)
+    bench.go_on(1.2)
+    vehicle.mode, vehicle.place, vehicle.amsl_m = "AUTO.LOITER", (0.0, 0.0, -0.3), vehicle.amsl_m + 0.4  # moved home
+    bench.go_on(0.9)
+    vehicle.mode = "OFFBOARD"
+    bench.go_on(0.3)
+    assert bench.state() is FlightState.HOVERING
+    assert [text for text in bench.texts if "not from here" in text] == []
+
+
 @AUTOPILOTS
 def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(autopilot: int) -> None:
     """It was told "disarmed itself" 2.5 s later: what was heard before a request proves nothing about it."""
@@ -130,6 +144,26 @@ def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(a
     bench.answer(ARM)
     bench.go_on(0.1)
     assert bench.state() is FlightState.TAKING_OFF
+
+
+@AUTOPILOTS
+def test_the_answer_to_disarming_after_a_landing_is_not_taken_for_one_to_arming(autopilot: int) -> None:
+    """Both commands have one number. A real PX4 was never told to arm, and "disarmed itself" 2.5 s later."""
+    bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
+    vehicle = bench.vehicle
+    bench.apply(Hover())
+    bench.go_on(1.2)
+    bench.apply(Land())
+    vehicle.mode, vehicle.landed, vehicle.place = LAND[autopilot][0], Landed.ON_GROUND, (0.0, 0.0, 0.0)
+    bench.go_on(0.3)
+    bench.apply(Takeoff())
+    bench.answer(ARM)  # to the command to disarm, on its way since before
+    bench.go_on(0.2)
+    vehicle.armed = False
+    bench.go_on(0.2)
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.go_on(0.2)
+    assert (ARM, 1.0, 0.0, 0.0, 0.0) in bench.commands()
 
 
 @AUTOPILOTS

@@ -216,7 +216,8 @@ ARMED_NS: Final = nanoseconds(2.5)  #: how long an acknowledgement of arming cou
 LANDED_NS: Final = nanoseconds(2.5)  #: after this a landing has disarmed it, or does not: a PX4 does after 2 s
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 LEFT_GROUND_M: Final = 0.3
-CUT_SHORT: Final = 0.5  #: a take-off that holds its position below this share of its height was stopped by somebody
+CUT_SHORT: Final = 0.5  #: a take-off that holds its position below this share of its height was stopped by somebody,
+CUT_SHORT_M: Final = 1.05  #: and by so much at least: a PX4's ends NAV_MC_ALT_RAD (0.8 m) below its height by itself
 STRAYED_NS: Final = nanoseconds(0.6)  #: another mode must show for so long, as messages may overtake one another
 STALLED_NS: Final = nanoseconds(6.0)  #: no higher than before for so long means that something cancelled the climb
 
@@ -259,6 +260,7 @@ class TakeoffSequence:
         self._seen = not autopilot.TAKING_OFF  # its mode for taking off, where it has one
         self.refused = ""  #: why it is not armed yet
         self.arm_asked_ns: int | None = None  #: when arming was asked for last; None: it was armed by others before
+        self._arming_ns: int | None = None  # since when; an answer from before is of the landing's disarming
         self._ready = False  # it was seen armed in the mode that it takes off in
 
     @property
@@ -283,6 +285,7 @@ class TakeoffSequence:
             commands.request(self._autopilot.mode_command(self._autopilot.ARMING), now_ns)
         elif self._armed_ns is None:
             self.arm_asked_ns = now_ns
+            self._arming_ns = now_ns if self._arming_ns is None else self._arming_ns
             commands.request(ARM, now_ns, ARM_PACE_S)
         elif vehicle.mode in (self._autopilot.ARMING, *self._autopilot.TAKING_OFF) or self._climb_command is not None:
             self._climb_command = self._climb_command or self._autopilot.takeoff_command(self._height_m, vehicle)
@@ -294,7 +297,7 @@ class TakeoffSequence:
 
     def _observe(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> None:
         """Judge what came of it so far."""
-        answer = commands.result(ARM.number, self._begun_ns)
+        answer = None if self._arming_ns is None else commands.result(ARM.number, self._arming_ns)
         if self._armed_ns is None:
             if vehicle.armed or answer == ACCEPTED:
                 self._armed_ns = now_ns
@@ -347,7 +350,10 @@ class TakeoffSequence:
         """Return whether somebody chose the mode for holding the position on the way up; a take-off ends in it, too."""
         if not (self._autopilot.TAKING_OFF and self.rose and self._seen and vehicle.mode == self._autopilot.HOLD):
             return False
-        return vehicle.altitude_m is not None and vehicle.altitude_m < CUT_SHORT * self._height_m
+        below_m = None if vehicle.altitude_m is None else self._height_m - vehicle.altitude_m
+        if self._climb_command is not None and vehicle.amsl_m is not None:
+            below_m = self._climb_command.arguments[6] - vehicle.amsl_m  # it may move its home on the way
+        return below_m is not None and below_m > max(CUT_SHORT * self._height_m, CUT_SHORT_M)
 
     def _observe_mode(self, vehicle: VehicleState, cut_short: bool, now_ns: int) -> None:
         """Notice that somebody chose another mode, on the ground already."""
