@@ -228,9 +228,10 @@ def test_a_stop_on_a_stalled_line_gets_a_moment_to_leave_when_the_port_is_closed
         stream.write(bytes(60))
         clock.advance(0.04)
     stream.write(b"stop", Rank.STOP)
+    stream.write(b"words", Rank.COMMAND)
     monkeypatch.setattr("skyloop.drivers.byte_stream.time.sleep", lambda _: came.extend(uart.read(29)))
     stream.close()
-    assert came.endswith(b"stop")
+    assert came.endswith(b"stopwords")
 
 
 def test_a_port_is_empty_when_it_is_opened(uart: Uart) -> None:

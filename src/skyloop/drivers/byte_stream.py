@@ -186,7 +186,8 @@ class ByteStream(ABC):
     def _drain(self, waiting: Callable[[], int]) -> bool:
         """Wait a moment for what was written to leave; return whether it did."""
         until_s = time.monotonic() + self.drain_s
-        patient = self._full_ns is None or not self._after_stop  # a stop has just emptied it, and may leave yet
+        # On a line that carries nothing only a stop is waited for: it emptied the buffer, and may leave yet.
+        patient = self._full_ns is None or self._cleared or waiting() > self._after_stop
         while patient and (waiting() or self._cleared) and time.monotonic() < until_s:
             time.sleep(0.005)
         return patient and not (waiting() or self._cleared)
