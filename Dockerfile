@@ -1,4 +1,4 @@
-# Skyloop with all its extras but MuJoCo and Ray: docs/platforms.md says how to run it.
+# Skyloop with its extra `all`: docs/platforms.md says how to run it.
 #   docker build -t skyloop . && docker run --rm skyloop
 ARG BASE=python:3.13-slim
 FROM ${BASE} AS build

@@ -16,7 +16,7 @@ help:
 	@echo "make test [ARGS='-k authority']              the tests of every day, 5 minutes; with ARGS, those that they select of all"
 	@echo "make test-all                                all tests"
 	@echo "make explore [SECONDS=3600]                  new examples for the tests of properties, for a minute"
-	@echo "make check                                   lint, format, types, import contracts"
+	@echo "make check                                   lint, format, types, import contracts, budgets"
 	@echo "make chaos [ARGS='--seconds 180']            drones flown while processes die, stall, starve and are flooded"
 	@echo "make fuzz [ARGS='--seconds 60 recording']    decoders, file readers and servers against hostile input"
 	@echo "make docs                                    the documentation as a site: build/site/index.html"
@@ -58,6 +58,8 @@ check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python scripts/house.py --check
+	$(BIN)/python scripts/paths.py --check
 
 # Three minutes by default; an hour by hand: make chaos ARGS="--seconds 3600".
 chaos: $(VENV)/.installed-dev

@@ -25,7 +25,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from skyloop.bench.machine import Machine
+from skyloop.bench import Machine
 from skyloop.cli.sim import OWN_OPTIONS
 from skyloop.cockpit.child import CockpitProcess
 

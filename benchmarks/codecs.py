@@ -14,13 +14,11 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from benchmarks.measuring.contract import Image, picture
+from benchmarks.measuring.schedule import SMALL
+from benchmarks.measuring.workers import STARTS_WITHIN_S, Workers
 from benchmarks.one_core import codecs_on_one_core
-from skyloop.bench.contract import Image, picture
-from skyloop.bench.machine import Machine
-from skyloop.bench.schedule import SMALL
-from skyloop.bench.sim import Flight, Progress, rounds
-from skyloop.bench.statistics import Spread, spread
-from skyloop.bench.workers import STARTS_WITHIN_S, Workers
+from skyloop.bench import Flight, Machine, Spread, rounds, spread
 from skyloop.drivers.ardrone.video import PaveVideo
 from skyloop.drivers.backlog import Coded
 from skyloop.emulators.ardrone.uvlc import encode as encode_uvlc
@@ -59,6 +57,9 @@ class CodecResults(msgspec.Struct, frozen=True):
     machine: Machine
     rows: list[CodecRow]
     skipped: dict[str, str]  #: why something was left out
+
+
+Progress = Callable[[float], None]
 
 
 def measure(seconds: float, progress: Progress = lambda _: None) -> CodecResults:

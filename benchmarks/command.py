@@ -11,10 +11,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from benchmarks.one_command import one_command
-from skyloop.bench.tables import verdict_table
-from skyloop.cli.app import run
-from skyloop.cli.bench import (
+from benchmarks.measuring.command_line import (
     Minutes,
     Output,
     Seconds,
@@ -27,12 +24,15 @@ from skyloop.cli.bench import (
     parse_sizes,
     print_skipped,
 )
+from benchmarks.measuring.tables import verdict_table
+from benchmarks.one_command import one_command
+from skyloop.cli.app import run
 from skyloop.errors import MissingExtraError, UsageError
 
 
 def peers(
     peers: Annotated[
-        str, typer.Option(help="Compare with fabric, ros2, zenoh, zeromq, several with commas, or all")
+        str, typer.Option(help="Compare with fabric, ros2, zenoh, zeromq, several with commas, all or none")
     ] = "all",
     ros_python: Annotated[
         str | None, typer.Option(help="The Python that has rclpy [default: $SKYLOOP_ROS_PYTHON or this one]")
@@ -42,15 +42,26 @@ def peers(
     minutes: Minutes = None,
     output: Output = None,
 ) -> None:
-    """Measure other libraries beside Skyloop and the bare hand-over, as ``skyloop bench delays`` does."""
+    """Measure other libraries beside Skyloop and the bare hand-over, in turns: the paper's experiment."""
+    from benchmarks.measuring.figures import draw
     from benchmarks.peers import chosen, find
-    from skyloop.bench.figures import draw
 
     wanted_s, wanted = duration_s(seconds, minutes), parse_sizes(sizes)
     found, skipped = find(chosen(peers), ros_python)
     with measuring("delays", output) as progress:
         results, shown = measure_delays(wanted_s, wanted, found, skipped, progress)
     finish("delays", results, shown, output, draw)
+
+
+def loop(sizes: Sizes = None, seconds: Seconds = None, minutes: Minutes = None, output: Output = None) -> None:
+    """Measure the way from a frame to the command that it causes, by stage."""
+    from benchmarks.measuring import loop
+    from benchmarks.measuring.tables import loop_table
+
+    wanted_s, wanted = duration_s(seconds, minutes), parse_sizes(sizes)
+    with measuring("loop", output) as progress:
+        results = loop.measure(wanted_s, wanted, progress)
+    finish("loop", results, as_rich([loop_table(results)], str(results.machine)), output)
 
 
 def load(
@@ -290,7 +301,21 @@ def video_path(
 
 BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
     function.__name__: function
-    for function in (peers, load, codecs, network, swarm, scale, fleet, learning, warmth, ros, recordings, video_path)
+    for function in (
+        peers,
+        loop,
+        load,
+        codecs,
+        network,
+        swarm,
+        scale,
+        fleet,
+        learning,
+        warmth,
+        ros,
+        recordings,
+        video_path,
+    )
 }
 
 

@@ -1,9 +1,9 @@
 """Compares a run with the last one on the pages, so that a loss shows.
 
-``python -m benchmarks.compare results`` reads what ``skyloop bench … --output results`` and ``python -m benchmarks.…
---output results`` wrote, and compares it with ``docs/measured``; with a second folder, with that. Delays are compared
-as multiples of the bare hand-over's in their own run, so that a faster or busier machine changes nothing; the
-simulator, which has no such floor, as it was measured, which says something on one machine only.
+``python -m benchmarks.compare results`` reads what ``python -m benchmarks.… --output results`` wrote (and ``skyloop
+bench sim --json``, as ``sim.json``), and compares it with ``docs/measured``; with a second folder, with that. Delays
+are compared as multiples of the bare hand-over's in their own run, so that a faster or busier machine changes nothing;
+the simulator, which has no such floor, as it was measured, which says something on one machine only.
 
 What is more than :data:`WORSE` times as slow as before is marked, and the exit status is 1 then.
 """
@@ -17,16 +17,16 @@ from typing import Annotated, Final, NamedTuple
 
 import typer
 
+from benchmarks.measuring import delays, loop
+from benchmarks.measuring.command_line import as_rich
+from benchmarks.measuring.contenders import FLOOR, OURS
+from benchmarks.measuring.loop import TOTAL
+from benchmarks.measuring.schedule import CHANNELS, COMMAND, VIDEO
+from benchmarks.measuring.tables import Table
 from benchmarks.one_command import one_command
 from benchmarks.pages.delays import MEASURED
-from skyloop.bench import delays, loop
-from skyloop.bench.contenders import FLOOR, OURS
-from skyloop.bench.loop import TOTAL
-from skyloop.bench.schedule import CHANNELS, COMMAND, VIDEO
-from skyloop.bench.sim import SimResults
-from skyloop.bench.tables import Table
+from skyloop.bench import SimResults
 from skyloop.cli.app import run
-from skyloop.cli.bench import as_rich
 from skyloop.cli.text import console
 from skyloop.errors import UsageError
 from skyloop.files import MAX_RESULTS, read_json

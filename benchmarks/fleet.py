@@ -17,16 +17,26 @@ import msgspec
 
 from benchmarks import mavlink_fleet
 from benchmarks.mavlink_fleet import MavlinkResult
+from benchmarks.measuring.contract import Arrivals, Received, picture
+from benchmarks.measuring.machine import cpu_time_s, memory_bytes
+from benchmarks.measuring.ours import Listening
+from benchmarks.measuring.pair import since
+from benchmarks.measuring.schedule import (
+    CHANNELS,
+    COMMAND,
+    FEEDBACK,
+    SETTLE_S,
+    VIDEO,
+    WARM_UP_S,
+    Turn,
+    paced,
+    sleep_until,
+)
+from benchmarks.measuring.statistics import Summary, summarize
+from benchmarks.measuring.waypoints import fly
+from benchmarks.measuring.workers import Pipe, Worker, Workers
 from benchmarks.scale import FRAME_PERIOD_S, loopback
-from skyloop.bench.contract import Arrivals, Received, picture
-from skyloop.bench.machine import Machine, cpu_time_s, memory_bytes
-from skyloop.bench.ours import Listening
-from skyloop.bench.pair import since
-from skyloop.bench.schedule import CHANNELS, COMMAND, FEEDBACK, SETTLE_S, VIDEO, WARM_UP_S, Turn, paced, sleep_until
-from skyloop.bench.statistics import Summary, summarize
-from skyloop.bench.vehicle import CAMERA, BenchVehicle, stamped
-from skyloop.bench.waypoints import fly
-from skyloop.bench.workers import Pipe, Worker, Workers
+from skyloop.bench import CAMERA, BenchVehicle, Machine, stamped
 from skyloop.client import Drone, connect
 from skyloop.client.core import Access
 from skyloop.drivers.uri import VehicleUri

@@ -8,9 +8,8 @@ from typing import Any, Final, Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from skyloop.bench.machine import Machine
-from skyloop.bench.sim import rounds
-from skyloop.bench.tables import Table
+from benchmarks.measuring.tables import Table
+from skyloop.bench import Machine, rounds
 from skyloop.clock import monotonic_ns
 from skyloop.gym import ReachEnv, ReachVectorEnv
 from skyloop.sim.render import use_one_core

@@ -14,14 +14,15 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from benchmarks.disk import small_disk
+from benchmarks.measuring.contract import Arrivals
+from benchmarks.measuring.machine import cpu_time_s
+from benchmarks.measuring.ours import proxy_name
+from benchmarks.measuring.pair import Pair, since
+from benchmarks.measuring.schedule import CHANNELS, FRAME_PERIOD_S, MIDDLE, SMALL, Size, Turn, sleep_until
+from benchmarks.measuring.statistics import Summary, summarize
+from benchmarks.measuring.workers import STARTS_WITHIN_S, Worker, Workers
 from benchmarks.onlookers import OWN, SHARED, look, observe, record, serve, show
-from skyloop.bench.contract import Arrivals
-from skyloop.bench.machine import Machine, cpu_time_s
-from skyloop.bench.ours import proxy_name
-from skyloop.bench.pair import Pair, since
-from skyloop.bench.schedule import CHANNELS, FRAME_PERIOD_S, MIDDLE, SMALL, Size, Turn, sleep_until
-from skyloop.bench.statistics import Summary, summarize
-from skyloop.bench.workers import STARTS_WITHIN_S, Worker, Workers
+from skyloop.bench import Machine
 from skyloop.errors import LinkError, UsageError
 from skyloop.files import MAX_RESULTS, read_json
 
@@ -259,7 +260,7 @@ class _Stage:
         self._folders = folders
         modules = {case.slow: "benchmarks.slow" if case.slow else None for case in cases}
         self._pairs = {
-            slow: Pair(workers, "skyloop.bench.ours", folder, application_module=module)
+            slow: Pair(workers, "benchmarks.measuring.ours", folder, application_module=module)
             for slow, module in modules.items()
         }
         self._observers = [workers.start(observe, self._proxy) for _ in range(max(case.observers for case in cases))]

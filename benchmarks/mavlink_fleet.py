@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.bench.machine import cpu_time_s
-from skyloop.bench.schedule import sleep_until
-from skyloop.bench.workers import Pipe, Worker, Workers
+from benchmarks.measuring.machine import cpu_time_s
+from benchmarks.measuring.schedule import sleep_until
+from benchmarks.measuring.workers import Pipe, Worker, Workers
 from skyloop.client import Drone, connect
 from skyloop.client.core import Access
 from skyloop.client.swarm import Swarm

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from skyloop.bench.contract import Image
-from skyloop.bench.schedule import Size
+from benchmarks.measuring.contract import Image
+from benchmarks.measuring.schedule import Size
 
 STAMP_NS: Final = 125_000  #: the stamps' step
 _BITS: Final = 24

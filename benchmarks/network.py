@@ -15,12 +15,12 @@ from benchmarks import over_network
 from benchmarks.hosts.impairments import Impairments
 from benchmarks.hosts.namespaces import Host, Lab
 from benchmarks.hosts.path import Path
-from skyloop.bench.contract import Arrivals
-from skyloop.bench.machine import Machine
-from skyloop.bench.pair import Pair
-from skyloop.bench.schedule import CHANNELS, COMMAND, FRAME_PERIOD_S, VIDEO, Turn, sleep_until
-from skyloop.bench.statistics import Spread, Summary, spread, summarize
-from skyloop.bench.workers import STARTS_WITHIN_S, Pipe, Workers
+from benchmarks.measuring.contract import Arrivals
+from benchmarks.measuring.pair import Pair
+from benchmarks.measuring.schedule import CHANNELS, COMMAND, FRAME_PERIOD_S, VIDEO, Turn, sleep_until
+from benchmarks.measuring.statistics import Summary, summarize
+from benchmarks.measuring.workers import STARTS_WITHIN_S, Pipe, Workers
+from skyloop.bench import Machine, Spread, spread
 from skyloop.files import MAX_RESULTS, read_json
 
 LOSSES: Final = (0.0, 0.01, 0.1, 0.3)

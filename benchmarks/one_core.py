@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from skyloop.bench.workers import Pipe
+from benchmarks.measuring.workers import Pipe
 
 
 def codecs_on_one_core(pipe: Pipe, seconds: float) -> None:

@@ -9,11 +9,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from skyloop.bench.contract import Arrivals, Recorder
-from skyloop.bench.ours import Listening
-from skyloop.bench.schedule import VIDEO
-from skyloop.bench.vehicle import CAMERA
-from skyloop.bench.workers import Pipe
+from benchmarks.measuring.contract import Arrivals, Recorder
+from benchmarks.measuring.ours import Listening
+from benchmarks.measuring.schedule import VIDEO
+from benchmarks.measuring.workers import Pipe
+from skyloop.bench import CAMERA
 from skyloop.client import connect
 from skyloop.clock import nanoseconds
 from skyloop.errors import LinkError, MissingExtraError

@@ -10,10 +10,10 @@ from typing import Final
 
 import numpy as np
 
-from skyloop.bench import ours
-from skyloop.bench.contract import Image
-from skyloop.bench.schedule import SMALL
-from skyloop.bench.waypoints import Setpoint
+from benchmarks.measuring import ours
+from benchmarks.measuring.contract import Image
+from benchmarks.measuring.schedule import SMALL
+from skyloop.bench import Setpoint
 from skyloop.client import Drone
 from skyloop.client import connect as connect_by_name
 from skyloop.client.channels import VideoOptions

@@ -8,11 +8,11 @@ from types import MappingProxyType
 from typing import Final
 
 from benchmarks import over_network
+from benchmarks.measuring.contract import Image, Received
+from benchmarks.measuring.schedule import VIDEO
 from benchmarks.moving_scene import MovingScene
 from benchmarks.video_judge import SIZE, Judge
-from skyloop.bench.contract import Image, Received
-from skyloop.bench.schedule import VIDEO
-from skyloop.bench.vehicle import CAMERA
+from skyloop.bench import CAMERA
 from skyloop.client import Drone, Frame
 from skyloop.client.channels import VideoOptions
 from skyloop.messages import CameraInfo

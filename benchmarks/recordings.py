@@ -15,9 +15,8 @@ from typing import Final
 
 import msgspec
 
-from skyloop.bench.machine import Machine
-from skyloop.bench.sim import Flight
-from skyloop.bench.tables import Table
+from benchmarks.measuring.tables import Table
+from skyloop.bench import Flight, Machine
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.replay.source import ReplaySource
 from skyloop.emulators.ardrone.video import H264_360P

@@ -20,9 +20,9 @@ from typing import Final
 
 import msgspec
 
-from skyloop.bench.machine import Machine
-from skyloop.bench.statistics import Summary, summarize
-from skyloop.bench.tables import Table, median_and_p99
+from benchmarks.measuring.statistics import Summary, summarize
+from benchmarks.measuring.tables import Table, median_and_p99
+from skyloop.bench import Machine
 from skyloop.client import Drone, connect
 from skyloop.errors import NoAnswerError, UnsupportedError
 from skyloop.messages import Applied, Velocity

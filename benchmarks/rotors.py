@@ -13,10 +13,10 @@ from typing import Final, NamedTuple
 
 import typer
 
+from benchmarks.measuring.command_line import as_rich
+from benchmarks.measuring.tables import UNKNOWN, Table
 from benchmarks.one_command import one_command
-from skyloop.bench.tables import UNKNOWN, Table
 from skyloop.cli.app import run
-from skyloop.cli.bench import as_rich
 from skyloop.cli.text import console
 from skyloop.messages import Attitude, FlightState, Takeoff
 from skyloop.sim import STEP_S, Limits, Simulation, VehicleParameters, parse_world

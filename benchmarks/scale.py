@@ -14,15 +14,15 @@ import msgspec
 
 from benchmarks import over_network
 from benchmarks.hosts.namespaces import Lab, problem
-from skyloop.bench.contract import Arrivals, Recorder, vehicle_side
-from skyloop.bench.machine import Machine, cpu_time_s, memory_bytes
-from skyloop.bench.ours import Listening
-from skyloop.bench.pair import since
-from skyloop.bench.schedule import COMMAND, FEEDBACK, SETTLE_S, VIDEO, WARM_UP_S, Turn, paced, sleep_until
-from skyloop.bench.statistics import Summary, summarize
-from skyloop.bench.vehicle import CAMERA
-from skyloop.bench.waypoints import fly
-from skyloop.bench.workers import Pipe, Worker, Workers
+from benchmarks.measuring.contract import Arrivals, Recorder, vehicle_side
+from benchmarks.measuring.machine import cpu_time_s, memory_bytes
+from benchmarks.measuring.ours import Listening
+from benchmarks.measuring.pair import since
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, SETTLE_S, VIDEO, WARM_UP_S, Turn, paced, sleep_until
+from benchmarks.measuring.statistics import Summary, summarize
+from benchmarks.measuring.waypoints import fly
+from benchmarks.measuring.workers import Pipe, Worker, Workers
+from skyloop.bench import CAMERA, Machine
 from skyloop.errors import LinkError, NoAnswerError
 from skyloop.files import MAX_RESULTS, read_json
 from skyloop.transport.fabric import FabricSettings

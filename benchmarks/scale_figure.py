@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, VIDEO
 from benchmarks.scale import PARTS, Scale
-from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO
 from skyloop.errors import MissingExtraError
 from skyloop.files import replacing
 

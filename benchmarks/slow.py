@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from skyloop.bench import ours
-from skyloop.bench.contract import Received
-from skyloop.bench.schedule import VIDEO
-from skyloop.bench.vehicle import CAMERA
+from benchmarks.measuring import ours
+from benchmarks.measuring.contract import Received
+from benchmarks.measuring.schedule import VIDEO
+from skyloop.bench import CAMERA
 from skyloop.client import Frame
 
 SLOW_S: Final = 0.2

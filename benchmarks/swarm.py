@@ -15,11 +15,11 @@ import msgspec
 
 from benchmarks import swarming
 from benchmarks.hosts.namespaces import Lab, problem
+from benchmarks.measuring.machine import cpu_time_s
+from benchmarks.measuring.schedule import sleep_until
+from benchmarks.measuring.workers import Worker, Workers
 from benchmarks.swarming import Step
-from skyloop.bench.machine import Machine, cpu_time_s
-from skyloop.bench.schedule import sleep_until
-from skyloop.bench.statistics import Spread, spread
-from skyloop.bench.workers import Worker, Workers
+from skyloop.bench import Machine, Spread, spread
 from skyloop.files import MAX_RESULTS, read_json
 from skyloop.transport.fabric.config import DEFAULT_PORT, free_port
 

@@ -7,7 +7,7 @@ import time
 from contextlib import ExitStack, suppress
 from typing import Final, NamedTuple
 
-from skyloop.bench.workers import Pipe
+from benchmarks.measuring.workers import Pipe
 from skyloop.client import Drone, Frame, connect
 from skyloop.control import Controller
 from skyloop.drivers.sim import SimDriver, options_of

@@ -11,13 +11,14 @@ from benchmarks.load import PARTS as LOAD_PARTS
 from benchmarks.load import CaseResult as LoadCase
 from benchmarks.load import Load
 from benchmarks.mavlink_fleet import MavlinkResult
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, VIDEO
+from benchmarks.measuring.statistics import Summary
+from benchmarks.measuring.tables import UNKNOWN, Table, median_and_p99
 from benchmarks.network import Channel, Network
 from benchmarks.scale import PARTS, CaseResult, Scale, bends
 from benchmarks.swarm import Swarm
 from benchmarks.units import Fleet, Needs, Units
-from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO
-from skyloop.bench.statistics import Spread, Summary
-from skyloop.bench.tables import UNKNOWN, Table, median_and_p99
+from skyloop.bench import Spread
 
 _OBSERVED: Final = (f"{FEEDBACK}, observers", f"{VIDEO}, observers")
 

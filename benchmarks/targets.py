@@ -15,8 +15,8 @@ from benchmarks.load import (
     observers_name,
     pages_name,
 )
-from skyloop.bench.schedule import COMMAND, FEEDBACK, MIDDLE, VIDEO
-from skyloop.bench.targets import Verdict
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, MIDDLE, VIDEO
+from benchmarks.measuring.targets import Verdict
 
 MOST_OBSERVERS: Final = 32
 OBSERVED_P99: Final = 2.0  #: the pilot's command, with that many observers to none

@@ -20,11 +20,10 @@ import cv2
 import msgspec
 import numpy as np
 
+from benchmarks.measuring.tables import Table
 from benchmarks.tracking_film import LABELS, read_film, read_labels
 from benchmarks.tracking_scenes import KINDS, Sequence, Truth, fixed, moved, scene
-from skyloop.bench.machine import Machine
-from skyloop.bench.statistics import Spread, spread
-from skyloop.bench.tables import Table
+from skyloop.bench import Machine, Spread, spread
 from skyloop.files import write
 from skyloop.vision import CorrelationTracker, LongTermTracker, MedianFlowTracker, Tracker
 from skyloop.vision.tracking import Box, Image, TrackResult, overlap

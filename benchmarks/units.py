@@ -7,9 +7,9 @@ from typing import Final
 
 import msgspec
 
+from benchmarks.measuring.schedule import PACKET_PERIOD_S
 from benchmarks.network import Network
 from benchmarks.scale import FRAME_PERIOD_S, OBSERVED, Case, Scale
-from skyloop.bench.schedule import PACKET_PERIOD_S
 from skyloop.errors import UsageError
 
 _PACKETS_PER_S: Final = 1 / PACKET_PERIOD_S

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
+from benchmarks.measuring.contract import Image, Received
+from benchmarks.measuring.schedule import MIDDLE
 from benchmarks.moving_scene import MovingScene, psnr_db
-from skyloop.bench.contract import Image, Received
-from skyloop.bench.schedule import MIDDLE
 
 SIZE: Final = MIDDLE  #: of the camera's pictures
 JUDGED: Final = 10  #: the quality of one picture in so many is measured

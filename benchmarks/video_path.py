@@ -18,14 +18,14 @@ from benchmarks.hosts.impairments import Impairments
 from benchmarks.hosts.namespaces import Host, Lab
 from benchmarks.hosts.path import Path
 from benchmarks.hosts.traces import Trace
+from benchmarks.measuring.contract import Arrivals
+from benchmarks.measuring.pair import Pair
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, VIDEO, Turn, sleep_until
+from benchmarks.measuring.tables import UNKNOWN, Table
+from benchmarks.measuring.workers import Workers
 from benchmarks.over_path import FORMS, FPS, address
 from benchmarks.video_judge import QUALITY, SIZE
-from skyloop.bench.contract import Arrivals
-from skyloop.bench.machine import Machine
-from skyloop.bench.pair import Pair
-from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO, Turn, sleep_until
-from skyloop.bench.tables import UNKNOWN, Table
-from skyloop.bench.workers import Workers
+from skyloop.bench import Machine
 from skyloop.files import MAX_RESULTS, read_json
 
 WEBRTC: Final = "WebRTC (aiortc)"

@@ -1,6 +1,7 @@
 """``python -m benchmarks.warmth``: what keeping code warm saves and costs, by how often it is run.
 
-It is itself a contender of :mod:`skyloop.bench.contract`: Skyloop's own ends, whose address ends with the interval.
+It is itself a contender of :mod:`benchmarks.measuring.contract`: Skyloop's own ends, whose address ends with the
+interval.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ from typing import Final
 
 import msgspec
 
-from skyloop.bench import ours
-from skyloop.bench.contract import Received
-from skyloop.bench.machine import Machine, cpu_time_s
-from skyloop.bench.pair import Pair
-from skyloop.bench.schedule import CHANNELS, Turn
-from skyloop.bench.statistics import Summary, summarize
-from skyloop.bench.tables import Table, median_and_p99
-from skyloop.bench.workers import Workers
+from benchmarks.measuring import ours
+from benchmarks.measuring.contract import Received
+from benchmarks.measuring.machine import cpu_time_s
+from benchmarks.measuring.pair import Pair
+from benchmarks.measuring.schedule import CHANNELS, Turn
+from benchmarks.measuring.statistics import Summary, summarize
+from benchmarks.measuring.tables import Table, median_and_p99
+from benchmarks.measuring.workers import Workers
+from skyloop.bench import Machine
 from skyloop.client import Drone, connect
 from skyloop.proxy.warm_up import WARMER
 

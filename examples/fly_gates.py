@@ -1,6 +1,6 @@
 """Fly a course of five gates, each found by its colour.
 
-python examples/fly_gates.py             # in a simulated hall of its own
+python examples/fly_gates.py             # in a simulated hall
 python examples/fly_gates.py alpha 120   # a running proxy, for two minutes at most
 """
 

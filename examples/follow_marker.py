@@ -1,6 +1,6 @@
-"""Find a marker that is carried about, follow it 1.5 m before its face, and tell how well that went.
+"""Find a marker that is carried about, follow it 1.5 m in front of its face, and print how well that went.
 
-python examples/follow_marker.py             # a simulated drone of its own
+python examples/follow_marker.py             # starts a simulated drone
 python examples/follow_marker.py alpha 60    # a running proxy, for a minute
 """
 

@@ -13,7 +13,7 @@ DRONES, ELITE = 64, 12  # policies tried in each round, and the best of them tha
 
 
 def returns_of(policies: np.ndarray, seconds: float, seed: int) -> np.ndarray:
-    """The sum of rewards of each policy, each on a drone of its own; shape (n,)."""
+    """The sum of rewards of each policy, one drone for each; shape (n,)."""
     envs = ReachVectorEnv(len(policies), seconds=seconds)
     seen, _ = envs.reset(seed=seed)
     total, alive = np.zeros(len(policies)), np.ones(len(policies), dtype=bool)

@@ -2,7 +2,7 @@
 
 skyloop sim --name alpha
 python examples/shared_drone.py alpha pilot      # in one terminal: flies, and hands over when asked
-python examples/shared_drone.py alpha look       # in others: who flies, and how it is
+python examples/shared_drone.py alpha look       # in others: prints the pilot and the drone's state
 python examples/shared_drone.py alpha turn       # in another: asks, flies for a while, gives it back
 """
 
@@ -13,7 +13,7 @@ import skyloop
 
 
 def pilot(name: str, seconds: float = 60.0) -> None:
-    """Turns on the spot, and hands over to whoever asks unless the battery is nearly empty."""
+    """Turns on the spot, and hands over when asked unless the battery is nearly empty."""
     with skyloop.connect(name, name="pilot", on_exit="land") as drone:
 
         def may_have_it(_: object) -> bool | str:
@@ -33,7 +33,7 @@ def pilot(name: str, seconds: float = 60.0) -> None:
 
 
 def look(name: str, seconds: float = 60.0) -> None:
-    """Tells whenever somebody else flies."""
+    """Prints each change of pilot."""
     with skyloop.connect(name, access="observe") as drone:
         owner, end = "", time.monotonic() + seconds
         while time.monotonic() < end:

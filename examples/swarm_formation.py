@@ -13,7 +13,7 @@ from skyloop.control.formation_flight import Formation
 
 
 def main(*targets: str, seconds: float = 6.0) -> None:
-    # What fails at one drone is told at the end of the block; until then the others go on without it.
+    # A drone that fails is reported at the end of the block; until then the others continue without it.
     with skyloop.swarm(*targets, on_error="continue") as drones:
         drones.takeoff()
         drones.wait_all("hovering", timeout_s=15)

@@ -1,4 +1,4 @@
-"""Three drones, each along a route of its own: checked first, then flown at the same time, and landed.
+"""Three drones with a route each: checked first, then flown at the same time, and landed.
 
 skyloop sim --drones 3 --name drone --option cameras=none   # three drones in one world
 python examples/three_routes.py "drone*"
@@ -12,7 +12,7 @@ from skyloop.control import FlyRoute, Route, RouteWaypoint, Wait
 
 
 def tour(height: float, x: float, y: float) -> Route:
-    """A square of 0.8 m above one place, at a height of its own: so no two drones meet. World axes [m]."""
+    """A square of 0.8 m above one place, at the drone's own height, so that no two drones meet. World axes [m]."""
     corners = [(x, y), (x + 0.8, y), (x + 0.8, y + 0.8), (x, y + 0.8)]
     places = [RouteWaypoint(a, b, height, look_at=(x + 0.4, y + 0.4), actions=(Wait(0.3),)) for a, b in corners]
     return Route(waypoints=tuple(places), name=f"square at {height:g} m", speed=0.6, end="return")

@@ -3,7 +3,7 @@
 
 =======================================  ===========================================================================
 ``cockpit-one-dark.png``, ``…-light``    one simulated drone that follows a marker, with what its controller draws; once
-                                         with the map and the events, once with the 3-D view and the parameters
+                                         as the page opens it, once with the panels: the 3-D view and the parameters
 ``cockpit-fleet-dark.png``, ``…-phone``  all drones: six in one world, four of them on rounds
 ``cockpit-swarm-dark.png``, ``…-light``  three in one world, each on a round of waypoints that its controller logs
 ``cockpit-phone-dark.png``, ``…-light``  the first one again, on a telephone
@@ -35,12 +35,12 @@ from pathlib import Path
 from typing import Literal
 
 import browser
+from follow_truth import FrameTruth, TargetTruth
 from page_film import PageFilm, Shown
 from PIL import Image
 from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
 import skyloop
-from skyloop.cli.follow_truth import FrameTruth, TargetTruth
 from skyloop.clock import nanoseconds
 from skyloop.cockpit.child import CockpitProcess
 from skyloop.control.follow import FollowMarker
@@ -101,6 +101,7 @@ def one() -> None:
         for scheme in SCHEMES:
             page = open_page(chromium, f"{address}#alpha", DESK, scheme)
             if scheme == "light":
+                page.get_by_role("button", name="Panels").click()
                 page.get_by_role("button", name="3-D").click()
                 page.get_by_role("button", name="Parameters").click()
             settle(page, ["alpha"], 16.0)
@@ -403,7 +404,6 @@ def open_page(chromium: Browser, address: str, size: ViewportSize, scheme: Schem
     context = chromium.new_context(
         viewport=size, color_scheme=scheme, has_touch=size in TOUCHED, is_mobile=size in TOUCHED
     )
-    context.add_init_script("localStorage.setItem('skyloop-panels', 'true')")
     page = context.new_page()
     page.goto(address)
     return page

@@ -167,7 +167,7 @@ def dots(canvas: Picture, places: dict[str, list[list[float]]]) -> None:
 
 def see_and_avoid(folder: Path) -> None:
     with flight(folder, "alpha", "--world", "pillars", *FRONT):
-        run("see_and_avoid", "alpha")
+        run("behaviours/see_and_avoid", "alpha")
     keep("see_and_avoid", film(folder / "flight.mcap", PILLARS, captions=True))
 
 

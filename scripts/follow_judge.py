@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from skyloop.cli.follow_truth import HIDDEN, FrameTruth, TargetTruth
+from follow_truth import HIDDEN, FrameTruth, TargetTruth
+
 from skyloop.messages import Feedback
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.labels import TargetBox

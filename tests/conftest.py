@@ -36,10 +36,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 # Folders whose processes mostly fly. Measuring their coverage would slow flights down and find what others have found.
-FLIGHTS = {"bench", "benchmarks", "docs", "examples", "processes", "test_demo.py", "third_party"}
+FLIGHTS = {"test_bench.py", "benchmarks", "docs", "examples", "processes", "test_demo.py", "third_party"}
 
 # Folders of which `make test` leaves everything out: promises kept for minutes, under faults, or between several hosts.
-SLOW = {"bench", "benchmarks", "faults", "fuzz", "hardware", "network", "security", "third_party"}
+SLOW = {"benchmarks", "faults", "fuzz", "hardware", "network", "security", "third_party"}
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

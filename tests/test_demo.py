@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Sequence
 from typing import Self
 
 import pytest
@@ -89,8 +90,8 @@ def test_true_range() -> None:
 class Running:
     """A demo as a child process, read as it prints."""
 
-    def __init__(self, *options: str) -> None:
-        self.process = subprocess.Popen([*DEMO, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    def __init__(self, *options: str, command: Sequence[str] = DEMO) -> None:
+        self.process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         self.text = ""
 
     def __enter__(self) -> Self:

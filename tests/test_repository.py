@@ -1,9 +1,12 @@
-"""What holds the repository together: the floors of coverage and the locked versions."""
+"""What holds the repository together: floors of coverage, budgets of rooms and paths, and the locked versions."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from types import ModuleType
@@ -16,15 +19,31 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 
 
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 @pytest.fixture(scope="module")
 def floor() -> ModuleType:
     """The script that holds coverage against its floors."""
-    spec = importlib.util.spec_from_file_location("coverage_floor", ROOT / "scripts" / "coverage_floor.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script("coverage_floor")
+
+
+@pytest.fixture(scope="module")
+def gauge() -> ModuleType:
+    """The script that measures rooms."""
+    return script("house")
+
+
+@pytest.fixture(scope="module")
+def tracer() -> ModuleType:
+    """The script that traces paths."""
+    return script("paths")
 
 
 def report(total: float, **modules: float) -> dict[str, Any]:
@@ -71,6 +90,109 @@ def test_an_exception_is_let_pass_until_it_is_none(floor: ModuleType) -> None:
 
 def test_exceptions_are_modules_that_exist(floor: ModuleType) -> None:
     assert [name for name in floor.EXCEPTIONS if not (ROOT / "src" / "skyloop" / name).is_file()] == []
+
+
+MODULE = '''"""Documented
+over two lines."""
+
+from typing import TYPE_CHECKING
+
+import p.a
+from p import b, name  # of p/__init__.py
+
+if TYPE_CHECKING:
+    from p.c import C
+
+
+@decorated
+class Small:
+    """One."""
+
+    def method(self) -> int:
+        from p.d import D
+
+        # a comment
+        return self._core + (
+            1
+        )
+'''
+
+
+def test_what_is_measured_of_a_module(gauge: ModuleType) -> None:
+    known = {"p", "p.a", "p.b", "p.c", "p.d", "p.e"}
+    found = gauge.measure_file("p.e", MODULE, "control", known)
+    assert (found.lines, found.code, found.import_lines, found.core_uses) == (23, 12, 5, 1)
+    assert (found.functions, found.classes) == ([7], [10])
+    assert found.imports == {"p", "p.a", "p.b", "p.c", "p.d"}
+    assert found.chained == {"p", "p.a", "p.b"}
+    assert gauge.measure_file("p.e", MODULE, "client", known).core_uses == 0
+
+
+@pytest.mark.parametrize(
+    ("path", "room"),
+    [
+        ("errors.py", "(top)"),
+        ("proxy/core/flight.py", "proxy"),
+        ("drivers/base.py", "drivers"),
+        ("drivers/msp/link.py", "drivers/msp"),
+        ("transport/local/client.py", "transport"),
+        ("transport/fabric/client.py", "transport/fabric"),
+    ],
+)
+def test_rooms(gauge: ModuleType, path: str, room: str) -> None:
+    assert gauge.room_of(Path(path)) == room
+
+
+def test_the_figures_of_rooms(gauge: ModuleType) -> None:
+    names = {"p", "p.x", "p.y"}
+    texts = {"p": ("(top)", ""), "p.x": ("client", "import p.y\n"), "p.y": ("sim", "import p\n\n\n")}
+    rows = gauge.house({name: gauge.measure_file(name, text, room, names) for name, (room, text) in texts.items()})
+    assert list(rows) == ["(top)", "client", "sim", "core", "house"]
+    assert [rows[room]["chain"] for room in rows] == [1, 3, 2, 3, 3]
+    assert [rows["house"][key] for key in ("files", "lines", "imports", "share", "one importer")] == [3, 4, 2, 0.5, 2]
+    assert rows["core"]["files"] == 1
+
+
+def test_a_room_over_its_budget(gauge: ModuleType) -> None:
+    rows = {"sim": {"files": 3, "lines": 10}, "new": {"files": 1}}
+    budgets = {"sim": {"files": 3, "lines": 9}, "gone": {"files": 1}}
+    assert gauge.over(rows, budgets) == [
+        "new has no budget",
+        "gone is gone: remove its budget",
+        "sim: lines is 10, and the budget is 9",
+    ]
+
+
+def test_the_figures_of_a_path(tracer: ModuleType) -> None:
+    path = [tracer.Call("", file, "f") for file in ("a", "a", "b", "a", "c", "b", "b")]
+    assert tracer.figures(path) == {"files": 3, "calls": 7, "returns": 2}
+    measured = {name: tracer.figures(path) for name in tracer.THREADS if name != "frame"}
+    assert tracer.over(measured, {"death": {"files": 3, "returns": 1}}) == [
+        "frame was not seen to its end in any run",
+        "death: returns are 2, and the budget is 1",
+    ]
+
+
+@pytest.mark.process
+def test_each_path_is_seen_to_its_end() -> None:
+    command = [sys.executable, str(ROOT / "scripts" / "paths.py"), "--json"]
+    paths = json.loads(subprocess.run(command, check=True, capture_output=True, text=True, timeout=100).stdout)
+    assert {name: {file.split("/")[0] for _, file, _ in each["path"]} for name, each in paths.items()} == {
+        "velocity": {"client", "clock.py", "drivers", "messages", "proxy", "sim", "transport", "zones.py"},
+        "frame": {"client", "drivers", "messages", "proxy", "sim", "transport"},
+        "parameter": {
+            "client",
+            "clock.py",
+            "drivers",
+            "errors.py",
+            "messages",
+            "proxy",
+            "sim",
+            "transport",
+            "zones.py",
+        },
+        "death": {"clock.py", "drivers", "errors.py", "messages", "proxy", "sim", "transport"},
+    }
 
 
 def locked() -> dict[str, set[str]]:

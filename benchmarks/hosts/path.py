@@ -9,7 +9,7 @@ from typing import Final
 from benchmarks.hosts.impairments import Impairments
 from benchmarks.hosts.namespaces import Host, Lab
 from benchmarks.hosts.relay import Direction, relay
-from skyloop.bench.workers import STARTS_WITHIN_S, Workers
+from benchmarks.measuring.workers import STARTS_WITHIN_S, Workers
 
 _ANSWERS_WITHIN_S: Final = 10.0
 _QUEUE: Final = 1000  #: packets that may wait for the relay, as on an ordinary interface

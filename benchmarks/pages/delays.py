@@ -13,11 +13,11 @@ from pathlib import Path
 
 from benchmarks import load
 from benchmarks import tables as load_tables
+from benchmarks.measuring import delays, loop, tables
+from benchmarks.measuring.figures import draw
+from benchmarks.measuring.targets import judge_delays
 from benchmarks.pages.fill import fill
 from benchmarks.targets import judge_load
-from skyloop.bench import delays, loop, tables
-from skyloop.bench.figures import draw
-from skyloop.bench.targets import judge_delays
 
 DOCS = Path(__file__).parents[2] / "docs"
 MEASURED = DOCS / "measured"

@@ -15,7 +15,7 @@ from benchmarks import network, scale, swarm, tables, units
 from benchmarks.pages.fill import fill
 from benchmarks.scale_figure import SERIES, draw
 from benchmarks.units import Fleet
-from skyloop.bench.machine import Machine
+from skyloop.bench import Machine
 
 DOCS = Path(__file__).parents[2] / "docs"
 MEASURED = DOCS / "measured"

@@ -1,4 +1,4 @@
-"""Puts a flight of ``skyloop demo paper`` into ``docs/paper.md``: ``python -m benchmarks.pages.paper FOLDER``.
+"""Puts a flight of ``python -m benchmarks.paper`` into ``docs/paper.md``: ``python -m benchmarks.pages.paper FOLDER``.
 
 The page's tables are made from ``docs/measured/paper.json``: the flight's ``results.json`` without its single samples.
 Its pictures are those of the flight. Without a folder the tables are made anew.
@@ -13,8 +13,8 @@ from pathlib import Path
 import msgspec
 
 from benchmarks.pages.fill import fill
-from skyloop.bench.paper import report
-from skyloop.bench.paper.evaluation import Experiment, Way, load
+from benchmarks.paper import report
+from benchmarks.paper.evaluation import Experiment, Way, load
 
 DOCS = Path(__file__).parents[2] / "docs"
 MEASURED = DOCS / "measured" / "paper.json"

@@ -1,6 +1,7 @@
 """What a user could take instead of Skyloop, where it is installed: one file each, measured by the same contract.
 
-``python -m benchmarks.peers`` measures them beside Skyloop and the bare hand-over, as ``skyloop bench delays`` does.
+``python -m benchmarks.peers`` measures them beside Skyloop and the bare hand-over, in turns; ``--peers none``: those
+two alone.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.bench.contenders import NETWORK, Contender
+from benchmarks.measuring.contenders import NETWORK, Contender
 from skyloop.errors import UnknownNameError
 
 ROS_PYTHON_VARIABLE: Final = "SKYLOOP_ROS_PYTHON"

@@ -20,9 +20,9 @@ from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import Image as ImageMessage
 from sensor_msgs.msg import Imu
 
-from skyloop.bench.contract import Image, Received
-from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO
-from skyloop.bench.waypoints import Setpoint
+from benchmarks.measuring.contract import Image, Received
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, VIDEO
+from benchmarks.measuring.waypoints import Setpoint
 
 _FOUND_WITHIN_S = 10.0
 _QUALITY = QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)

@@ -25,11 +25,11 @@ from aiortc import (
 from aiortc.mediastreams import MediaStreamError
 from av import VideoFrame
 
+from benchmarks.measuring.contract import Image, Received
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, MIDDLE, VIDEO
+from benchmarks.measuring.waypoints import Setpoint
 from benchmarks.moving_scene import MovingScene, stamp_in
 from benchmarks.video_judge import Judge
-from skyloop.bench.contract import Image, Received
-from skyloop.bench.schedule import COMMAND, FEEDBACK, MIDDLE, VIDEO
-from skyloop.bench.waypoints import Setpoint
 
 _CONNECTED_WITHIN_S = 15.0
 _STAMP = struct.Struct("<q")

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from skyloop.bench.contract import Image, Received
-from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO
-from skyloop.bench.waypoints import Setpoint
+from benchmarks.measuring.contract import Image, Received
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, VIDEO
+from benchmarks.measuring.waypoints import Setpoint
 
 _PACKET = struct.Struct("<q11d")  # stamp and as many numbers as feedback or a command has
 _FRAME = struct.Struct("<qqq")  # stamp, columns, rows

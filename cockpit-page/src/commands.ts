@@ -120,7 +120,12 @@ export class CommandSender {
 
   /** Sticks: what does not go now is forgotten. */
   steer<Message extends { do: string }>(command: Message): boolean {
-    const stamp = this.isLive ? this.clock.at(this.now_ms()) : null;
+    return this.isLive && this.attempt(command);
+  }
+
+  /** Sent even if nothing is known to arrive: for what only ends a flight, and is of no use later. */
+  attempt<Message extends { do: string }>(command: Message): boolean {
+    const stamp = this.clock.at(this.now_ms());
     return stamp !== null && this.socket.send({ ...command, ...stamp });
   }
 

@@ -37,6 +37,7 @@ class Card {
     setAttribute(this.linked, "title", links);
     setHidden(this.recording, !row.recording);
     setText(this.alarms, alarm);
+    setAttribute(this.alarms, "title", alarm);
     setHidden(this.alarms, alarm === "");
     setText(this.linkText, links);
     setAttribute(this.element, "data-open", String(open));

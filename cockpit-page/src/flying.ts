@@ -1,7 +1,7 @@
 // Keys, gamepad and thumbs fly the selected drone; nothing else of the page does.
 
 import { chosen, GamepadReader, plugged } from "./gamepad.js";
-import { type Deed, Keys, stopKeys } from "./keys.js";
+import { type Deed, isEnter, Keys, stopKeys } from "./keys.js";
 import { isModalOpen } from "./modal.js";
 import type { Sticks } from "./model.js";
 import { padMaps } from "./paddialog.js";
@@ -97,6 +97,13 @@ export class Flying {
       if (!event.repeat) this.stop("keys", stops);
       return;
     }
+    if (event.repeat && isEnter(event.code) && document.activeElement?.matches("textarea") !== true) {
+      // A press chooses a place, or marks a target, and the focus moves on to what flies there: a key that is held does
+      // not go with it.
+      event.preventDefault();
+      event.stopImmediatePropagation();
+      return;
+    }
     if (isModalOpen()) return;
     const modified = event.ctrlKey || event.altKey || event.metaKey;
     const press = { code: event.code, repeat: event.repeat, modified, typing: event.isComposing || this.typing() || (ownKeys()?.has(event.code) ?? false) };
@@ -113,7 +120,7 @@ export class Flying {
 
   private up(event: KeyboardEvent): void {
     this.keys.up(event.code);
-    const lets = event.code === "Enter" || event.code === "NumpadEnter" || event.key === "Control" || event.key === "Shift";
+    const lets = isEnter(event.code) || event.key === "Control" || event.key === "Shift";
     if (lets && this.stopping === "keys") this.stop("keys", null);
   }
 

@@ -7,6 +7,35 @@ export interface Encoding {
   /** As the vehicle itself does it; once for all pages that ask for the same; for this page alone. */
   kind: "vehicle" | "shared" | "own";
   kbit_s: number | null;
+  /** For this page alone, as pictures come late to the cockpit itself. */
+  late?: boolean;
+}
+
+/** Why a page gets less than others: its connection, the computer that it runs on, or what lies before the cockpit. */
+export type Cause = "connection" | "computer" | "source";
+/** A page that stands still for longer, or needs longer for a picture, is on a busy computer [ms] … */
+export const BUSY_MS = 150;
+/** … and that was the cause of what happens within this time [ms]. */
+export const LATELY_MS = 3000;
+
+/** Why this page has a stream of its own. Pure. */
+export class Pace {
+  private busy_ms = Number.NEGATIVE_INFINITY;
+  private cause: Cause | null = null;
+
+  /** Something that takes a moment took so long here. */
+  took(ms: number, now_ms: number): void {
+    if (ms > BUSY_MS) this.busy_ms = now_ms;
+  }
+
+  /** Null while it gets what all get; the cause stays until then, as a smaller picture is what ends its signs. */
+  why(encoding: Encoding | null, now_ms: number): Cause | null {
+    if (encoding?.kind !== "own") this.cause = null;
+    else if (encoding.late) this.cause = "source";
+    else if (now_ms - this.busy_ms < LATELY_MS) this.cause = "computer";
+    else this.cause ??= "connection";
+    return this.cause;
+  }
 }
 
 export interface Unit {

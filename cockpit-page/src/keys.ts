@@ -60,10 +60,12 @@ export interface Press {
   typing: boolean;
 }
 
+export const isEnter = (code: string): boolean => code === "Enter" || code === "NumpadEnter";
+
 /** Ctrl and Enter, held: motors off, whatever has the focus. With Shift those of all drones; null: something else. */
 export function stopKeys(event: { code: string; ctrlKey: boolean; shiftKey: boolean; altKey: boolean; metaKey: boolean }): "one" | "all" | null {
   if (!event.ctrlKey || event.altKey || event.metaKey) return null;
-  if (event.code !== "Enter" && event.code !== "NumpadEnter") return null;
+  if (!isEnter(event.code)) return null;
   return event.shiftKey ? "all" : "one";
 }
 

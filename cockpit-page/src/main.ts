@@ -62,6 +62,8 @@ class Page {
   private lonely = 0;
   private readonly lostAge = h("span", { "aria-hidden": "true" });
   private readonly lost = h("div", { class: "banner lost", role: "alert", "data-tone": "bad", hidden: true }, t.page.lost, this.lostAge);
+  /** What concerns all drones: in a line that is there anyhow, of what is shown. */
+  private readonly said = h("div", { class: "page-said" }, this.lost);
   private readonly countdown = new Countdown();
   private readonly safety: Safety | null;
   private readonly clock = new ServerClock();
@@ -93,7 +95,8 @@ class Page {
     const leave = who.login ? h("button", { type: "button", class: "small", onclick: () => void post("/api/logout").finally(() => location.reload()) }, t.page.logOut) : null;
     const brand = h("h1", { class: "brand" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "Skyloop");
     const usual = h("div", { class: "bar-usual" }, brand, this.all, h("span", { class: "spring" }), person, leave, this.sound.button, this.help.chip, settings.button);
-    this.bar = h("header", { class: "bar" }, usual, this.safety?.element ?? null, h("div", { class: "page-said" }, this.lost, this.safety?.message ?? null));
+    this.bar = h("header", { class: "bar" }, usual, this.safety?.element ?? null);
+    if (this.safety) this.said.append(this.safety.message);
     new ResizeObserver(() => this.measure()).observe(this.bar);
     window.addEventListener("resize", () => this.measure());
     const recordings = new RecordingList(() => this.recorded, (name) => this.enter(name), who.role === "pilot");
@@ -315,6 +318,8 @@ class Page {
 
   private select(name: string | null): void {
     this.chosen = name;
+    const place = this.inOverview ? this.overview.said : (this.selected ?? [...this.panes.values()][0])?.said;
+    if (place && this.said.parentElement !== place) place.prepend(this.said);
     for (const pane of this.panes.values()) pane.selected(pane.name === name);
     this.aim();
   }

@@ -30,6 +30,8 @@ export class OverviewView {
   readonly element: HTMLElement;
   /** The map, and what is beside the drones. */
   readonly side: HTMLElement;
+  /** The place of what is said of all drones: it is always there, so that nothing moves when something is. */
+  readonly said: HTMLElement;
   private readonly video = new SmallVideo();
   private readonly tiles = new Map<string, Tile>();
   private readonly list = h("ul", { class: "tiles" });
@@ -58,7 +60,8 @@ export class OverviewView {
     const choice = (kind: Kind, title: string): HTMLButtonElement => h("button", { type: "button", class: "tab", onclick: () => this.choose(kind) }, title);
     this.kinds = { tiles: choice("tiles", t.overview.tiles), table: choice("table", t.overview.table) };
     const kinds = h("span", { class: "tabs", role: "group", "aria-label": t.overview.shownAs }, ...Object.values(this.kinds));
-    this.element = h("main", { class: "overview", id: "overview", tabindex: -1, "aria-label": t.overview.all }, h("header", { class: "overview-head" }, h("h2", {}, t.overview.drones, this.counted), this.search, kinds), this.list, this.table.element, this.none, this.unfound);
+    this.said = h("div", { class: "overview-said" }, h("h2", {}, t.overview.drones, this.counted));
+    this.element = h("main", { class: "overview", id: "overview", tabindex: -1, "aria-label": t.overview.all }, h("header", { class: "overview-head" }, this.said, this.search, kinds), this.list, this.table.element, this.none, this.unfound);
     this.side = h("section", { class: "overview-map", "aria-label": t.overview.map }, this.map.element);
     this.map.allow("");
     window.addEventListener("resize", () => this.visible && this.tiles.forEach((tile) => tile.look()));

@@ -65,6 +65,8 @@ const now_s = (): number => performance.now() / 1000;
 export class Pane {
   readonly element: HTMLElement;
   readonly pilot: Pilot | null;
+  /** Its line of alarms and messages, in which the page says what concerns all drones, too. */
+  readonly said = h("div", { class: "said" });
   private vehicle: Vehicle | null = null;
   private state: State | null = null;
   /** Where it was when it was first seen in the air, in this flight. */
@@ -270,9 +272,10 @@ export class Pane {
 
   private build(): HTMLElement {
     const close = h("button", { type: "button", class: "bare close", "aria-label": t.pane.close(this.name), onclick: () => this.host.close(this.name) }, "×");
-    const head = h("header", { class: "pane-head" }, this.title, this.hud.element, this.endReplay, this.alarms.chip, this.pill, this.battery.element, this.full, this.panels, this.fly, close);
+    const head = h("header", { class: "pane-head" }, this.title, this.hud.element, this.endReplay, this.pill, this.battery.element, this.full, this.panels, this.fly, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
-    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, h("div", { class: "said" }, this.kind, this.fresh.element, this.ended, this.alarms.element, this.notice), this.alarms.voice, body, this.thumbs.element, this.strip.element);
+    this.said.append(this.kind, this.fresh.element, this.ended, this.alarms.element, this.notice, this.alarms.chip);
+    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, this.said, this.alarms.voice, body, this.thumbs.element, this.strip.element);
     element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
     element.addEventListener("focusin", () => this.host.select(this.name));
     return element;

@@ -198,7 +198,8 @@ export class Pilot {
   rest(): void {
     const moving = this.steering || this.going || this.following;
     this.end();
-    if (moving && this.mine) this.commands.steer({ do: "hover", automatic: true } satisfies Command);
+    // Also where no answers come: what is sent may arrive all the same, long before the cockpit counts this page as gone.
+    if (moving && this.mine) this.commands.attempt({ do: "hover", automatic: true } satisfies Command);
   }
 
   close(): void {

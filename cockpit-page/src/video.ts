@@ -7,7 +7,7 @@ import { contain, draw } from "./drawing.js";
 import { type FollowMessage, REACH_NS, SOURCE } from "./follow.js";
 import { type FollowHost, FollowTool } from "./followtool.js";
 import { duration } from "./format.js";
-import { type Encoding, StreamDecoder, type WhyJpeg, whyJpeg } from "./h264.js";
+import { type Encoding, Pace, StreamDecoder, type WhyJpeg, whyJpeg } from "./h264.js";
 import { t } from "./language/index.js";
 import type { Camera, Drawing, FrameHead } from "./model.js";
 import { NewestFrame, type Received, unpack } from "./newest.js";
@@ -40,6 +40,8 @@ export class VideoView {
   private readonly age = h("span");
   private readonly ageChip = h("p", { class: "chip age", "data-tone": "quiet" }, h("i", { class: "dot" }), this.age);
   private readonly rate = h("p", { class: "chip rate" });
+  /** Why the picture is smaller, or coarser, than it could be. */
+  private readonly smaller = h("p", { class: "chip smaller", role: "status" });
   private readonly nothing = h("p", { class: "nothing" }, t.video.waiting);
   private readonly drawings = new Map<string, Drawing>();
   private socket: LastingSocket | null = null;
@@ -47,6 +49,8 @@ export class VideoView {
   private shown: Shown | null = null;
   private stream: StreamDecoder | null = null;
   private encoding: Encoding | null = null;
+  private readonly pace = new Pace();
+  private updated_ms: number | null = null;
   /** Why pictures are JPEGs; null while nobody asked the browser. */
   private why: WhyJpeg | "failed" | null = null;
   private asked_px: number | null = null;
@@ -62,7 +66,7 @@ export class VideoView {
     host: FollowHost | null,
   ) {
     this.canvas = h("canvas", { class: "video", role: "img", "aria-label": t.video.none(camera.name), width: camera.width, height: camera.height });
-    this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.nothing);
+    this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.smaller, this.nothing);
     this.follow = host && new FollowTool(this, host);
     this.tools = new VideoTools(this, this.follow?.button ?? null);
     // What nobody sees asks for no pictures: a hidden page, or a place that is scrolled away.
@@ -103,6 +107,8 @@ export class VideoView {
   /** Show age and rate. */
   update(now_ms: number): void {
     const age_s = this.age_s(now_ms);
+    if (this.updated_ms !== null) this.pace.took(now_ms - this.updated_ms - TELL_MS, now_ms);
+    this.updated_ms = now_ms;
     while (this.arrivals[0] !== undefined && this.arrivals[0].at_ms < now_ms - RATE_MS) this.arrivals.shift();
     if (this.asked_px !== null && Math.abs(this.width_px() - this.asked_px) > OTHER * this.asked_px) this.ask();
     if (age_s === null || this.shown === null) return;
@@ -121,6 +127,9 @@ export class VideoView {
     setText(this.rate, t.video.rate(this.camera.name, width, height, ((this.arrivals.length * 1000) / RATE_MS).toFixed(0), how, (bytes / RATE_MS).toFixed(0)));
     setAttribute(this.rate, "title", this.encoding ? t.video.encoded(this.encoding.kind, this.encoding.kbit_s) : this.why ? t.video.jpeg(this.why) : "");
     setAttribute(this.element, "data-form", this.encoding ? `h264 ${this.encoding.kind}` : "jpeg");
+    const cause = this.pace.why(this.encoding, now_ms);
+    const isSmaller = width < (1 - OTHER) * Math.min(this.camera.width, this.asked_px || this.camera.width);
+    setText(this.smaller, cause ? t.video.reduced(isSmaller ? t.video.smaller(width, height) : t.video.coarser, cause) : "");
     setAttribute(this.canvas, "aria-label", t.video.showing(this.camera.name, stale));
   }
 
@@ -160,7 +169,7 @@ export class VideoView {
     this.socket?.close();
     this.frames?.end();
     this.stream?.close();
-    this.socket = this.stream = this.asked_px = null;
+    this.socket = this.stream = this.asked_px = this.updated_ms = null;
     setAttribute(this.element, "data-asks", String(this.isSeen));
     if (!this.isSeen) return;
     const socket = new LastingSocket(`/ws/drones/${encodeURIComponent(this.drone)}/video/${encodeURIComponent(this.camera.name)}`, {
@@ -207,7 +216,9 @@ export class VideoView {
         this.ask();
       },
     );
+    const began_ms = performance.now();
     const picture = await this.stream.decode({ ...head, h264: encoding }, received.jpeg);
+    this.pace.took(performance.now() - began_ms, performance.now());
     if (socket !== this.socket) picture?.close();
     else {
       if (picture) {

@@ -52,10 +52,13 @@ function connect(to: string): Wire {
   const wire = new Socket(`${origin.replace("http", "ws")}${to}`, { headers: { Origin: origin } });
   const send = wire.send.bind(wire);
   wire.send = (text) => {
-    const flies = (JSON.parse(text) as { do: string }).do === "fly";
-    if (flies) note("call", number);
+    const command = JSON.parse(text) as { do: string; yaw_rate?: number };
+    const flies = command.do === "fly";
+    // As it travels: by now the gamepads may have been read once more.
+    const sent = Math.round((command.yaw_rate ?? 0) / NUMBER_RAD_S);
+    if (flies) note("call", sent);
     send(text);
-    if (flies) note("called", number);
+    if (flies) note("called", sent);
   };
   return wire;
 }

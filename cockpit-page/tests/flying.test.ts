@@ -61,3 +61,22 @@ test("a stick that is held while the motors are stopped flies nothing after the 
   push(-0.8);
   assert.equal(steered.at(-1), true);
 });
+
+test("an Enter that is held presses what it moved the focus to no more: a place was chosen, and nobody said to fly there", async (context) => {
+  context.mock.timers.enable({ apis: ["setInterval"] });
+  const { tell } = browser();
+  const { Flying } = await import("../src/flying.js");
+  new Flying({ flown: () => [], selected: () => null, act: () => undefined, hold: () => undefined, inputs: () => undefined });
+  const prevented = (event: object): boolean => {
+    let is = false;
+    const plain = { key: "", ctrlKey: false, shiftKey: false, altKey: false, metaKey: false, isComposing: false };
+    tell("keydown", { ...plain, ...event, preventDefault: () => (is = true), stopImmediatePropagation: () => undefined });
+    return is;
+  };
+  for (const code of ["Enter", "NumpadEnter"]) {
+    assert.equal(prevented({ code, repeat: false }), false);
+    assert.equal(prevented({ code, repeat: true }), true);
+  }
+  Object.assign(document, { activeElement: { matches: (what: string) => what.includes("textarea"), dataset: {} } });
+  assert.equal(prevented({ code: "Enter", repeat: true }), false, "a note has as many lines as are typed");
+});

@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { type Codecs, codecOf, type Decoder, MOST_FAILURES, StreamDecoder, type Unit } from "../src/h264.js";
+import { BUSY_MS, type Codecs, codecOf, type Decoder, LATELY_MS, MOST_FAILURES, Pace, StreamDecoder, type Unit } from "../src/h264.js";
 
 const SPS = [0, 0, 0, 1, 0x67, 0x4d, 0x40, 0x1e, 0xaa];
 const unit = (seq: number, key = false, width = 64): Unit => ({ seq, width, height: 48, h264: { key, kind: "shared", kbit_s: 150 } });
@@ -106,4 +106,21 @@ test("a decoder that fails is begun anew, and given up after some times", async 
   assert.equal(calls.at(-1), "failed");
   decoder.close();
   assert.equal(await decoder.decode(unit(9, true), new Uint8Array(SPS)), null);
+});
+
+test("a page of its own stream knows why, until it shares one again", () => {
+  const own = { key: false, kind: "own" as const, kbit_s: null };
+  const shared = { ...own, kind: "shared" as const };
+  const pace = new Pace();
+  assert.equal(pace.why(null, 0), null);
+  assert.equal(pace.why(shared, 0), null);
+  assert.equal(pace.why(own, 0), "connection");
+  pace.took(BUSY_MS, 10);
+  assert.equal(pace.why(own, 10), "connection", "that is not long");
+  pace.took(BUSY_MS + 1, 20);
+  assert.equal(pace.why(own, 20), "computer");
+  assert.equal(pace.why(own, 20 + 2 * LATELY_MS), "computer", "a smaller picture is what it is busy with no more");
+  assert.equal(pace.why({ ...own, late: true }, 9000), "source");
+  assert.equal(pace.why(shared, 9000), null, "gone when it recovers");
+  assert.equal(pace.why(own, 9000), "connection");
 });

@@ -238,6 +238,18 @@ test("a page that loses the focus hovers what it has under way, and nothing else
   assert.deepEqual(doings(sent).slice(4), ["goto"], "there already");
 });
 
+test("sticks that are let go, or count no more, as no answers come, hover all the same", () => {
+  const { pilot, sent, receive, live, at } = flown();
+  live();
+  receive(held(true));
+  pilot.steer(FORWARD);
+  at(1200);
+  assert.ok(!pilot.isFlyable);
+  pilot.steer(CENTRED);
+  assert.deepEqual(doings(sent), ["fly", "hover"]);
+  assert.ok(Math.abs((sent.findLast((message) => message["do"] === "hover")?.["at_s"] as number) - 1001.2) < 0.1);
+});
+
 test("a hover that nobody pressed says so, and sticks say how often hands were seen", () => {
   const { pilot, sent, receive, live } = flown();
   live();

@@ -18,23 +18,27 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_.-]*\Z")
 #: In a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``: where it ends is not known.
 _IN_PATH: Final = re.compile(rf"(?i)(?<![a-z])((?:{_SECRET})=)[^/?#]*")
 _HOST: Final = re.compile(r"(?:\[[^\]]*\]|[^:\[\]]*)(?::\d*)?\Z")
+#: How places begin that are devices, which have no user, whatever stands before an ``@`` in their path.
+_DEVICES: Final = {"mavlink": ("serial:/", "serial:~")}
 _KEEP: Final = "/:@*,;=()[]~!$'+"  # as people write them in an address
 
 
-def without_secrets(text: str, option: str = "", *, broken: bool = False) -> str:
+def without_secrets(text: str, option: str = "", *, broken: bool = False, place_of: str = "") -> str:
     """Return a part of an address as it may be shown, without what may be a secret: user, password, query and keys.
 
     Args:
         text: The address of a stream, or another place or value of an option, percent-decoded.
         option: The option whose value it is.
         broken: Whether a password in it may have been cut where the address was split.
+        place_of: Scheme of the vehicle's address whose place it is; empty for anything else.
     """
     if _SECRET_NAME.match(option):
         return HIDDEN
     scheme, separator, rest = text.partition("://")
     if not separator:
+        is_path = text.startswith(("/", "~", *_DEVICES.get(place_of, ())))
         user, at, host = text.rpartition("@")
-        return _hide(host if at and ":" in user and not text.startswith(("/", "~")) else text)
+        return _hide(host if at and ":" in user and not is_path else text)
     place = re.split(r"[?#]", rest.rpartition("@")[2], maxsplit=1)[0]
     if broken or not _HOST.match(place.partition("/")[0]):
         place = HIDDEN
@@ -75,6 +79,6 @@ def shown_address(text: str) -> str:
         kept = name if shown_name(decoded) == decoded else HIDDEN
         options.append(f"{kept}{equals}{value if shown == given else quote(shown, safe=_KEEP)}")
     decoded = unquote(place)
-    shown = without_secrets(decoded, broken=broken)
+    shown = without_secrets(decoded, broken=broken, place_of=scheme)
     kept = place if shown == decoded else quote(shown, safe=f"{_KEEP}&")
     return f"{scheme}://{kept}{mark}{'&'.join(options)}"

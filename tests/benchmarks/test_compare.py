@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks import compare
+from benchmarks.measuring import delays
 from benchmarks.pages.delays import MEASURED
-from skyloop.bench import delays
 from skyloop.errors import FileFormatError, UsageError
 
 

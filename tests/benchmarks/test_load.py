@@ -12,11 +12,11 @@ import pytest
 from benchmarks import load
 from benchmarks.disk import DISK_MB, small_disk
 from benchmarks.load import FULL, KILLED, RECORDED, Case, cases_of, pages_name
+from benchmarks.measuring.schedule import CHANNELS, MIDDLE, Turn
 from benchmarks.onlookers import cockpit_problem, recorder_problem, view_problem
 from benchmarks.slow import SLOW_VIDEO
-from skyloop.bench.schedule import CHANNELS, MIDDLE, Turn
 from skyloop.errors import UsageError
-from tests.bench.test_measuring import plausible
+from tests.benchmarks.test_measuring import plausible
 
 SHORT_S = 0.5
 pytestmark = pytest.mark.process

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.measuring.pair import Pair
+from benchmarks.measuring.schedule import CHANNELS, Turn
+from benchmarks.measuring.workers import Workers
 from benchmarks.peers import PEERS, chosen, find
-from skyloop.bench.pair import Pair
-from skyloop.bench.schedule import CHANNELS, Turn
-from skyloop.bench.workers import Workers
 from skyloop.errors import UnknownNameError
 
 SHORT_S = 0.5

@@ -19,14 +19,14 @@ from benchmarks.load import (
     observers_name,
     pages_name,
 )
+from benchmarks.measuring import delays, loop, tables
+from benchmarks.measuring.delays import Delays
+from benchmarks.measuring.schedule import LARGE, MIDDLE, SMALL
+from benchmarks.measuring.targets import judge_delays
 from benchmarks.pages.fill import fill
 from benchmarks.targets import judge_load
-from skyloop.bench import delays, loop, tables
-from skyloop.bench.delays import Delays
-from skyloop.bench.schedule import LARGE, MIDDLE, SMALL
-from skyloop.bench.targets import judge_delays
 from skyloop.errors import UsageError
-from tests.bench.conftest import summary_of
+from tests.benchmarks.conftest import summary_of
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.ros import _judged, measure, table
-from skyloop.bench.machine import Machine
+from skyloop.bench import Machine
 from skyloop.errors import UnsupportedError
 from skyloop.messages import Applied, Velocity
 

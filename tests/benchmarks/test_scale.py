@@ -16,10 +16,10 @@ from benchmarks.command import build
 from benchmarks.network import Network, Wire
 from benchmarks.scale import OBSERVED, UNIT_CASES, Case, CaseResult, Scale, bends, cases_of
 from benchmarks.units import Fleet, Units, derive, needs
-from skyloop.bench.machine import Machine
+from skyloop.bench import Machine
 from skyloop.errors import UsageError
-from tests.bench import working
-from tests.bench.conftest import summary_of
+from tests.benchmarks import working
+from tests.benchmarks.conftest import summary_of
 
 MACHINE = Machine("A processor", 2, "An OS", "Linux 6.1", "3.11.7", {}, 0.1)
 #: Cores in use that make the costs of one come out as round numbers.

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from benchmarks import warmth
-from skyloop.bench.schedule import CHANNELS
+from benchmarks.measuring.schedule import CHANNELS
 
 pytestmark = [
     pytest.mark.process,

@@ -74,6 +74,12 @@ def test_a_part_that_is_not_installed_is_no_fault_and_is_told_with_what_installs
     assert "– page in the browser [cockpit]: uvicorn not installed\n  → skyloop install cockpit" in ended.out
 
 
+def test_several_missing_modules_are_listed_as_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "EXTRAS", (("record", "recordings", ("none1", "none2", "none3")),))
+    (finding,) = doctor._extras()
+    assert finding.detail == "none1, none2 and none3 not installed"
+
+
 def test_a_check_that_needs_a_part_that_is_not_installed_is_no_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def cameras() -> Iterator[Finding]:
         raise MissingExtraError("video://", "video", cause="No module named 'av'")

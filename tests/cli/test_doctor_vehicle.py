@@ -6,9 +6,11 @@ import pytest
 
 from skyloop.cli import checkup
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.emulators.msp import BetaflightFirmware
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from tests.cli.conftest import Run
+from tests.drivers.msp.rig import world
 
 
 @pytest.mark.parametrize(
@@ -23,6 +25,14 @@ def test_safety_nets_that_are_off_are_reported(run: Run, kind: Kind, name: str, 
     assert f"✓ autopilot: {name}, system 1" in ended.out
     assert "– loss of this computer:" in ended.out
     assert f"→ skyloop param NAME mavlink.{advice}" in ended.out
+
+
+def test_a_fault_that_ends_when_sticks_arrive_is_not_reported(run: Run) -> None:
+    with BetaflightFirmware(world(), port=0) as firmware:
+        ended = run("doctor", firmware.address)
+    assert ended.code == 0, ended.out
+    assert "✓ arming: it reports nothing that keeps it from being armed" in ended.out
+    assert "RXLOSS" not in ended.out
 
 
 def test_a_vehicle_that_is_not_there(run: Run) -> None:

@@ -21,7 +21,7 @@ from skyloop.messages import (
     SetParameter,
     Value,
 )
-from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
+from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
 
 
 @pytest.fixture
@@ -106,6 +106,38 @@ def writes(proxy: ScriptedProxy) -> list[SetParameter]:
 def held_again(drone: Drone, lease: int) -> None:
     drone.wait(lambda _: drone.authority.state == "held" and drone.authority.lease != lease, WAIT_S)
     _ = drone.config["limits.tilt"]  # what is written at the grant was sent before this
+
+
+@pytest.mark.parametrize("momentary", [True, False])
+def test_what_happens_once_is_not_asked_for_again_after_a_broken_link(
+    proxy: ScriptedProxy, drone: Drone, momentary: bool
+) -> None:
+    """The proxy may have done it before the link broke: two flips for one."""
+    proxy.momentary = {"limits.tilt"} if momentary else set()
+    proxy.answers[SetParameter] = None
+    ended: list[Exception | None] = []
+
+    def write() -> None:
+        try:
+            drone.config["limits.tilt"] = 0.2
+        except LinkError as error:
+            ended.append(error)
+        else:
+            ended.append(None)
+
+    writing = background(write)
+    proxy.until(lambda: any(isinstance(request, SetParameter) for request in proxy.requests))
+    proxy.stop()
+    proxy.requests.clear()
+    del proxy.answers[SetParameter]
+    proxy.start()
+    writing.join(WAIT_S)
+    again = [request for request in proxy.requests if isinstance(request, SetParameter)]
+    if momentary:
+        assert "may have been carried out" in str(ended[0])
+        assert not again
+    else:
+        assert again
 
 
 def test_a_lost_link_alone_writes_nothing_again(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -76,9 +76,9 @@ class Deck:
         page.locator(f'.pane[data-drone="{names[-1]}"][data-lost="false"]').wait_for(timeout=PATIENCE_S * 1000)
         return shown
 
-    def overview(self, **options: Any) -> DronePage:
+    def overview(self, prepare: str = "", **options: Any) -> DronePage:
         """The page with all drones; one that is opened has the panels beside its picture."""
-        page = self._new_page(PANELS, options)
+        page = self._new_page(prepare + PANELS, options)
         shown = DronePage(page, "")
         page.goto(f"{self.address}#/")
         return shown

@@ -130,6 +130,7 @@ def test_a_page_that_takes_nothing_is_behind_and_so_is_one_that_is_far_from_the_
     for at_s in (0.0, 0.2, 0.3, 1.0, 1.2, 1.4):
         behind = silent.update(round(at_s * 1e9)), far.update(round(at_s * 1e9), 2 * LATE_S)
     assert behind == (True, True)
+    assert (silent.late_here, far.late_here) == (False, True), "who is to blame"
 
 
 def test_only_so_much_is_under_way() -> None:

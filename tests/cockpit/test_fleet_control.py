@@ -9,7 +9,10 @@ from contextlib import contextmanager
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
-from skyloop.cockpit.fleet import Fleet
+from skyloop.client import Drone
+from skyloop.cockpit.discovery import Found
+from skyloop.cockpit.fleet import Fleet, observe
+from skyloop.errors import LinkError
 from skyloop.messages import EmergencyStop, FlightState, Land, Role
 from tests.cockpit.fake import Node, Nodes, cockpit, open_socket, this_user, until
 from tests.cockpit.test_control import Page, count, page
@@ -42,6 +45,24 @@ def test_stop_all_cuts_the_motors_of_drones_that_no_page_shows(nodes: tuple[Node
         told = {pilot.wait("each", do="stop_all", state="sent")["drone"] for _ in nodes}
         assert told == {"alpha", "beta"}
         until(lambda: all(node.flyer.state is FlightState.EMERGENCY for node in nodes))
+
+
+@pytest.mark.parametrize("do", ["stop_all", "land_all"])
+def test_a_drone_to_which_there_is_no_connection_is_told_not_to_be_stopped(nodes: tuple[Node, Node], do: str) -> None:
+    """It was left out, and all seemed to be stopped."""
+
+    def connect(found: Found) -> Drone:
+        if found.name == "beta":
+            raise LinkError("beta does not answer")
+        return observe(found)
+
+    fleet = Fleet(Nodes(*nodes), connect, look_s=0.05)
+    with cockpit(fleet) as client, everybody(client) as pilot:
+        until(lambda: fleet.problems)
+        pilot.say(do)
+        assert pilot.wait("sent", do=do)["drones"] == ["alpha", "beta"]
+        assert pilot.wait("each", drone="beta", state="refused")["why"]
+        pilot.wait("each", drone="alpha", state="done")
 
 
 def test_land_all_lands_what_others_fly_and_gives_control_back(nodes: tuple[Node, Node]) -> None:

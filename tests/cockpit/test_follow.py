@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import itertools
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -27,6 +29,26 @@ from tests.cockpit.testclient import TestClient
 
 BOX = [4.0, 4.0, 10.0, 12.0]
 FORWARD = Velocity(forward=0.25)
+
+#: All that a cockpit has imported, then the real follower with detections; it prints what that imports besides.
+FIRST_TARGET = """
+import sys
+import skyloop.cockpit.app
+import skyloop.cockpit.target_tracker as tracker
+from skyloop.clock import nanoseconds
+from skyloop.vision import Detection
+from tests.control.target_world import PERIOD_S
+from tests.control.test_follow_target import flown, follower_of, the_box
+assert "scipy" not in sys.modules, "the test would show nothing"
+tracker.warm_up()
+known = set(sys.modules)
+follower = follower_of(class_name="person")
+flown(follower, 0.3)
+follower.detected([Detection(the_box(), 0.9, 0, "person")], nanoseconds(1.0 + 3 * PERIOD_S))
+flown(follower, 0.3, start=1.4)
+assert follower.sighting.box is not None
+print(sorted(set(sys.modules) - known))
+"""
 
 
 @pytest.fixture
@@ -229,6 +251,33 @@ def following(client: TestClient, node: Node) -> Iterator[Marker]:
             yield pilot
 
 
+def test_a_hand_over_that_both_want_ends_in_no_refusal(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+    """Who gave it while it flew after a target was told that it had lost control, and of refusals of idle by lease."""
+    with following(client, node) as giver, page(client) as asker:
+        with giver.staying():
+            giver.select()  # the next target is being drawn
+        asker.say("take", priority=8, ask=True)
+        [asked] = giver.wait("asked")["questions"]
+        giver.say("answer", id=asked["id"], grant=True)
+        told = giver.wait("authority", mine=False)
+        assert told["given"]
+        assert told["why"] == f"{asked['by']} has control now"
+        giver.say("ping", n=6)
+        giver.wait("pong", n=6)
+        assert [one["problem"] for one in giver.told if one.get("state") == "ended"] == [NO_CONTROL]
+        assert asker.wait("authority", mine=True)["holder"] == asked["by"]
+        until(lambda: node.flyer.state is FlightState.HOVERING, "it hovers before it changes hands")
+        with asker.staying():
+            asker.say("fly", up=0.1)
+            until(lambda: count(node, Velocity(up=0.1)))
+            giver.say("ping", n=7)
+            giver.wait("pong", n=7)
+            asker.say("hover")
+            asker.wait("done", do="hover")
+        for pilot in (giver, asker):
+            assert [one for one in pilot.told if one["type"] == "refused"] == []
+
+
 @pytest.mark.parametrize(
     ("do", "values", "then"),
     [
@@ -333,6 +382,15 @@ def test_detections_of_processors_are_used(client: TestClient, node: Node, stand
         (found, captured_ns) = stand_ins.last.detections[0]
         assert [(one.class_name, one.box) for one in found] == [("person", (1.0, 2.0, 8.0, 9.0))]
         assert captured_ns > pilot.since_ns
+
+
+@pytest.mark.process
+def test_nothing_is_imported_when_a_first_target_is_marked() -> None:
+    """SciPy was, with 400 modules: for a second or more the cockpit answered nobody's sticks."""
+    pytest.importorskip("scipy", reason="needs the extra detect: skyloop install detect")
+    command = [sys.executable, "-c", FIRST_TARGET]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
 
 
 def test_a_command_that_the_proxy_refuses_ends_it(client: TestClient, node: Node, stand_ins: StandIns) -> None:

@@ -48,6 +48,15 @@ window.WebSocket = class extends WebSocket {
   }
 };
 """
+#: As over a slow line: half a second passes before the cockpit knows what was shown.
+SLOW: Final = """
+window.WebSocket = class extends WebSocket {
+  send(text) {
+    if (!text.includes('"ack"')) super.send(text);
+    else setTimeout(() => this.readyState === WebSocket.OPEN && super.send(text), 500);
+  }
+};
+"""
 #: Some of them: all would take long to get here.
 PIXELS: Final = """canvas => [...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data]
   .filter((_, at) => at % 37 === 0)"""
@@ -120,6 +129,18 @@ def test_a_key_is_asked_for_after_a_gap(deck: Deck) -> None:
     page.wait_for_new_picture()
     assert form(page).startswith("h264")
     assert page.problems == []
+
+
+def test_a_page_that_falls_behind_is_told_why_its_picture_is_smaller(deck: Deck) -> None:
+    """It fell to 160 × 120, and nobody said why."""
+    page = deck.page("film", prepare=SLOW)
+    page.until(lambda: form(page) == "h264 own", "it has a stream of its own", MOST_S)
+    told = page.pane.locator(".chip.smaller")
+    page.until(lambda: told.is_visible(), "it says so")
+    said = told.text_content() or ""
+    assert said.startswith(("Smaller picture, ", "Coarser picture: "))
+    # On a computer that is busy with other tests as well that is the reason.
+    assert said.endswith(("this connection is slow", "this computer is busy", "late to the cockpit"))
 
 
 def test_tiles_show_h264_and_tell_what_it_takes(deck: Deck) -> None:

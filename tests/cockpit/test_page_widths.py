@@ -167,3 +167,78 @@ def test_an_alarm_covers_nothing(deck: Deck) -> None:
         page.wait_for_text(".alarms", "battery low")
         assert page.page.evaluate(COVERED) == []
         assert page.pane.locator(".stage").bounding_box() == before, "and moves nothing"
+
+
+#: Which controls, pictures and maps lie elsewhere while a banner is shown, and when it is not.
+MOVED = """(selectors) => selectors.flatMap((selector) => {
+  const boxes = () => [...document.querySelectorAll("button, input, select, a, .pill, .tile, .map, .video")]
+    .filter((one) => one.checkVisibility({visibilityProperty: true}) && !one.closest(".said, .page-said, .alarm-chip"))
+    .map((one) => {
+      const {left, top, width, height} = one.getBoundingClientRect();
+      return `${one.getAttribute("aria-label") ?? one.textContent}: ${[left, top, width, height].map(Math.round)}`;
+    });
+  const banner = document.querySelector(selector);
+  const [hidden, text] = [banner.hidden, banner.textContent];
+  banner.hidden = false;
+  if (!text) banner.textContent = "2 alarms";
+  const shown = boxes();
+  banner.hidden = true;
+  const without = boxes();
+  banner.hidden = hidden;
+  if (!text) banner.textContent = "";
+  return shown.filter((one) => !without.includes(one)).map((one) => `${selector}: ${one}`);
+})"""
+
+
+def moved(page: DronePage, *banners: str) -> str:
+    """What a banner moves, at each width, at the top of the page and farther down."""
+    found = []
+    for width in WIDTHS:
+        resize(page, width, 860)
+        for down in (0, 150):
+            page.page.evaluate(f"scrollTo(0, {down})")
+            page.page.evaluate(DRAWN)
+            found += [f"{width} {one}" for one in page.page.evaluate(MOVED, banners)]
+    return "\n".join(found)
+
+
+def landed(page: DronePage) -> None:
+    """All drones are told to land, as is said where it concerns all of them."""
+    button = page.page.locator(".safety .land-all")
+    page.until(lambda: not button.is_disabled(), "there is a drone")
+    button.hover()
+    page.page.mouse.down()
+    page.until(lambda: "Land all ·" in (page.page.locator(".safety-message").text_content() or ""), "the outcome")
+    page.page.mouse.up()
+
+
+#: Hears nothing of the list of drones while ``window.deaf`` is true.
+DEAF = """
+window.WebSocket = class extends WebSocket {
+  constructor(...given) {
+    super(...given);
+    this.addEventListener("message", (event) => window.deaf && event.stopImmediatePropagation());
+  }
+};
+"""
+
+
+def test_what_is_said_of_one_drone_or_all_moves_nothing(deck: Deck) -> None:
+    for name in ("told", "beside"):
+        deck.proxy(name)
+    page = deck.page("told", panels=False)
+    landed(page)
+    assert page.page.locator(".said .safety-message").is_visible()
+    page.page.locator(".card").nth(1).wait_for()
+    assert moved(page, ".safety-message", ".alarms", ".alarm-chip", ".notice", ".card-alarm") == ""
+
+
+def test_what_is_said_above_all_drones_moves_nothing(deck: Deck) -> None:
+    deck.proxy("listed")
+    page = deck.overview(DEAF)
+    landed(page)
+    assert page.page.locator(".overview-head .safety-message").is_visible()
+    assert moved(page, ".safety-message") == ""
+    page.page.evaluate("window.deaf = true")
+    page.page.locator(".lost").wait_for()
+    assert moved(page, ".lost") == ""

@@ -27,7 +27,7 @@ from websockets.sync.client import connect as open_socket
 from websockets.typing import Origin
 
 from skyloop.client import connect
-from skyloop.cockpit import Access, serve_cockpit, with_certificate
+from skyloop.cockpit import Access, serve_cockpit, target_tracker, with_certificate
 from skyloop.cockpit.__main__ import main
 from skyloop.cockpit.addresses import bind
 from skyloop.cockpit.child import CockpitProcess
@@ -160,6 +160,23 @@ def ask(address: str, path: str, token: str | None = None, tls: ssl.SSLContext |
         request.add_header("Authorization", f"Bearer {token}")
     with urllib.request.urlopen(request, timeout=5, context=tls) as answer:
         return json.load(answer)
+
+
+def test_pages_are_served_while_the_cockpit_warms_up(monkeypatch: pytest.MonkeyPatch, tokens: Path) -> None:
+    """A thread of its own imports what following needs: not the event loop's, on which sticks arrive."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def warm_up() -> None:
+        begun.set()
+        assert go_on.wait(30)
+
+    monkeypatch.setattr(target_tracker, "warm_up", warm_up)
+    try:
+        with served(access=Access(token_file=tokens)) as address:
+            assert begun.wait(10)
+            assert ask(address, "/api/drones", OBSERVER) == []
+    finally:
+        go_on.set()
 
 
 def test_tokens_on_the_network(tokens: Path) -> None:

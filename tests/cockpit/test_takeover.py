@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -169,6 +170,26 @@ def test_control_that_was_offered_in_vain_and_taken_later_is_lost_all_the_same(
             told = pilot.wait("authority", mine=False)
             assert "has control" in told["why"]
             assert not told["given"]
+
+
+def test_control_that_is_gone_before_the_answer_has_arrived_was_given(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One time in four the page that gave it was told that it had lost control."""
+    answer, gone = PilotConnection.answer_takeover, threading.Event()
+
+    def late(pilot: PilotConnection, lease: int, app_id: int, grant: bool, reason: str) -> None:
+        answer(pilot, lease, app_id, grant, reason)
+        assert gone.wait(10)
+
+    monkeypatch.setattr(PilotConnection, "answer_takeover", late)
+    with page(client) as pilot:
+        pilot.take(8)
+        with asks(node):
+            pilot.say("answer", id=question(pilot)["id"], grant=True)
+            told = pilot.wait("authority", mine=False)
+            gone.set()
+            assert told["given"]
 
 
 # Asking ----------------------------------------------------------------------------------------------------------

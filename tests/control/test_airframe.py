@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from see_and_avoid import AvoidLaw, AvoidPhase
 
 from skyloop.clock import nanoseconds
 from skyloop.control.airframe import DRAG_PER_S, Airframe, AirframeLaw, Part, TiltVelocity
-from skyloop.control.avoid import AvoidLaw, AvoidPhase
 from skyloop.control.chase_law import FollowMode
 from skyloop.control.course_law import CourseLaw, GatePlace
 from skyloop.control.flow_hover import FlowLaw, FlowPhase

@@ -14,6 +14,7 @@ from types import ModuleType
 import msgspec
 import numpy as np
 import pytest
+from see_and_avoid import SeeAndAvoid
 
 from skyloop.control import (
     RACE_TRACK,
@@ -22,7 +23,6 @@ from skyloop.control import (
     GateKind,
     ImageServo,
     LandOnMarker,
-    SeeAndAvoid,
     course_in,
 )
 from skyloop.control.course_law import CourseSettings

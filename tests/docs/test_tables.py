@@ -43,6 +43,13 @@ def test_the_extras() -> None:
         assert re.split(r"[>=<]", requirement)[0] in table[0][2].lower()
 
 
+def test_the_budgets_of_paths() -> None:
+    budgets = tomllib.loads((ROOT / "scripts" / "budgets.toml").read_text())["paths"]
+    table = rows(section("docs/architecture.md", "### How long the paths are"))
+    assert [row[0] for row in table] == [f"`{name}`" for name in budgets]
+    assert [row[2:] for row in table] == [[str(number) for number in budget.values()] for budget in budgets.values()]
+
+
 def test_the_proxys_parameters() -> None:
     table = rows(section("docs/proxy.md", "## Parameters"))
     assert table == [

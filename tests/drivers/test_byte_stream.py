@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import socket
 import tty
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -12,7 +13,9 @@ from pathlib import Path
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.byte_stream import STUCK_NS, LinePace, Rank, SerialStream, line_speed
+from skyloop.drivers.byte_stream import STUCK_NS, LinePace, Rank, SerialStream, TcpStream, line_speed
+from skyloop.wire.mavlink.codec import Codec, Message
+from skyloop.wire.mavlink.codec import dialect as m
 
 
 @pytest.fixture
@@ -69,6 +72,213 @@ def test_a_serial_port_that_takes_half_a_frame_says_so(line: tuple[int, str]) ->
     pytest.importorskip("serial")
     with closing(SerialStream(line[1], 10_000_000, "x", "mavlink")) as stream, pytest.raises(OSError, match="reads"):
         stream.write(bytes(1 << 20))
+
+
+class Uart:
+    """The same line with the output buffer of a UART: its size is available, and it can be emptied.
+
+    Args:
+        line: Its far end, and the device at this one.
+    """
+
+    def __init__(self, line: tuple[int, str]) -> None:
+        self.waiting = 0
+        self._far, self.device = line
+
+    def read(self, most: int = 65_536) -> bytes:
+        """Carry some of what waits."""
+        came, wanted = b"", min(most, self.waiting)
+        while len(came) < wanted:
+            assert select.select([self._far], [], [], 5.0)[0]
+            came += os.read(self._far, wanted - len(came))
+        self.waiting -= wanted
+        return came
+
+
+@pytest.fixture
+def uart(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> Uart:
+    serial, uart = pytest.importorskip("serial"), Uart(line)
+    write = os.write
+
+    def count(descriptor: int, data: bytes) -> int:
+        sent = write(descriptor, data)
+        uart.waiting += sent
+        return sent
+
+    monkeypatch.setattr("skyloop.drivers.byte_stream.os.write", count)
+    monkeypatch.setattr(serial.Serial, "out_waiting", property(lambda _: uart.waiting))
+    monkeypatch.setattr(serial.Serial, "reset_output_buffer", lambda _: uart.read())
+    return uart
+
+
+def test_what_is_not_carried_counts_as_full(uart: Uart) -> None:
+    """The reader stalls, with room for thousands of bytes: a few set-points wait, and the newest is sent after that."""
+    clock = ManualClock()
+    with closing(SerialStream(uart.device, 921_600, "x", "mavlink", clock)) as stream:
+        for number in range(25):
+            stream.write(b"%08d" % number)
+            clock.advance(0.04)
+            uart.read()
+        for number in range(25, 32):
+            stream.write(b"%08d" % number)
+            clock.advance(0.04)
+        assert uart.waiting <= 4 * 8, "what waits is of one tenth of a second"
+        assert stream.dropped >= 3
+        uart.read()
+        stream.write(b"%08d" % 32)
+        assert uart.read() == b"00000032"
+        for number in range(33, 49):
+            stream.write(b"%08d" % number)
+            clock.advance(0.04)
+        with pytest.raises(OSError, match="no longer reads"):
+            stream.write(b"%08d" % number)
+
+
+@pytest.mark.parametrize(("baud", "most"), [(57_600, 576), (115_200, 1152)])
+def test_what_waits_is_asked_for_and_not_only_reckoned(uart: Uart, baud: int, most: int) -> None:
+    """The line is slower than its baud rate: what waits is limited to a tenth of a second at that rate."""
+    clock = ManualClock()
+    with closing(SerialStream(uart.device, baud, "x", "mavlink", clock)) as stream:
+        for _ in range(100):
+            with suppress(ConnectionError):
+                stream.write(bytes(50))
+            clock.advance(0.02)
+            uart.read(25)
+            assert uart.waiting <= most + 50
+
+
+class FlightControllerParser:
+    """Finds frames as MAVLink's C library does: it does not look for one within a damaged one."""
+
+    def __init__(self) -> None:
+        self._kept = bytearray()
+        self._codec = Codec(1, 1)
+
+    def feed(self, data: bytes) -> list[Message]:
+        self._kept += data
+        found: list[Message] = []
+        while (begin := self._kept.find(m.PROTOCOL_MARKER_V2)) >= 0:
+            del self._kept[:begin]
+            if len(self._kept) < 2 or len(self._kept) < (size := self._kept[1] + 12):
+                break
+            found += self._codec.decode(bytes(self._kept[:size]), whole=True)
+            del self._kept[:size]
+        return found
+
+
+def test_a_stop_goes_before_what_waits_and_is_not_taken_for_the_end_of_a_cut_frame(uart: Uart) -> None:
+    """The reader stalls in the middle of a frame, whose rest is discarded: the next frame it decodes is the stop."""
+    clock, station, vehicle = ManualClock(), Codec(255, 190), FlightControllerParser()
+    target = m.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1.0, 0.0, 0.0, 0.0], 0.1, 0.2, 0.3, 0.5)
+    stop = m.MAVLink_command_long_message(1, 1, m.MAV_CMD_COMPONENT_ARM_DISARM, 0, 0.0, 21196.0, 0, 0, 0, 0, 0)
+    with closing(SerialStream(uart.device, 57_600, "x", "mavlink", clock)) as stream:
+        for _ in range(10):
+            stream.write(station.encode(target))
+            clock.advance(0.001)
+        vehicle.feed(uart.read(70))
+        stream.write(station.encode(stop), Rank.STOP)
+        stream.write(station.encode(target))
+        (message,) = vehicle.feed(uart.read())
+        assert message.get_type() == "COMMAND_LONG"
+        for _ in range(5):
+            stream.write(station.encode(stop), Rank.STOP)
+            clock.advance(0.1)
+        assert len(vehicle.feed(uart.read())) == 5, "a stop does not discard the one before"
+
+
+def test_a_stop_finds_room_in_a_full_port(line: tuple[int, str]) -> None:
+    """The end of the buffer is discarded for it, even where its size is not available."""
+    pytest.importorskip("serial")
+    far, device = line
+    with closing(SerialStream(device, 10_000_000, "x", "mavlink")) as stream:
+        fill(stream)
+        stream.write(b"command", Rank.COMMAND)
+        assert stream.dropped == 1
+        stream.write(b"stop", Rank.STOP)
+        came = b""
+        while select.select([far], [], [], 0.2)[0]:
+            came += os.read(far, 65_536)
+        assert came.endswith(b"stop")
+
+
+def test_a_port_is_empty_when_it_is_opened(uart: Uart) -> None:
+    other = os.open(uart.device, os.O_WRONLY | os.O_NOCTTY)
+    os.write(other, b"of the connection before")
+    with closing(SerialStream(uart.device, 57_600, "x", "mavlink")) as stream:
+        assert uart.waiting == 0
+        stream.write(b"new")
+        assert uart.read() == b"new"
+        stream.write(b"stop", Rank.STOP)
+        assert uart.read() == bytes(277) + b"stop", "the end of a frame may have been discarded"
+        stream.write(b"stop", Rank.STOP)
+        assert uart.read() == b"stop"
+    os.close(other)
+
+
+def test_a_port_that_does_not_tell_what_waits_is_written_to_as_before(
+    line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    serial = pytest.importorskip("serial")
+    far, device = line
+
+    def untold(_: object) -> int:
+        raise OSError("inappropriate ioctl for device")
+
+    monkeypatch.setattr(serial.Serial, "out_waiting", property(untold))
+    monkeypatch.setattr(serial.Serial, "reset_output_buffer", untold)
+    clock = ManualClock()
+    with closing(SerialStream(device, 57_600, "x", "mavlink", clock)) as stream:
+        for _ in range(20):
+            stream.write(bytes(50))
+            stream.write(bytes(40), Rank.COMMAND)
+            clock.advance(0.04)
+        stream.write(bytes(40), Rank.STOP)
+        assert stream.dropped == 0
+        assert read_all(far) == 20 * 90 + 40
+
+
+@pytest.fixture
+def peer() -> Iterator[socket.socket]:
+    """A server that accepts one connection, and has room for little."""
+    with socket.socket() as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        yield server
+
+
+def received(connection: socket.socket) -> tuple[bytes, bool]:
+    """Return everything that comes, and whether the connection was ended properly."""
+    came = b""
+    connection.settimeout(5.0)
+    with connection:
+        try:
+            while more := connection.recv(65_536):
+                came += more
+        except ConnectionResetError:
+            return came, False
+    return came, True
+
+
+def test_what_a_connection_holds_when_it_is_closed_is_not_delivered_later(peer: socket.socket) -> None:
+    """The vehicle's network comes back when nobody flies it any more: it must not be armed then."""
+    stream = TcpStream("127.0.0.1", peer.getsockname()[1], ManualClock())
+    connection, _ = peer.accept()
+    with suppress(ConnectionError):
+        stream.write(bytes(1 << 16), Rank.COMMAND)
+        stream.write(b"arm", Rank.COMMAND)
+    stream.close()
+    came, ended = received(connection)
+    assert not came.endswith(b"arm")
+    assert not ended
+
+
+def test_the_last_words_of_a_connection_are_delivered(peer: socket.socket) -> None:
+    stream = TcpStream("127.0.0.1", peer.getsockname()[1])
+    connection, _ = peer.accept()
+    stream.write(b"disarm", Rank.COMMAND)
+    stream.close()
+    assert received(connection) == (b"disarm", True)
 
 
 def test_a_slow_line_carries_set_points_before_poses_and_commands_before_all() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -26,10 +27,11 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         return rehearse(target)
 
     def begin(name: str) -> str:
-        spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+        spec = importlib.util.spec_from_file_location(Path(name).stem, FOLDER / f"{name}.py")
         assert spec is not None
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, module.__name__, module)  # where dataclasses look for it
         spec.loader.exec_module(module)
         monkeypatch.setattr(skyloop, "connect", connect)
         module.main()
@@ -38,9 +40,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     return begin
 
 
-@pytest.mark.parametrize(
-    "name", ["fly_gates", "land_on_platform", "orbit_and_map", "approach", "see_and_avoid", "follow_anything"]
-)
+@pytest.mark.parametrize("name", ["fly_gates", "land_on_platform", "orbit_and_map", "approach", "follow_anything"])
 def test_an_example_is_short_and_says_how_to_run_it(name: str) -> None:
     text = (FOLDER / f"{name}.py").read_text()
     assert len(text.splitlines()) < 60
@@ -80,7 +80,7 @@ def test_approach(run: Run) -> None:
 
 
 def test_see_and_avoid(run: Run) -> None:
-    printed = run("see_and_avoid")
+    printed = run("behaviours/see_and_avoid")
     assert "and arrived" in printed
     assert "hit" not in printed
 

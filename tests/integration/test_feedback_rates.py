@@ -15,7 +15,7 @@ import pytest
 from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.clock import monotonic_ns
-from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
+from skyloop.errors import NoAnswerError, UsageError
 from skyloop.messages import Feedback, FlightState, LinkState, Overview
 from skyloop.proxy import Proxy
 from skyloop.transport.base import FEEDBACK, OVERVIEW, Dialer, TransportServer
@@ -87,24 +87,23 @@ def test_an_observer_is_sent_what_its_consumers_ask_for_and_its_link_is_up(
     fast: list[Feedback] = []
     with Beating(server), open_drone(dial, app="eye", access="observe") as drone:
         assert server.subscribers(FEEDBACK) == 1
-        with drone.on_feedback(got.append, inline=True, max_hz=10, fields=("battery", "native")):
-            topic = "feedback?fields=battery,native&max_hz=10"
+        with drone.on_feedback(got.append, inline=True, max_hz=10):
+            topic = "feedback?max_hz=10"
             wait_until(lambda: server.subscribers(topic) == 1 and not server.subscribers(FEEDBACK), "it is narrowed")
             wait_until(lambda: len(got) >= 5, "samples come")
             before = drone.stats["feedback"].count
             wait_until(lambda: len(got) >= 10, "samples come")
             assert drone.stats["feedback"].count - before <= 7, "no more were sent than were asked for"
             wait_until(lambda: drone.link.application is LinkState.UP, "the link is up")
-            with drone.on_feedback(fast.append, max_hz=50, fields=["altitude_m"]):
-                both = "feedback?fields=battery,altitude_m,native&max_hz=50"
+            with drone.on_feedback(fast.append, max_hz=50):
+                both = "feedback?max_hz=50"
                 wait_until(lambda: server.subscribers(both) == 1 and not server.subscribers(topic), "for both")
                 wait_until(lambda: len(fast) >= 10, "samples come")
             wait_until(lambda: server.subscribers(topic) == 1, "narrowed again")
         wait_until(lambda: server.subscribers(FEEDBACK) == 1, "all again, as nobody asks for less")
         wait_until(lambda: drone.feedback().skipped == 0, "whole")
         assert drone.stats["feedback"].lost == 0 or isinstance(server, FabricServer)  # there it travels as datagrams
-    assert {(sample.battery, sample.altitude_m) for sample in got} == {(0.9, None)}
-    assert {(sample.battery, sample.altitude_m) for sample in fast} == {(None, 1.0)}
+    assert {(sample.battery, sample.altitude_m) for sample in (*got, *fast)} == {(0.9, 1.0)}
     for one, other in itertools.pairwise(got):
         assert other.published_ns - one.published_ns > 0.05e9
 
@@ -112,10 +111,10 @@ def test_an_observer_is_sent_what_its_consumers_ask_for_and_its_link_is_up(
 def test_reading_is_a_consumer_too_and_waiting_needs_all() -> None:
     server, dial = _memory()
     with Beating(server) as beating, open_drone(dial, app="eye", access="observe") as drone:
-        assert drone.feedback(max_hz=2, fields=["battery"]).altitude_m is None
-        slow = "feedback?fields=battery&max_hz=2"
+        assert drone.feedback(max_hz=2).altitude_m == 1.0
+        slow = "feedback?max_hz=2"
         wait_until(lambda: server.subscribers(slow) == 1 and not server.subscribers(FEEDBACK), "it is narrowed")
-        assert drone.next_feedback(WAIT_S, max_hz=2, fields=["battery"]).battery == 0.9
+        assert drone.next_feedback(WAIT_S, max_hz=2).battery == 0.9
         waiting = threading.Thread(target=drone.wait, args=("flying", WAIT_S))
         waiting.start()
         wait_until(lambda: server.subscribers(FEEDBACK) == 1, "all while it waits")
@@ -134,13 +133,12 @@ def test_a_pilot_is_sent_all_and_its_consumers_get_what_they_ask_for() -> None:
     with (
         Beating(server),
         open_drone(dial, app="pilot") as drone,
-        drone.on_feedback(got.append, max_hz=20, fields=()),
+        drone.on_feedback(got.append, max_hz=20),
     ):
         wait_until(lambda: len(got) >= 5, "samples come")
         assert server.subscribers(FEEDBACK) == 1
-        assert drone.feedback(fields=["battery"]).altitude_m is None
         assert drone.feedback().altitude_m == 1.0
-    assert {sample.battery for sample in got} == {None}
+    assert {sample.battery for sample in got} == {0.9}
     assert {sample.owner for sample in got} <= {None, "pilot"}
     for one, other in itertools.pairwise(got):
         assert other.published_ns - one.published_ns > 0.02e9
@@ -157,8 +155,6 @@ def test_what_makes_no_sense_is_refused() -> None:
         for call in calls:
             with pytest.raises(UsageError, match="max_hz is"):
                 call()
-        with pytest.raises(UnknownNameError, match="did you mean 'position_m'"):
-            drone.on_feedback(print, fields=["position"])
         assert server.subscribers(FEEDBACK) == 1
 
 

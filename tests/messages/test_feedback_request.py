@@ -9,18 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.errors import UnknownNameError, UsageError
-from skyloop.messages import Feedback, FeedbackRequest, FlightState, VideoRequest
-from skyloop.messages.feedback_request import FIELDS, PLAIN
+from skyloop.errors import UsageError
+from skyloop.messages import FeedbackRequest, VideoRequest
+from skyloop.messages.feedback_request import PLAIN
 from skyloop.messages.rate import RateLimiter
 from skyloop.messages.video import FrameFilter
 from skyloop.transport.base import FEEDBACK, MAX_TOPIC
 
-requests = st.builds(
-    FeedbackRequest,
-    st.none() | st.floats(0.001, 1000.0),
-    st.none() | st.frozensets(st.sampled_from(FIELDS)),
-)
+requests = st.builds(FeedbackRequest, st.none() | st.floats(0.001, 1000.0))
 
 
 @pytest.mark.parametrize(
@@ -28,9 +24,7 @@ requests = st.builds(
     [
         (FeedbackRequest(), FEEDBACK),
         (FeedbackRequest(5), "feedback?max_hz=5"),
-        (FeedbackRequest.of(0.5, ("position_m", "battery")), "feedback?fields=battery,position_m&max_hz=0.5"),
-        (FeedbackRequest.of(fields=()), "feedback?fields=none"),
-        (FeedbackRequest.of(2, FIELDS), "feedback?max_hz=2"),
+        (FeedbackRequest(0.5), "feedback?max_hz=0.5"),
     ],
 )
 def test_a_request_as_a_topic(request_: FeedbackRequest, topic: str) -> None:
@@ -49,27 +43,13 @@ def test_a_union_gives_what_either_asks_for_and_no_more(one: FeedbackRequest, ot
     both = one.union(other)
     assert both == other.union(one)
     assert both.period_s == min(one.period_s, other.period_s)
-    for field in FIELDS:
-        wanted = any(request.fields is None or field in request.fields for request in (one, other))
-        assert (both.fields is None or field in both.fields) == wanted
     assert one.union(PLAIN) == PLAIN
 
 
 @pytest.mark.parametrize("max_hz", [0.0, -1.0, math.nan, math.inf, 1001, 1e-300, True, "5"])
 def test_a_rate_that_makes_no_sense(max_hz: Any) -> None:
     with pytest.raises(UsageError, match=r"max_hz is .* and must be from 0\.001 to 1000 samples a second"):
-        FeedbackRequest.of(max_hz)
-
-
-def test_fields_that_do_not_exist_or_always_come() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'battery'"):
-        FeedbackRequest.of(fields=("batery",))
-    with pytest.raises(UnknownNameError, match="owner"):
-        FeedbackRequest.of(fields=["owner"])
-    with pytest.raises(UsageError, match="several names"):
-        FeedbackRequest.of(fields="battery")
-    with pytest.raises(UsageError, match="must be names"):
-        FeedbackRequest.of(fields=[1])  # type: ignore[list-item]
+        FeedbackRequest(max_hz)
 
 
 @pytest.mark.parametrize(
@@ -95,15 +75,6 @@ def test_fields_that_do_not_exist_or_always_come() -> None:
 def test_topics_that_are_none(topic: str) -> None:
     with pytest.raises(UsageError, match="is no request for feedback"):
         FeedbackRequest.parse(topic)
-
-
-def test_only_what_was_asked_for_is_left() -> None:
-    whole = Feedback(
-        captured_ns=7, state=FlightState.FLYING, battery=0.5, yaw_rad=1.0, native={"a": 1}, seq=3, owner="p", lease=4
-    )
-    few = FeedbackRequest.of(fields=["battery"]).select(whole)
-    assert few == Feedback(captured_ns=7, state=FlightState.FLYING, battery=0.5, seq=3, owner="p", lease=4)
-    assert PLAIN.select(whole) is whole
 
 
 @given(st.floats(0.5, 50.0), st.floats(1.0, 100.0), st.integers(0, 2**32))

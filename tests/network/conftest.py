@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 
 from benchmarks.hosts.namespaces import Host, Lab, Segment, problem
-from skyloop.bench.workers import Workers
+from benchmarks.measuring.workers import Workers
 from tests.network.remote import Remote
 from tests.processes.conftest import Process
 

@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from benchmarks.hosts.namespaces import Host
-from skyloop.bench.workers import STARTS_WITHIN_S, Pipe, Workers
+from benchmarks.measuring.workers import STARTS_WITHIN_S, Pipe, Workers
 from skyloop.client import Drone
 
 ANSWERS_WITHIN_S = 40.0

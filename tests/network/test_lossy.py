@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from benchmarks import network
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, VIDEO
 from benchmarks.network import DATAGRAMS, PATH, TCP
-from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO
 
 pytest.importorskip("zenoh")
 SECONDS = 6.0

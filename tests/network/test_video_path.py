@@ -10,9 +10,9 @@ from benchmarks import moving_scene, video_path
 from benchmarks.hosts import traces
 from benchmarks.hosts.impairments import Impairments, Way
 from benchmarks.hosts.traces import Modem, Trace
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, SMALL, VIDEO, Size
 from benchmarks.over_path import FIXED_KBIT_S, NO_VIDEO
-from skyloop.bench.machine import Machine
-from skyloop.bench.schedule import COMMAND, FEEDBACK, SMALL, VIDEO, Size
+from skyloop.bench import Machine
 from skyloop.errors import UsageError
 
 MS = 1_000_000

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks.measuring.schedule import SMALL
 from benchmarks.moving_scene import MovingScene
-from skyloop.bench.schedule import SMALL
 from skyloop.pyav import H264Encoder
 
 pytest.importorskip("av", reason="H.264 needs the extra 'video'")

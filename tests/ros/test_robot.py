@@ -279,6 +279,28 @@ def test_a_service_that_never_answers_is_waited_for_no_longer() -> None:
     assert rig.tell() is FlightState.LANDED
 
 
+def test_a_take_off_without_an_answer_is_not_called_again_by_its_repeats() -> None:
+    rig = Rig()
+    rig.tell()
+    rig.session.command(Takeoff())
+    rig.clock.advance(ANSWER_S + 0.1)
+    rig.session.tick()
+    rig.tell()
+    rig.session.command(Takeoff(), new=False)
+    assert rig.robot.called == ["/robot/takeoff"]
+
+
+def test_a_robot_of_which_no_images_come_any_more_is_stopped() -> None:
+    rig = Rig(f"{SERVED}&odom=")
+    rig.session.on_image(image(rig.system()))
+    rig.session.command(Velocity(forward=0.5))
+    for _ in range(100):
+        rig.clock.advance(0.05)
+        rig.session.tick()
+    assert rig.sink.link_state is LinkState.LOST
+    assert rig.robot.sent[-1] == Velocity()
+
+
 def test_without_odometry_the_services_tell_whether_it_flies() -> None:
     rig = Rig(f"{SERVED}&odom=")
     rig.session.on_image(image(rig.system()))

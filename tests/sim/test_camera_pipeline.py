@@ -59,7 +59,7 @@ def drawing(pipeline: CameraPipeline) -> Iterator[CameraPipeline]:
 
 
 def test_only_the_newest_exposure_of_a_camera_is_drawn() -> None:
-    wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "planar", "fast")
+    wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "fast")
     front, now_ns = camera(wall), monotonic_ns()
     for late_ns in range(3):
         pipeline.expose([exposure(front, now_ns - 1_000_000_000 + late_ns)])
@@ -73,7 +73,7 @@ def test_only_the_newest_exposure_of_a_camera_is_drawn() -> None:
 def test_a_forgotten_camera_is_shown_nothing_more() -> None:
     gone, stays = Wall(), Wall()
     left, right = camera(gone), camera(stays)
-    pipeline = CameraPipeline(load_world("empty"), 1, "planar", "fast")
+    pipeline = CameraPipeline(load_world("empty"), 1, "fast")
     pipeline.forget((left,))
     with drawing(pipeline):
         pipeline.expose([exposure(left, monotonic_ns()), exposure(right, monotonic_ns())])
@@ -86,7 +86,7 @@ def test_a_renderer_that_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch)
         raise RuntimeError("no scene")
 
     monkeypatch.setattr("skyloop.sim.camera_pipeline.make_renderer", refuse)
-    wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "planar", "fast")
+    wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "fast")
     pipeline.expose([exposure(camera(wall), monotonic_ns())])
     with drawing(pipeline):
         assert wall.told.wait(5.0)
@@ -102,7 +102,7 @@ def test_a_picture_that_cannot_be_drawn_is_told_and_the_next_one_comes(monkeypat
         return finish(self, *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Camera, "finish", sometimes)
-    wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "planar", "fast")
+    wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "fast")
     front = camera(wall)
     with drawing(pipeline):
         pipeline.expose([exposure(front, monotonic_ns())])

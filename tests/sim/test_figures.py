@@ -17,8 +17,8 @@ from skyloop.sim import OccurrenceKind, Simulation, load_world, parse_world
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.labels import pictures, target_boxes
 from skyloop.sim.render import PlanarRenderer, Scene, SceneState
-from skyloop.sim.render.brightness import dimmed
 from skyloop.sim.render.compiled import Compiler, load_kernels
+from skyloop.sim.render.planar import dimmed
 from skyloop.sim.world import FigureTarget, Light, StillPath, World
 
 from .helpers import IDEAL, steps

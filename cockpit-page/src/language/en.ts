@@ -84,7 +84,7 @@ export const en = {
       ({
         vehicle: "H.264 as the vehicle encodes it",
         shared: `H.264 at ${kbit_s ?? 0} kbit/s, encoded once for all who watch`,
-        own: "H.264 for this page alone, which is slow: as much as its connection carries",
+        own: "H.264 for this page alone: as much as reaches it in time",
       })[kind],
     jpeg: (why: "" | "insecure" | "browser" | "failed") =>
       ({
@@ -92,6 +92,14 @@ export const en = {
         insecure: "JPEG: browsers decode H.264 only over https, or on the cockpit's own machine. Settings tell how.",
         browser: "JPEG: this browser decodes no H.264",
         failed: "JPEG: this browser could not decode the H.264 of this drone",
+      })[why],
+    smaller: (width: number, height: number) => `Smaller picture, ${width} × ${height}`,
+    coarser: "Coarser picture",
+    reduced: (what: string, why: "connection" | "computer" | "source") =>
+      ({
+        connection: `${what}: this connection is slow`,
+        computer: `${what}: this computer is busy`,
+        source: `${what}: pictures come late to the cockpit`,
       })[why],
     cameras: "Cameras",
     overlay: "Overlay",

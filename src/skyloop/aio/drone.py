@@ -333,21 +333,13 @@ class Drone:
 
     # Reading ---------------------------------------------------------------------------------------------------
 
-    def feedback(
-        self,
-        *,
-        max_age_s: float | None = None,
-        max_hz: float | None = None,
-        fields: Iterable[str] | None = None,
-    ) -> Feedback:
+    def feedback(self, *, max_age_s: float | None = None, max_hz: float | None = None) -> Feedback:
         """Return the newest feedback; see :meth:`skyloop.Drone.feedback`."""
-        return self.sync.feedback(max_age_s=max_age_s, max_hz=max_hz, fields=fields)
+        return self.sync.feedback(max_age_s=max_age_s, max_hz=max_hz)
 
-    async def next_feedback(
-        self, timeout_s: float = 1.0, *, max_hz: float | None = None, fields: Iterable[str] | None = None
-    ) -> Feedback:
+    async def next_feedback(self, timeout_s: float = 1.0, *, max_hz: float | None = None) -> Feedback:
         """Wait for feedback that was not read before; see :meth:`skyloop.Drone.next_feedback`."""
-        return await in_thread(lambda: self.sync.next_feedback(timeout_s, max_hz=max_hz, fields=fields))
+        return await in_thread(lambda: self.sync.next_feedback(timeout_s, max_hz=max_hz))
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> client.Frame | None:
         """Return the newest frame without waiting; see :meth:`skyloop.Drone.frame`.
@@ -450,11 +442,9 @@ class Drone:
         """Call ``function`` with each overview, on the event loop; see :meth:`skyloop.Drone.on_overview`."""
         return Listener(self.sync.on_overview(on_loop(function)))
 
-    def on_feedback(
-        self, function: Callback[Feedback], *, max_hz: float | None = None, fields: Iterable[str] | None = None
-    ) -> Listener:
+    def on_feedback(self, function: Callback[Feedback], *, max_hz: float | None = None) -> Listener:
         """Call ``function`` with the newest feedback, on the event loop; see :meth:`skyloop.Drone.on_feedback`."""
-        return Listener(self.sync.on_feedback(on_loop(function), max_hz=max_hz, fields=fields))
+        return Listener(self.sync.on_feedback(on_loop(function), max_hz=max_hz))
 
     def on_event(self, function: Callback[Event]) -> Listener:
         """Call ``function`` with each event, on the event loop."""

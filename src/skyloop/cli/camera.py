@@ -121,6 +121,9 @@ def calibrate(
         search.run(_from_files(named))
     else:
         with _Vehicle(named[0], camera, seconds) as vehicle:
+            _print(
+                f"looking for a board of {columns} × {rows} squares for {seconds:g} s at most; Ctrl-C ends that earlier"
+            )
             search.run(vehicle.pictures(), vehicle.draw)
     collector = search.collector
     if collector is None:

@@ -5,6 +5,7 @@ It flies nothing.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
@@ -12,11 +13,15 @@ from skyloop.cli.findings import Finding, Health
 from skyloop.messages import EventKind, LinkState, Severity
 
 if TYPE_CHECKING:
+    from skyloop.drivers.base import Driver
     from skyloop.drivers.recording_sink import RecordingSink
+    from skyloop.messages.checkup import Diagnostic
 
 ANSWER_S: Final = 3.5  #: for a vehicle to answer; the user gets a result within 5 s
 PATIENCE_S: Final = 40.0  #: for one that answers to be read
 FEEDBACK_S: Final = 3.0
+SETTLE_S: Final = 2.0  #: for faults that end with our first messages, such as a receiver without sticks
+LOOK_S: Final = 0.1
 
 
 def examine_vehicle(address: str) -> Iterator[Finding]:
@@ -48,11 +53,20 @@ def examine_vehicle(address: str) -> Iterator[Finding]:
         for event in sink.events:
             if event.kind is EventKind.DRIVER_ERROR or event.severity is Severity.ERROR:
                 yield Finding("vehicle", Health.MISSING, event.text)
-        for diagnostic in driver.checkup():
+        for diagnostic in _settled(driver, sink):
             health = Health.GOOD if diagnostic.good else Health.MISSING
             yield Finding(diagnostic.what, health, diagnostic.detail, diagnostic.advice)
     finally:
         driver.close()
+
+
+def _settled(driver: Driver, sink: RecordingSink) -> list[Diagnostic]:
+    end = time.monotonic() + SETTLE_S
+    while True:
+        found = driver.checkup()
+        if time.monotonic() >= end or all(each.good or not each.severe for each in found):
+            return found
+        sink.wait(lambda: False, LOOK_S)
 
 
 def _unreachable(sink: RecordingSink) -> Finding:

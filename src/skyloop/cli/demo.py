@@ -15,11 +15,9 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from skyloop.cli.demo_follow import FOLLOW_EXAMPLE, follow_anything
-from skyloop.cli.demo_paper import PAPER_EXAMPLE, paper
 from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
 from skyloop.cli.demo_report import DemoReport, TruthMeter
-from skyloop.errors import LinkError, UsageError
+from skyloop.errors import LinkError
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -31,14 +29,8 @@ ENOUGH_IN_VIEW = 0.9
 _FIRST_PICTURE_S = 10.0
 _REFRESH_HZ = 4
 
-demo = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
-demo.command("paper", short_help="The paper's test flight and its figures", epilog=PAPER_EXAMPLE)(paper)
-demo.command("follow-anything", short_help="Follow a person who walks about", epilog=FOLLOW_EXAMPLE)(follow_anything)
 
-
-@demo.callback()
-def follow(
-    context: typer.Context,
+def demo(
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="How long to follow; until Ctrl-C if not given")
     ] = None,
@@ -56,16 +48,7 @@ def follow(
         bool, typer.Option("--json", help="For programs: the figures as one JSON object; the rest on standard error")
     ] = False,
 ) -> None:
-    """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands.
-
-    skyloop demo follow-anything follows a person without any marker; skyloop demo paper flies the paper's experiment.
-    """
-    if context.invoked_subcommand is not None:
-        for given in context.params:
-            source = context.get_parameter_source(given)
-            if source is not None and source.name == "COMMANDLINE":
-                raise UsageError(f"--{given} stands before {context.invoked_subcommand}: give its options after it")
-        return
+    """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands."""
     console = Console(highlight=False, stderr=json)
     report = _Demo(console, name, seconds).fly(_address(world, seed), not headless, port, browser)
     if json:

@@ -1,4 +1,4 @@
-"""What both demos share besides their flights: the page beside them, and a Ctrl-C that ends them in good order."""
+"""What demonstrations share besides their flights: the page beside them, and a Ctrl-C that ends them in good order."""
 
 from __future__ import annotations
 

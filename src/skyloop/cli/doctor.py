@@ -151,7 +151,8 @@ def _extras() -> Iterator[Finding]:
         if broken:
             yield Finding(what, Health.BAD, "; ".join(broken), f"{install} --anew")
         elif missing:
-            yield Finding(what, Health.MISSING, f"{' and '.join(missing)} not installed", install)
+            named = " and ".join(part for part in (", ".join(missing[:-1]), missing[-1]) if part)
+            yield Finding(what, Health.MISSING, f"{named} not installed", install)
         else:
             yield Finding(what, Health.GOOD, ", ".join(versions))
 

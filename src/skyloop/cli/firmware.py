@@ -140,8 +140,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
     from skyloop.sim.render.planar import Quality, prepare
     from skyloop.wire.tello.commands import PORT
 
-    if options.renderer == "planar":
-        prepare(FRONT, Quality(options.quality))  # so that its first picture comes at once when it is asked for
+    prepare(FRONT, Quality(options.quality))  # so that its first picture comes at once when it is asked for
     host = SimHost(with_tellos(options), drones)
     return [
         TelloFirmware(

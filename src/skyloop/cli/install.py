@@ -23,7 +23,6 @@ from skyloop.errors import SkyloopError, UnknownNameError, UnsupportedError, ins
 EXTRAS: Final = (
     ("sim", "simulator's cameras", ("cv2",)),
     ("fast", "simulator's cameras, several times faster", ("numba", "cv2")),
-    ("mujoco", "simulator with meshes and shadows", ("mujoco", "cv2")),
     ("vision", "markers and other vision", ("cv2", "PIL")),
     ("detect", "detectors from an ONNX file", ("onnxruntime", "cv2", "scipy")),
     ("video", "recorded video, H.264", ("av",)),
@@ -47,8 +46,6 @@ EXTRAS: Final = (
 #: Commands that need several parts: who lacks one of them is told of all that are missing.
 NEEDS: Final = {
     "demo": ("sim", "vision", "cockpit"),
-    "demo follow-anything": ("sim", "vision", "detect", "cockpit"),
-    "demo paper": ("sim", "cockpit", "record", "control", "bench"),
     "fly": ("sim", "vision"),
     "fly follow": ("vision", "detect"),
     "detect": ("detect", "vision"),

@@ -168,17 +168,24 @@ class ProxyConnection:
         else:
             session.requests.ask(body, done, timeout_s, self._clock())
 
-    def call(self, body: Callable[[], AnyRequest], timeout_s: float = 2.0) -> AnyReply:
+    def call(
+        self,
+        body: Callable[[], AnyRequest],
+        timeout_s: float = 2.0,
+        *,
+        may_repeat: Callable[[], bool] = lambda: True,
+    ) -> AnyReply:
         """Send a request and wait for the answer. While the link is lost, wait for it to come back.
 
         Args:
             body: Makes the request, for each attempt again.
             timeout_s: For all of it [s].
+            may_repeat: Whether to ask once more, when the link broke before the answer to a request that was sent.
 
         Raises:
             NoAnswerError: If there is no answer in time.
             ClosedError: If the drone is closed.
-            LinkError: If called from an inline callback.
+            LinkError: If called from an inline callback, or what was asked may have been done and must not be repeated.
         """
         if self.receiving:
             raise LinkError("an inline listener can't wait for an answer, which it would itself have to receive")
@@ -191,7 +198,7 @@ class ProxyConnection:
 
         deadline = time.monotonic() + timeout_s
         while not self.closing:
-            left_s = deadline - time.monotonic()
+            left_s, sent = deadline - time.monotonic(), self._session is not None
             self.ask(body(), done, max(left_s, 0.001))
             notifier.wait_for(lambda: bool(answers), left_s + 1.0)
             answer = answers.pop() if answers else NoAnswerError("the link's thread has ended")
@@ -199,6 +206,8 @@ class ProxyConnection:
                 return answer
             if isinstance(answer, NoAnswerError) or left_s <= 0.02:
                 raise NoAnswerError(f"{answer} ({timeout_s:g} s were given)") from answer
+            if sent and not may_repeat():
+                raise LinkError(f"{answer}, after the request was sent: it may have been carried out") from answer
             notifier.wait_for(lambda: self.closing, 0.02)
         raise ClosedError("this drone was closed")
 

@@ -545,7 +545,6 @@ class Drone:
         *,
         max_age_s: float | None = None,
         max_hz: float | None = None,
-        fields: Iterable[str] | None = None,
     ) -> Feedback:
         """Return the newest feedback.
 
@@ -555,17 +554,14 @@ class Drone:
         Args:
             max_age_s: Oldest age since capture that is accepted [s]; None: any.
             max_hz: So many new samples a second are enough, 0.001 to 1000; None: all are wanted.
-            fields: Names of the vehicle's fields that are wanted, from ``battery`` to ``native``; the others are None.
-                None: all. Time, flight state, links, authority and failsafe always come.
 
         Raises:
             NoAnswerError: If no feedback has come yet, or the newest is older than ``max_age_s``.
             ClosedError: If the drone was closed.
-            UsageError: If ``max_hz`` is out of range, or ``fields`` are no names of fields.
+            UsageError: If ``max_hz`` is out of range.
         """
         self._core.check_open()
-        request = _feedback_request(max_hz, fields)
-        self._state.demand.keep(request)
+        self._state.demand.keep(_feedback_request(max_hz))
         newest = self._state.newest
         if newest is None:
             raise NoAnswerError("no feedback has come yet")
@@ -574,7 +570,7 @@ class Drone:
             if age_s > max_age_s:
                 raise NoAnswerError(f"the newest feedback is {age_s:.3f} s old, {max_age_s:g} s were allowed")
         self._read = newest
-        return newest if request is PLAIN else request.select(newest)
+        return newest
 
     def overview(self, timeout_s: float = 2.0) -> Overview:
         """Return the newest overview of all vehicles that the proxy's process serves, a row each.
@@ -606,15 +602,12 @@ class Drone:
         """Return the time since the sample's capture [s], within ``clock_uncertainty_ns``."""
         return (self.now_ns - sample.captured_ns) / 1e9
 
-    def next_feedback(
-        self, timeout_s: float = 1.0, *, max_hz: float | None = None, fields: Iterable[str] | None = None
-    ) -> Feedback:
+    def next_feedback(self, timeout_s: float = 1.0, *, max_hz: float | None = None) -> Feedback:
         """Wait for feedback that was not read before, and return the newest.
 
         Args:
             timeout_s: How long to wait [s].
             max_hz: As for :meth:`feedback`; samples that other consumers ask for are returned, too.
-            fields: As for :meth:`feedback`.
 
         Raises:
             NoAnswerError: If none comes in time.
@@ -624,11 +617,11 @@ class Drone:
         self._core.check_open()
         self._core.check_may_wait()
         state = self._state
-        state.demand.keep(_feedback_request(max_hz, fields))
+        state.demand.keep(_feedback_request(max_hz))
         if not state.notifier.wait_for(lambda: state.newest is not self._read or self._core.closed, timeout_s):
             link = self._core.connection.state.value
             raise NoAnswerError(f"no feedback came within {timeout_s:g} s: the link is {link}")
-        return self.feedback(max_hz=max_hz, fields=fields)
+        return self.feedback(max_hz=max_hz)
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> Frame | None:
         """Return the newest frame without waiting.
@@ -779,7 +772,6 @@ class Drone:
         *,
         inline: bool = False,
         max_hz: float | None = None,
-        fields: Iterable[str] | None = None,
     ) -> Listener[Feedback]:
         """Call ``function`` with the newest feedback.
 
@@ -791,9 +783,8 @@ class Drone:
             inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
             max_hz: At most so many samples a second, 0.001 to 1000; None: all. An observer is sent no more, unless
                 another consumer asks for it.
-            fields: As for :meth:`feedback`.
         """
-        channel = self._state.feedback_channel(_feedback_request(max_hz, fields))
+        channel = self._state.feedback_channel(_feedback_request(max_hz))
         return self._listen(channel, function, "feedback", inline=inline)
 
     def on_overview(self, function: Callable[[Overview], object], *, inline: bool = False) -> Listener[Overview]:
@@ -1174,8 +1165,8 @@ def open_drone(
     return Drone(core)
 
 
-def _feedback_request(max_hz: float | None, fields: Iterable[str] | None) -> FeedbackRequest:
-    return PLAIN if max_hz is None and fields is None else FeedbackRequest.of(max_hz, fields)
+def _feedback_request(max_hz: float | None) -> FeedbackRequest:
+    return PLAIN if max_hz is None else FeedbackRequest(max_hz)
 
 
 def _from_numpy(value: Any) -> Any:

@@ -79,7 +79,7 @@ class FeedbackDemand:
 
 
 class FeedbackChannel(Channel[Feedback]):
-    """Feedback for consumers that ask for fewer samples or fields than the connection may be sent for others."""
+    """Feedback for consumers that ask for fewer samples than the connection may be sent for others."""
 
     def __init__(self, request: FeedbackRequest, demand: FeedbackDemand) -> None:
         super().__init__(lambda on: demand.want(request, on))
@@ -87,6 +87,6 @@ class FeedbackChannel(Channel[Feedback]):
         self._rate = RateLimiter(request.max_hz)
 
     def receive(self, sample: Feedback) -> None:
-        """Publish a sample as it was asked for, if it is due; on the receiving thread."""
+        """Publish a sample if it is due; on the receiving thread."""
         if self._consumers and self._rate.in_time(sample.published_ns):
-            self.publish(self.request.select(sample))
+            self.publish(sample)

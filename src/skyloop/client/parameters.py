@@ -130,9 +130,14 @@ class Config(Mapping[str, Value]):
             AuthorityError: If the authority is not held.
             UnknownNameError: If there is no such parameter; carries suggestions.
             UsageError: If the value is of no type that a parameter can have.
+            LinkError: If the link broke before the answer and the parameter is momentary: once may have been enough.
         """
         plain = plain_value(name, value)
-        answer = self._call(name, lambda: SetParameter(_name(name), plain, self._authority.status.lease))
+        answer = self._call(
+            name,
+            lambda: SetParameter(_name(name), plain, self._authority.status.lease),
+            may_repeat=lambda: not self.describe(name).momentary,
+        )
         if not isinstance(answer, ParameterValue):
             raise LinkError(f"the proxy answered the writing of {name} with {type(answer).__name__}")
         self._restorer.written(msgspec.structs.replace(answer.parameter, value=plain))
@@ -177,8 +182,10 @@ class Config(Mapping[str, Value]):
         """Return the values of all parameters, sorted by name."""
         return [parameter.value for parameter in self.parameters()]
 
-    def _call(self, name: str, body: Callable[[], AnyRequest]) -> AnyReply:
-        answer = self._connection.call(body, ANSWER_S)
+    def _call(
+        self, name: str, body: Callable[[], AnyRequest], may_repeat: Callable[[], bool] = lambda: True
+    ) -> AnyReply:
+        answer = self._connection.call(body, ANSWER_S, may_repeat=may_repeat)
         if not isinstance(answer, Refused):
             return answer
         if answer.code is Refusal.UNKNOWN_PARAMETER:

@@ -41,9 +41,9 @@ class AuthorityReport:
         """Count the control as given back on purpose: it was not lost."""
         self._was_mine, self._loss = False, None
 
-    def handed_over(self) -> None:
-        """Count the control that goes now as given to who asked for it: it is not lost."""
-        self._given, self._given_ns = True, monotonic_ns()
+    def handed_over(self, *, given: bool = True) -> None:
+        """Count the control that goes now as given to who asked for it: it is not lost; or no longer so."""
+        self._given, self._given_ns = given, monotonic_ns()
 
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
         """Return the message for the page; None if nothing has changed.

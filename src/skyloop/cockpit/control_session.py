@@ -379,10 +379,15 @@ class ControlSession:
         self._update()
 
     async def _answer(self, command: Answer) -> None:
+        pilot = self._held()
         self._acknowledge(command)
-        await self._takeover.answer(command, self._held())
         if command.grant:
-            self._authority.handed_over()
+            self._authority.handed_over()  # which may be seen before the answer's own answer is here
+        try:
+            await self._takeover.answer(command, pilot)
+        except RefusedError:
+            self._authority.handed_over(given=False)
+            raise
         self._done(command.do)
 
     async def _release(self, command: Release) -> None:

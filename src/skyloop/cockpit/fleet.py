@@ -130,6 +130,12 @@ class Fleet:
             elif self._forgotten(name, station, now_ns):
                 self.let_go(name)
 
+    @property
+    def unreached(self) -> dict[str, str]:
+        """Why nothing can be commanded to drones that were found, by name: there is no connection to them."""
+        waiting = dict.fromkeys(self._connecting, "the cockpit is still connecting to it")
+        return {**waiting, **self.problems}
+
     def want(self, name: str) -> None:
         """Show this drone too, where only certain names are shown."""
         self.finder.add_name(name)

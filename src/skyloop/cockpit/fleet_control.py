@@ -60,8 +60,12 @@ class FleetSession:
             self._send({"type": "refused", "do": command.do, "n": command.n, "why": problem})
         else:
             stations = [station for _, station in sorted(self._fleet.stations.items()) if station.flies]
-            names = [station.found.name for station in stations]
+            unreached = self._fleet.unreached  # a person who stops all must know of whom that is not true
+            names = sorted([*(station.found.name for station in stations), *unreached])
             self._send({"type": "sent", "do": command.do, "n": command.n, "drones": names})
+            for name, why in unreached.items():
+                each = {"type": "each", "do": command.do, "n": command.n, "drone": name}
+                self._send({**each, "state": "refused", "why": why})
             for station in stations:
                 self._fleet.begin(self._run(command, station))
 

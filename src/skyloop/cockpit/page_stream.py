@@ -36,6 +36,7 @@ class PagePath:
 
     def __init__(self) -> None:
         self.behind = False  #: it needs less than what others get
+        self.late_here = False  #: and that is no fault of the page: pictures were late when they came to the cockpit
         self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, when it was sent
         self._trip_s = 0.0  # of the newest acknowledged
         self._changed_ns: int | None = None  # since when all are late, or none is
@@ -77,6 +78,8 @@ class PagePath:
         late = max(oldest_s, self._trip_s, extra_s) > LATE_S
         if self._changed_ns is None or late != self._was_late:
             self._changed_ns, self._was_late = now_ns, late
+        if late:
+            self.late_here = extra_s > LATE_S
         lasts_s = seconds(now_ns - self._changed_ns)
         if late and not self.behind and lasts_s >= FALLS_BEHIND_S:
             relapse = self._back_ns is not None and seconds(now_ns - self._back_ns) < 2.0 * self._quiet_s
@@ -95,6 +98,7 @@ class Sent:
     picture: EncodedFrame
     form: Form
     age_s: float
+    late_here: bool = False  #: where the form is the page's own: not for the page's sake
 
 
 class PageStream:
@@ -165,7 +169,10 @@ class PageStream:
         self._serial, self._follows = pictures[-1].serial, True
         now_ns = self._clock() + self._station.drone.clock_offset_ns
         self._late_s = seconds(now_ns - pictures[-1].picture.published_ns)
-        return [Sent(one.serial, one.picture, feed.form, seconds(now_ns - one.picture.captured_ns)) for one in pictures]
+        form, late = feed.form, self.path.late_here
+        return [
+            Sent(one.serial, one.picture, form, seconds(now_ns - one.picture.captured_ns), late) for one in pictures
+        ]
 
     def sent(self, number: int, one: Sent) -> None:
         """Note under which number a picture that was taken is sent."""

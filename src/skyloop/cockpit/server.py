@@ -280,6 +280,7 @@ def _serve(
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.recordings import Recordings
     from skyloop.cockpit.security import bind_address, own_names
+    from skyloop.cockpit.target_tracker import warm_up
 
     address, port = listening.getsockname()[:2]
     own_name = () if bind_address(address)[1] else host_names()
@@ -304,6 +305,7 @@ def _serve(
             print(endpoint.announcement, file=sys.stderr, flush=True)
         pairing = gate.pairing if isinstance(gate, TokenGate) else None
         look = _idle if pairing is None else pairing.expire
+        threading.Thread(target=warm_up, name="skyloop-warm-up").start()
         asyncio.run(_run(server, listener, lambda: on_ready(page), stop, look))
 
 

@@ -346,4 +346,5 @@ def _said(text: str) -> _FromPage | None:
 
 def encoding_values(one: Sent) -> dict[str, Any]:
     """Return how a picture is encoded as JSON values for a page."""
-    return {"key": one.picture.key, "kind": one.form.kind, "kbit_s": one.form.kbit_s}
+    values = {"key": one.picture.key, "kind": one.form.kind, "kbit_s": one.form.kbit_s}
+    return values | {"late": True} if one.form.subscriber and one.late_here else values

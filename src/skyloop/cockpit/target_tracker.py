@@ -14,11 +14,15 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+import numpy as np
+
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.cockpit.kept_frames import KEPT_S
 from skyloop.control.follow_target import detections_of
 from skyloop.errors import DecodeError, MissingExtraError, SkyloopError, UsageError
 from skyloop.messages import Text
+from skyloop.vision import LongTermTracker
+from skyloop.vision.object_tracks import assignment
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
@@ -31,6 +35,20 @@ if TYPE_CHECKING:
 
 PERIOD_S: Final = 0.05  #: between two set-points without a new frame
 SOURCE: Final = "follow"  #: of what is drawn
+
+
+def warm_up() -> None:
+    """Track once, in noise: what that imports takes the interpreter from everybody who flies by this cockpit.
+
+    SciPy, which matches detections, needs it for half a second on an idle computer and for seconds on a busy one. So
+    this runs as the cockpit starts, on a thread other than the event loop's, and not when a first target is marked.
+    """
+    noise = np.random.default_rng(1).integers(0, 255, (96, 96, 3), np.uint8)
+    with suppress(MissingExtraError):  # who marks a target is told
+        tracker = LongTermTracker()
+        tracker.start(noise, (32.0, 32.0, 24.0, 32.0))
+        tracker.update(noise)
+        assignment()
 
 
 class Follower(Protocol):

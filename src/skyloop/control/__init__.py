@@ -1,7 +1,6 @@
 """Controllers: the base class for an application's control loop, ready-made behaviours, and their building blocks."""
 
 from skyloop.control.approach import ApproachMarker, OrbitMarker, OrbitPlace
-from skyloop.control.avoid import SeeAndAvoid
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.chase_law import FollowMode
 from skyloop.control.chase_settings import ChaseSettings
@@ -67,7 +66,6 @@ __all__ = [
     "RouteCheck",
     "RouteWaypoint",
     "RunSummary",
-    "SeeAndAvoid",
     "Spline",
     "TrackingError",
     "Wait",

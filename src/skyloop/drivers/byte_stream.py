@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import re
 import socket
+import struct
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
@@ -20,16 +22,22 @@ CONNECT_S: Final = 1.0
 STUCK_NS: Final = nanoseconds(0.5)  #: a connection that has no room for so long is no longer read
 _MOST: Final = 65_536  # bytes read at once
 _BITS: Final = 10  # that a serial line takes for a byte
-_DRAIN_S: Final = 0.1  # that closing a serial port may take
+_DRAIN_S: Final = 0.1  # that closing a connection may take
+_UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection ends: nothing older is delivered
+_OVERDUE_NS: Final = nanoseconds(0.1)  # a line is stalled if bytes wait so long after it should have carried them
+#: Size of the longest frame of MAVLink and MSP [bytes]. Parsers of flight controllers read as many bytes as a frame
+#: announces and don't look for another frame among them, so a frame that may be cut is filled up before a stop.
+_LONGEST: Final = 280
 
 
 class Rank(IntEnum):
     """How important a packet is: the first is sent whatever is under way, the last only on a line that is free."""
 
-    COMMAND = 0  #: emergency stops, modes, arming: rare, small, never held back
-    SETPOINT = 1
-    QUERY = 2  #: requests, parameters
-    POSE = 3  #: poses from outside, which come often and are large
+    STOP = 0  #: emergency stops, which empty the output buffer of a serial port
+    COMMAND = 1  #: modes, arming: rare, small, never held back
+    SETPOINT = 2
+    QUERY = 3  #: requests, parameters
+    POSE = 4  #: poses from outside, which come often and are large
 
 
 #: How far the line may be behind for a packet to be sent [ns].
@@ -41,7 +49,7 @@ _PATIENCE_NS: Final = {
 
 
 class LinePace:
-    """Tells how far a slow line is behind, so that what is sent is new when it arrives. Pure.
+    """Tells how far a line is behind, so that what is sent is new when it arrives. Pure.
 
     Args:
         bytes_per_s: Of the line; None: it is as fast as needed.
@@ -50,20 +58,40 @@ class LinePace:
     def __init__(self, bytes_per_s: float | None) -> None:
         self._ns_per_byte = 0.0 if bytes_per_s is None else 1e9 / bytes_per_s
         self._free_ns = 0  # when all that was written has been carried
+        self._written = 0  # bytes
+        self._mark = 0  # so many of them
+        self._due_ns: int | None = None  # should have been carried by then; None: nothing waited
 
     def admits(self, rank: Rank, now_ns: int) -> bool:
         """Return whether a packet may be sent now; if not, it would wait behind others and arrive late."""
-        return rank is Rank.COMMAND or self._free_ns - now_ns <= _PATIENCE_NS[rank]
+        return rank <= Rank.COMMAND or self._free_ns - now_ns <= _PATIENCE_NS[rank]
+
+    def stalled(self, now_ns: int) -> bool:
+        """Return whether the line carries nothing, going by the size of the output buffer."""
+        return self._due_ns is not None and now_ns > self._due_ns
+
+    def on_waiting(self, size: int, now_ns: int) -> None:
+        """Note how many of the bytes written are still in the output buffer."""
+        if not size:
+            self._due_ns = None
+        elif self._due_ns is None or self._written - size >= self._mark:
+            self._mark, self._due_ns = self._written, self._free_ns + _OVERDUE_NS
+        self._free_ns = max(self._free_ns, now_ns + round(size * self._ns_per_byte))
 
     def on_written(self, size: int, now_ns: int) -> None:
         """Note that so many bytes were written."""
         self._free_ns = max(self._free_ns, now_ns) + round(size * self._ns_per_byte)
+        self._written += size
+
+
+_NOT_READ: Final = "the vehicle no longer reads what is sent"
 
 
 class ByteStream(ABC):
     """An open connection. Not thread-safe.
 
-    ``dropped`` counts the packets that were not sent, because the line was behind or had no room.
+    ``dropped`` counts the packets that were not sent, because the line was behind or stalled, or had no room. Drivers
+    repeat each, or send a newer one.
 
     Args:
         pace: Of the line.
@@ -74,7 +102,10 @@ class ByteStream(ABC):
         self.dropped = 0
         self._pace = pace
         self._clock = clock
-        self._full_ns: int | None = None  # since when there is no room
+        self._full_ns: int | None = None  # since when there is no room, or the line is stalled
+        self._whole = _LONGEST  # bytes written since a frame may have been cut
+        self._cleared = False  # a full buffer was emptied for a stop, and nothing shows whether it is read since
+        self._stopping = False  # the last packet was a stop, which the next one must not discard
 
     @abstractmethod
     def fileno(self) -> int:
@@ -99,24 +130,63 @@ class ByteStream(ABC):
             OSError: It can't be sent, or only in part so that what follows would be noise, or nothing could be sent for
                 :data:`STUCK_NS`.
         """
-        now_ns = self._clock()
-        if not self._pace.admits(rank, now_ns):
-            self.dropped += 1
-            return
-        try:
-            sent = self._write(data)
-        except BlockingIOError:
-            self.dropped += 1
-            if self._full_ns is None:
-                self._full_ns = now_ns
-            if now_ns - self._full_ns < STUCK_NS:
+        now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
+        self._pace.on_waiting(waiting, now_ns)
+        if stop and not self._stopping and waiting > _LONGEST:  # less is sent no later than what fills up a cut frame
+            self._discard()
+        stalled = self._cleared or self._pace.stalled(now_ns)
+        sent = 0
+        if not stalled or rank <= Rank.COMMAND:
+            if not self._pace.admits(rank, now_ns):
+                self.dropped += 1
                 return
-            sent = 0
-        if sent < len(data):
-            self._full_ns = now_ns if self._full_ns is None else self._full_ns
-            raise ConnectionError("the vehicle no longer reads what is sent")
-        self._full_ns = None
-        self._pace.on_written(sent, now_ns)
+            packet = self._filled(data) if stop else data
+            sent = self._attempt(packet)
+            if stop and sent < len(packet) and self._discard():
+                packet = self._filled(data)
+                sent = self._attempt(packet)
+                self._cleared = stalled = not self._waiting()
+            if 0 < sent < len(packet):
+                self._full_ns = now_ns if self._full_ns is None else self._full_ns
+                raise ConnectionError(_NOT_READ)
+        if sent:
+            self._pace.on_written(sent, now_ns)
+            self._whole += sent
+            self._stopping = stop
+        self.dropped += not sent
+        self._check_room(now_ns, room=bool(sent) and not stalled)
+
+    def _filled(self, data: bytes) -> bytes:
+        return bytes(max(0, _LONGEST - self._whole)) + data
+
+    def _attempt(self, packet: bytes) -> int:
+        try:
+            return self._write(packet)
+        except BlockingIOError:
+            return 0
+
+    def _check_room(self, now_ns: int, *, room: bool) -> None:
+        if room:
+            self._full_ns = None
+        elif self._full_ns is None:
+            self._full_ns = now_ns
+        elif now_ns - self._full_ns >= STUCK_NS:
+            raise ConnectionError(_NOT_READ)
+
+    def _waiting(self) -> int:
+        """Return how many bytes are in the output buffer; 0 where that is not available."""
+        return 0
+
+    def _discard(self) -> bool:
+        """Empty the output buffer, which may cut a frame; return whether it did, as far as that is known."""
+        return False
+
+    def _drain(self, waiting: Callable[[], int]) -> bool:
+        """Wait a moment for what was written to leave; return whether it did."""
+        until_s = time.monotonic() + _DRAIN_S
+        while self._full_ns is None and waiting() and time.monotonic() < until_s:
+            time.sleep(0.005)
+        return self._full_ns is None and not waiting()
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
@@ -143,6 +213,8 @@ class TcpStream(ByteStream):
         super().__init__(LinePace(None), clock)
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # not on macOS
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNACKNOWLEDGED_MS)
         self._socket.setblocking(False)
 
     def fileno(self) -> int:
@@ -167,12 +239,24 @@ class TcpStream(ByteStream):
         return self._socket.send(data)
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection. What was not received is discarded: the system would go on sending it for minutes."""
+        if not self._drain(self._unacknowledged):
+            with suppress(OSError):
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
+
+    def _unacknowledged(self) -> int:
+        with suppress(Exception):  # not available, or the connection is gone
+            import fcntl
+            import termios
+
+            count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
+            return count
+        return 0
 
 
 class SerialStream(ByteStream):
-    """A serial port, through pyserial, opened for this process alone.
+    """A serial port, through pyserial, opened for this process alone, with an empty output buffer.
 
     Args:
         path: Of the device.
@@ -193,6 +277,8 @@ class SerialStream(ByteStream):
             raise MissingExtraError(what, extra, cause=str(error)) from error
         super().__init__(LinePace(line_speed(path, baud)), clock)
         self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
+        self._discard()
+        self._whole = 0  # by the connection before
 
     def fileno(self) -> int:
         """Return the descriptor."""
@@ -215,14 +301,25 @@ class SerialStream(ByteStream):
     def _write(self, data: bytes) -> int:
         return os.write(self.fileno(), data)  # pyserial's own tries again and again while there is no room
 
+    def _waiting(self) -> int:
+        with suppress(Exception):  # not available, or the port is gone, which writing reports
+            waiting: int = self._port.out_waiting
+            return waiting
+        return 0
+
+    def _discard(self) -> bool:
+        before = self._waiting()
+        with suppress(Exception):  # the error of a terminal is no OSError
+            self._port.reset_output_buffer()
+            if not before or self._waiting() < before:  # not every driver can empty it
+                self._whole = 0
+                return True
+        return False
+
     def close(self) -> None:
         """Close the port. What nobody reads is thrown away: the system would wait for it, with some ports for 30 s."""
-        with suppress(Exception):  # it may be unplugged, and the error of a terminal is no OSError
-            until_s = time.monotonic() + (_DRAIN_S if self._full_ns is None else 0.0)
-            while self._port.out_waiting and time.monotonic() < until_s:
-                time.sleep(0.005)
-            if self._full_ns is not None or self._port.out_waiting:
-                self._port.reset_output_buffer()
+        if not self._drain(self._waiting):
+            self._discard()
         self._port.close()
 
 

@@ -43,7 +43,7 @@ class VehicleUri:
         given = dict(options or {})
         broken = is_broken(given)
         self.scheme: Final = scheme
-        self.place: Final = without_secrets(place, broken=broken)
+        self.place: Final = without_secrets(place, broken=broken, place_of=scheme)
         self.options: Final[Mapping[str, str]] = {
             shown_name(name): without_secrets(value, name, broken=broken) if value else value
             for name, value in given.items()

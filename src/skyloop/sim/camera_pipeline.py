@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.messages.rate import RateLimiter
 from skyloop.sim.camera import CameraModel, CameraPose
-from skyloop.sim.render import PlanarRenderer, Quality, Renderer, Scene, SceneState, SensorEffects
+from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, SensorEffects
 from skyloop.sim.world import World
 
 _LONGEST_WAIT_S: Final = 0.5
@@ -113,18 +113,16 @@ class CameraPipeline:
     The scene is created at the start, which takes some tenths of a second: start it when the first frame is wanted.
     """
 
-    def __init__(self, world: World, drones: int, renderer: str, quality: str) -> None:
+    def __init__(self, world: World, drones: int, quality: str) -> None:
         """Initialise without starting the thread.
 
         Args:
             world: The world.
             drones: How many it has.
-            renderer: ``planar`` or ``mujoco``.
-            quality: Of the planar renderer.
+            quality: Of the images: ``fast``, ``smooth`` or ``best``.
         """
         self._world = world
         self._drones = drones
-        self._renderer = renderer
         self._quality = quality
         self._changed = threading.Condition()
         self._waiting: dict[Camera, Exposure] = {}  # oldest camera first
@@ -163,7 +161,7 @@ class CameraPipeline:
 
     def _run(self) -> None:
         try:
-            renderer = make_renderer(self._world, self._drones, self._renderer, self._quality)
+            renderer = make_renderer(self._world, self._drones, self._quality)
         except Exception as error:  # noqa: BLE001  reported to the drivers: there will be no frames
             with self._changed:
                 screens = {camera.screen for camera in self._waiting}
@@ -208,9 +206,9 @@ class SteppedCameraPipeline:
     For a world whose time stands still between two steps.
     """
 
-    def __init__(self, world: World, drones: int, renderer: str, quality: str) -> None:
+    def __init__(self, world: World, drones: int, quality: str) -> None:
         """Create the renderer."""
-        self._renderer = make_renderer(world, drones, renderer, quality)
+        self._renderer = make_renderer(world, drones, quality)
         self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
         self._order = itertools.count()
 
@@ -238,26 +236,9 @@ class SteppedCameraPipeline:
         self._finished.clear()
 
 
-def make_renderer(world: World, drones: int, renderer: str, quality: str) -> Renderer:
+def make_renderer(world: World, drones: int, quality: str) -> PlanarRenderer:
     """Create a renderer; to be called on the thread that renders, to which it belongs."""
-    if renderer == "mujoco":
-        from skyloop.sim.render.mujoco import MujocoRenderer
-
-        return MujocoRenderer(world, drones)
     return PlanarRenderer(Scene(world, drones), Quality(quality))
-
-
-def require_renderer(name: str) -> None:
-    """Check that a renderer can be used here.
-
-    Raises:
-        MissingExtraError: It is not installed.
-        UnsupportedError: It does not work here; the text says what to install.
-    """
-    if name == "mujoco":
-        from skyloop.sim.render.mujoco import require_opengl
-
-        require_opengl()
 
 
 def expose(

@@ -112,8 +112,7 @@ class SimHost:
 
         Raises:
             UsageError: There is no such drone, or it has an observer already.
-            MissingExtraError: Cameras are wanted, and the renderer is not installed.
-            UnsupportedError: Cameras are wanted, and the renderer does not work here.
+            MissingExtraError: Cameras are wanted, and what renders them is not installed.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
@@ -158,9 +157,8 @@ class SimHost:
     def _cameras(self, drone: int, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         if not models:
             return ()
-        from skyloop.sim.camera_pipeline import Camera, Shutter, require_renderer
+        from skyloop.sim.camera_pipeline import Camera, Shutter
 
-        require_renderer(self.options.renderer)
         cameras = []
         for n, model in enumerate(models):
             place = drone * len(models) + n
@@ -294,6 +292,6 @@ class _RealTimeStepper:
         from skyloop.sim.camera_pipeline import CameraPipeline
 
         options = self._host.options
-        pipeline = CameraPipeline(self._simulation.world, self._host.drones, options.renderer, options.quality)
+        pipeline = CameraPipeline(self._simulation.world, self._host.drones, options.quality)
         pipeline.start()
         return pipeline

@@ -29,8 +29,7 @@ class SimOptions:
         noise: Factor of the sensors' noise and biases.
         wind: Factor of the world's wind.
         battery: Charge at the start, 0 to 1.
-        renderer: ``planar`` or ``mujoco``.
-        quality: Of the planar renderer.
+        quality: Of the images: ``fast``, ``smooth`` or ``best``.
         native: Actions that the drone's driver supports natively.
         position: Whether the drone reports its position.
         velocity: Whether the drone reports its velocity; it flies by it all the same.
@@ -49,7 +48,6 @@ class SimOptions:
     noise: float = 1.0
     wind: float = 1.0
     battery: float = 1.0
-    renderer: str = "planar"
     quality: str = "smooth"
     native: frozenset[str] = EVERY_ACTION
     position: bool = True

@@ -78,7 +78,7 @@ from skyloop.sim.world_variation import place_varied
 from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
 
 _NEAREST_M = 0.01  # of two way points
-_WALL_GAP_M = 0.004  # posters and markers hang this far off their wall, so that no renderer has to choose
+_WALL_GAP_M = 0.004  # posters and markers hang this far off their wall, so that the renderer need not choose
 
 N = TypeVar("N", bound=Named)
 T = TypeVar("T")

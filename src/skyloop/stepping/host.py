@@ -80,8 +80,7 @@ class _ManualStepper:
     def _make_pipeline(self) -> SteppedCameraPipeline:
         from skyloop.sim.camera_pipeline import SteppedCameraPipeline
 
-        options = self._host.options
         self._pipeline = SteppedCameraPipeline(
-            self._host.simulation.world, self._host.drones, options.renderer, options.quality
+            self._host.simulation.world, self._host.drones, self._host.options.quality
         )
         return self._pipeline

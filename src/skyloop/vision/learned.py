@@ -5,7 +5,6 @@ ViTTrack (``cv2.TrackerVit``) is one ONNX file, NanoTrack (``cv2.TrackerNano``) 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,6 @@ from skyloop.errors import FileFormatError, UnsupportedError, UsageError
 from skyloop.vision import onnx
 from skyloop.vision.opencv import opencv
 from skyloop.vision.tracking import Box, Image, Tracker, TrackResult
-
-
-def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
-    """Return OpenCV's tracker of a name with its weights: one file of ViTTrack, two of NanoTrack."""
-    settings = getattr(cv, f"{name}_Params")()
-    if len(files) == 1:
-        (settings.net,) = files
-    else:
-        settings.backbone, settings.neckhead = files
-    return getattr(cv, f"{name}_create")(settings)
 
 
 class LearnedTracker(Tracker):
@@ -58,7 +47,7 @@ class LearnedTracker(Tracker):
         self._given = ", ".join(files)
         onnx.try_alone(*files, tracker=name)
         try:
-            self._tracker: Any = load_tracker(self._cv, name, files)
+            self._tracker: Any = onnx.load_tracker(self._cv, name, files)
         except self._cv.error as error:
             raise FileFormatError(
                 f"{self._given} can't be loaded as the weights of {name}: {_reason(error)}"

@@ -32,6 +32,7 @@ class ScriptedDrone:
         self.deaf = False  # it takes no command
         self.refuses_takeoff = False
         self.commands: list[AtCommand] = []  # obeyed
+        self.toggles = 0  # of its emergency
         self.stale = 0
         self.telemetry: list[Option] = []  # besides the demo option
         self.extra = State(0)  # bits that stay
@@ -69,6 +70,15 @@ class ScriptedDrone:
             self.commands.append(command)
             self._obey(command)
 
+    def land(self) -> None:
+        """By itself."""
+        self.state &= ~State.FLYING
+        self.control = ControlState.LANDED
+
+    def hear_bit(self) -> None:
+        """Another program's emergency bit stayed set, and is known."""
+        self._ref = Ref.EMERGENCY
+
     def navdata(self) -> bytes:
         """Its next datagram."""
         self.sequence += 1
@@ -103,6 +113,7 @@ class ScriptedDrone:
     def _refer(self, bits: Ref) -> None:
         if bits & ~self._ref & Ref.EMERGENCY:
             self.state ^= State.EMERGENCY
+            self.toggles += 1
         self._ref = bits
         if self.state & State.EMERGENCY or not bits & Ref.TAKEOFF:
             self.state &= ~State.FLYING
@@ -125,7 +136,10 @@ class ScriptedDrone:
 
 
 class Rig:
-    """A session, its drone and the time. ``lost`` says of each datagram, either way, whether it gets lost."""
+    """A session, its drone and the time. ``lost`` says of each datagram, either way, whether it gets lost.
+
+    ``late``: how late it comes [s], given whether it goes up.
+    """
 
     def __init__(self, options: ArdroneOptions | None = None, drone: ScriptedDrone | None = None) -> None:
         self.clock = ManualClock(100 * NS_PER_S)
@@ -135,8 +149,11 @@ class Rig:
         self.on = True  # the drone is there
         self.port_open = True  # its control port
         self.lost: Callable[[], bool] = lambda: False
+        self.late: Callable[[bool], float] = lambda _up: 0.0
+        self._under_way: list[tuple[int, bool, bytes]] = []  # when it comes, whether it goes up, and what
         self.started = False  # it was asked for navdata
         self.sent: list[bytes] = []
+        self.navdata_steps = NAVDATA_STEPS
         self._steps = 0
         self._dump = 0
 
@@ -166,13 +183,31 @@ class Rig:
         if now_ns >= session.due_ns:
             datagram = session.poll(now_ns)
             self.sent.append(datagram)
-            if self.on and not self.lost():
-                self.drone.take(datagram)
+            self._send(datagram, up=True)
+        self._deliver(up=True)
         self._serve_dump()
-        if self.on and self.started and self._steps % NAVDATA_STEPS == 0 and not self.lost():
-            session.on_navdata(self.drone.navdata(), now_ns)
+        if self.started and self._steps % self.navdata_steps == 0:
+            self._send(self.drone.navdata(), up=False)
+        self._deliver(up=False)
         for publish in session.drain():
             publish(self.sink)
+
+    def _send(self, datagram: bytes, *, up: bool) -> None:
+        now_ns = self.clock.now_ns
+        if self.on and not self.lost():
+            self._under_way.append((now_ns + nanoseconds(self.late(up)), up, datagram))
+
+    def _deliver(self, *, up: bool) -> None:
+        now_ns = self.clock.now_ns
+        come = sorted(
+            (each for each in self._under_way if each[0] <= now_ns and each[1] is up), key=lambda each: each[0]
+        )
+        for each in come[:1]:  # one at a step, as what was held back comes
+            self._under_way.remove(each)
+            if up:
+                self.drone.take(each[2])
+            else:
+                self.session.on_navdata(each[2], now_ns)
 
     def switch_off(self) -> None:
         self.on = self.started = False

@@ -11,7 +11,17 @@ from hypothesis import strategies as st
 from skyloop.drivers.ardrone.configuration import Exchange, Read, Write
 from skyloop.drivers.ardrone.options import ArdroneOptions
 from skyloop.errors import DriverError
-from skyloop.messages import Attitude, FlightState, Hover, Land, LinkState, Severity, Takeoff
+from skyloop.messages import (
+    Attitude,
+    EmergencyStop,
+    FlightState,
+    Hover,
+    Land,
+    LinkState,
+    ResetEmergency,
+    Severity,
+    Takeoff,
+)
 from skyloop.wire.ardrone.at import Ref
 from skyloop.wire.ardrone.navdata import State, encode
 from skyloop.wire.ardrone.options import Demo, Time
@@ -486,3 +496,138 @@ def test_a_landing_of_a_drone_that_is_not_heard_is_not_kept_for_ever() -> None:
     rig.run(5.0)
     assert rig.sent
     assert not [datagram for datagram in rig.sent if b"AT*REF" in datagram]
+
+
+# The emergency bit over a bad link -----------------------------------------------------------------------------------
+
+
+def flying() -> Rig:
+    rig = Rig()
+    rig.ready()
+    rig.navdata_steps = 7  # about 15 Hz, as a real one
+    rig.session.command(Takeoff(), rig.clock.now_ns)
+    rig.until(lambda: State.FLYING in rig.drone.state, 1.0)
+    rig.run(0.3)
+    return rig
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_an_emergency_is_toggled_once_however_bad_the_link_is(seed: int) -> None:
+    """Late, lost and out of order: a second toggle would have released the motors, or stopped them after a reset."""
+    rig, chance = flying(), random.Random(seed)
+    drone, setpoints = rig.drone, rig.session.setpoints
+    rig.lost = lambda: chance.random() < 0.3
+    rig.late = lambda _up: chance.choice((0.0, 0.02, 0.1, 0.3))
+    rig.session.command(EmergencyStop(), rig.clock.now_ns)
+    rig.until(lambda: setpoints.stop.shown, 8.0)
+    rig.run(3.0)
+    assert State.EMERGENCY in drone.state
+    assert drone.toggles == 1
+    rig.session.command(ResetEmergency(), rig.clock.now_ns)
+    rig.until(lambda: State.EMERGENCY not in drone.state, 3.0)
+    rig.run(3.0)
+    assert State.EMERGENCY not in drone.state
+    assert drone.toggles == 2
+    assert State.FLYING not in drone.state
+
+
+@pytest.mark.parametrize("stall_s", [0.5, 0.7, 0.9])
+@pytest.mark.parametrize("before_s", [0.0, 0.1, 0.3])
+def test_navdata_that_waited_are_no_news(stall_s: float, before_s: float) -> None:
+    """The driver's process stood still, or the network held them back: then they come in a row, the oldest first."""
+    rig = flying()
+    until_s = 0.0
+    rig.late = lambda up: 0.0 if up else max(0.0, until_s - rig.clock.now_ns / 1e9)
+    for action in (EmergencyStop(), ResetEmergency()):
+        before = rig.drone.toggles
+        until_s = rig.clock.now_ns / 1e9 + stall_s
+        rig.run(before_s)
+        rig.session.command(action, rig.clock.now_ns)
+        rig.run(3.0)
+        assert rig.drone.toggles == before + 1
+    assert State.EMERGENCY not in rig.drone.state
+
+
+def test_one_old_datagram_after_a_gap_does_not_release_what_is_stopped() -> None:
+    rig = flying()
+    old = rig.drone.navdata()
+    rig.session.command(EmergencyStop(), rig.clock.now_ns)
+    rig.until(lambda: rig.session.setpoints.stop.shown, 1.0)
+    rig.run(1.0)
+    rig.lost = lambda: True
+    rig.run(0.3)
+    rig.session.on_navdata(old, rig.clock.now_ns)
+    rig.run(0.1)
+    rig.lost = lambda: False
+    rig.run(2.0)
+    assert State.EMERGENCY in rig.drone.state
+    assert rig.drone.toggles == 1
+
+
+def test_a_stop_whose_toggle_the_drone_did_not_see_gets_another() -> None:
+    """It had heard the bit set last, from another program."""
+    rig = flying()
+    rig.drone.hear_bit()
+    rig.session.command(EmergencyStop(), rig.clock.now_ns)
+    assert rig.until(lambda: State.EMERGENCY in rig.drone.state, 2.0) > 0.4
+    rig.run(2.0)
+    assert rig.drone.toggles == 1
+
+
+def test_motors_that_another_program_releases_soon_are_stopped_again() -> None:
+    rig = flying()
+    rig.session.command(EmergencyStop(), rig.clock.now_ns)
+    rig.run(2.0)
+    rig.drone.state = rig.drone.state & ~State.EMERGENCY | State.FLYING
+    assert rig.until(lambda: State.EMERGENCY in rig.drone.state, 2.0) < 0.8
+
+
+# What stands does not take off by what it was ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stall_s", [0.5, 0.9, 4.0])
+def test_a_drone_that_landed_while_the_driver_stood_still_stays_there(stall_s: float) -> None:
+    """It hears nothing for 2 s and lands. Navdata of its flight wait for whoever wakes up, and told it to take off."""
+    rig = flying()
+    rig.session.command(Hover(), rig.clock.now_ns)
+    rig.run(0.2)
+    waiting = []
+    for step in range(round(stall_s * 15)):
+        rig.clock.advance(1 / 15)
+        if step == round(stall_s * 10):
+            rig.drone.land()
+        waiting.append(rig.drone.navdata())
+    before = len(rig.drone.commands)
+    for number, datagram in enumerate(waiting):
+        rig.session.on_navdata(datagram, rig.clock.advance(0.0005))
+        if number % 3 == 0:  # between two bursts
+            rig.session.command(Hover(), rig.clock.now_ns)
+            rig.drone.take(rig.session.poll(rig.clock.now_ns))
+        assert State.FLYING not in rig.drone.state
+    rig.run(2.0)
+    assert len(rig.drone.commands) > before + 20
+    assert State.FLYING not in rig.drone.state
+
+
+def test_a_drone_that_is_not_heard_for_a_moment_is_not_told_to_take_off() -> None:
+    rig = flying()
+    rig.lost = lambda: True
+    rig.run(0.5)
+    rig.drone.land()
+    rig.late = lambda up: 0.0 if up else 10.0
+    rig.lost = lambda: False
+    rig.run(0.4)
+    assert State.FLYING not in rig.drone.state
+    rig.late = lambda _up: 0.0
+    rig.run(0.5)
+    assert State.FLYING not in rig.drone.state
+
+
+def test_a_drone_that_flies_is_told_to_again_after_a_gap() -> None:
+    rig = flying()
+    rig.lost = lambda: True
+    rig.run(0.5)
+    rig.lost = lambda: False
+    rig.run(0.5)
+    references = [command for command in rig.drone.commands if command.name == "REF"]
+    assert Ref(int(references[-1].arguments[0])) & Ref.TAKEOFF

@@ -26,6 +26,7 @@ def understood(text: str) -> MavlinkOptions:
         ("mavlink://tcp:[::1]:5760", ConnectionKind.TCP, "::1", 5760),
         ("mavlink://tcp:192.168.4.1:5760", ConnectionKind.TCP, "192.168.4.1", 5760),
         ("mavlink://serial:/dev/ttyACM0:921600", ConnectionKind.SERIAL, "/dev/ttyACM0", 921600),
+        ("mavlink://serial:/dev/serial/by-id/usb-x@1:9600", ConnectionKind.SERIAL, "/dev/serial/by-id/usb-x@1", 9600),
         ("mavlink://serial:/dev/ttyACM0", ConnectionKind.SERIAL, "/dev/ttyACM0", 57600),
     ],
 )

@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.drivers.base import ExternalPose
+from skyloop.drivers.byte_stream import Rank
 from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import PoseMessage
-from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession
+from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession, rank_of
 from skyloop.drivers.mavlink.setpoints import STEP_NS, Goal
+from skyloop.drivers.mavlink.telemetry import VehicleState
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
 from skyloop.messages import (
@@ -709,6 +711,47 @@ def test_a_vehicle_that_no_longer_reads_is_not_up_before_it_has_answered() -> No
     assert bench.link() is LinkState.UP
 
 
+def test_a_vehicle_that_no_longer_reads_gets_no_set_points_before_it_has_answered() -> None:
+    """Nothing shows that the port, opened again, carries anything: what waits there would be followed late."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.session.broken(ConnectionError("the vehicle no longer reads what is sent"), bench.clock())
+    bench.go_on(0.5)
+    bench.said.clear()
+    for _ in range(10):
+        bench.apply(Velocity(forward=0.5))
+        bench.go_on(0.1)
+    assert not bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
+    bench.apply(Land())
+    bench.go_on(0.1)
+    assert (m.MAV_CMD_DO_SET_MODE, 1, 9, 0, 0) in bench.commands(), "what is repeated is sent all the same"
+    bench.answer(m.MAV_CMD_DO_SET_MODE)
+    bench.apply(Hover())
+    bench.go_on(0.1)
+    assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
+
+
+def test_an_emergency_stop_goes_before_all_else() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.session.command(EmergencyStop(), bench.clock())
+    assert [packet.rank for packet in bench.session.poll(bench.clock())].count(Rank.STOP) == 1
+    assert rank_of(m.MAVLink_command_long_message(1, 1, m.MAV_CMD_COMPONENT_ARM_DISARM, 0, *[0.0] * 7)) is Rank.COMMAND
+
+
+def test_a_take_off_is_decided_by_one_state_of_the_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, read = Bench(Vehicle(ARDUPILOT)).found(), list[int]()
+    state = MavlinkSession.vehicle_state
+
+    def count(session: MavlinkSession, now_ns: int) -> VehicleState | None:
+        read.append(now_ns)
+        return state(session, now_ns)
+
+    monkeypatch.setattr(MavlinkSession, "vehicle_state", count)
+    bench.session.command(Takeoff(), bench.clock())
+    assert len(read) == 1
+
+
 # Nothing comes, and what is sent may arrive --------------------------------------------------------------------------
 
 
@@ -789,6 +832,36 @@ def test_an_emergency_stop_outlives_what_is_known_of_the_vehicle() -> None:
     cuts = [each for each in bench.heard_of("COMMAND_LONG") if each.command == m.MAV_CMD_COMPONENT_ARM_DISARM]
     assert len(cuts) >= 5
     bench.go_on(10.0)
+    assert "stop_given_up" in [event.data.get("reason") for event in bench.sink.events]
+
+
+def cuts(bench: Bench) -> int:
+    return [each[:3] for each in bench.commands()].count((m.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, 21196.0))
+
+
+def test_an_emergency_stop_of_a_vehicle_that_was_never_heard_is_sent_and_kept_until_it_is_found() -> None:
+    """As when its proxy was restarted in flight."""
+    bench = Bench(Vehicle(ARDUPILOT, system=7), options("mavlink://udpout:10.0.0.5:14550?parameters=no&sysid=7"))
+    assert bench.apply(EmergencyStop()) == EmergencyStop()
+    bench.go_on(1.0, silent=True)
+    assert [each.target_system for each in bench.said if each.get_type() == "COMMAND_LONG"][:1] == [7]
+    assert cuts(bench) >= 9
+    bench.flying("GUIDED")
+    bench.go_on(0.5)
+    assert cuts(bench) >= 4
+    bench.vehicle.armed = False
+    bench.go_on(0.5)
+    assert bench.state() is FlightState.EMERGENCY
+
+
+def test_an_emergency_stop_of_a_vehicle_that_is_found_much_later_is_given_up() -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.apply(EmergencyStop())
+    bench.go_on(11.0, silent=True)
+    bench.said.clear()
+    bench.flying("GUIDED")
+    bench.go_on(1.0)
+    assert not cuts(bench)
     assert "stop_given_up" in [event.data.get("reason") for event in bench.sink.events]
 
 

@@ -854,6 +854,22 @@ def test_a_hover_after_that_landing_leaves_it_to_disarm_what_arms_then(autopilot
 
 
 @AUTOPILOTS
+def test_an_arming_that_shows_after_its_take_off_was_given_up_is_undone(autopilot: int) -> None:
+    """Its acknowledgement was lost, and a PX4's heartbeat comes once a second."""
+    bench = arming(autopilot)
+    while not any("does not answer" in text for text in bench.texts):
+        bench.go_on(0.02)
+        assert bench.clock() < 60_000_000_000
+    bench.commands()
+    bench.vehicle.armed = True
+    bench.go_on(1.0)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) in bench.commands()
+    bench.vehicle.armed = False
+    bench.go_on(0.5)
+    assert bench.state() is FlightState.LANDED
+
+
+@AUTOPILOTS
 def test_landing_before_an_arming_that_never_comes_ends_soon(autopilot: int) -> None:
     bench = arming(autopilot)
     bench.apply(Land())

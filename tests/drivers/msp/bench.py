@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
@@ -35,7 +36,8 @@ def options(text: str = "msp://tcp:127.0.0.1:5761") -> MspOptions:
 class Bench:
     """A drone on the ground, seen by cameras if ``poses``; ``cut``: nothing passes; ``deaf``: no reply passes.
 
-    ``world_speed``: of the simulated world, beside the clock of board and driver.
+    ``world_speed``: of the simulated world, beside the clock of board and driver. ``noise_m``: of the poses' height.
+    ``unanswered``: functions whose replies do not pass.
     """
 
     def __init__(
@@ -48,7 +50,10 @@ class Bench:
         self.sink = RecordingSink()
         self.poses = poses
         self.cut = self.deaf = False
+        self.unanswered: set[int] = set()
         self.world_speed = 1.0
+        self.noise_m = 0.0
+        self._random = random.Random(3)
         self._behind_s = 0.0
         self.sent: list[Frame] = []
         self._parser = Parser()
@@ -92,7 +97,9 @@ class Bench:
         now_ns = self.clock.now_ns
         if self.poses and self._ticks % POSE_TICKS == 0:
             truth = self.simulation.truth(0)
-            self.session.on_pose(ExternalPose(truth.position_m, truth.quaternion, now_ns), now_ns)
+            x, y, z = truth.position_m
+            seen = x, y, z + self._random.gauss(0.0, self.noise_m)
+            self.session.on_pose(ExternalPose(seen, truth.quaternion, now_ns), now_ns)
         if now_ns >= self.session.due_ns:
             self._exchange(self.session.poll(now_ns))
         for publish in self.session.drain():
@@ -104,7 +111,7 @@ class Bench:
         for frame in self._parser.feed(data):
             self.sent.append(frame)
             reply = self.board.answer(frame, self.clock.now_ns)
-            if reply is not None and not self.deaf:
+            if reply is not None and not self.deaf and frame.function not in self.unanswered:
                 self.session.receive(encode(reply), self.clock.now_ns)
 
     def _look(self) -> None:

@@ -10,15 +10,19 @@ import threading
 import tty
 from collections.abc import Iterator
 from contextlib import suppress
+from unittest.mock import create_autospec
 
 import pytest
 
+from skyloop.drivers.byte_stream import Rank, TcpStream
 from skyloop.drivers.msp import MspDriver
+from skyloop.drivers.msp.link import MspLink
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.msp import BetaflightFirmware
 from skyloop.errors import MissingExtraError
 from skyloop.messages import Attitude, EmergencyStop, Idle, LinkState, ResetEmergency
+from tests.drivers.msp.bench import Bench
 from tests.drivers.msp.rig import world
 
 
@@ -101,6 +105,21 @@ def test_a_serial_port_that_is_no_longer_read_stops_nobody(firmware: BetaflightF
     finally:
         driver.close()
         wire.cut()
+
+
+def test_a_stop_is_sent_as_one_whatever_waits_on_the_line() -> None:
+    """As a set-point it would be dropped where the line is behind."""
+    bench, ranks = Bench(), list[Rank]()
+    bench.take_off()
+    link = MspLink(bench.session, lambda _: None, lambda: bench.clock.now_ns)
+    line = create_autospec(TcpStream, instance=True)
+    line.write.side_effect = lambda _, rank: ranks.append(rank)
+    link._connection = line
+    bench.clock.advance(0.1)
+    link._send_due(bench.clock.now_ns)
+    link.command(EmergencyStop())
+    link.end()
+    assert ranks == [Rank.SETPOINT, Rank.STOP]
 
 
 def test_without_pyserial_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

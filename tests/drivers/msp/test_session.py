@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from contextlib import suppress
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import pytest
 
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
+from skyloop.drivers.msp.motion import Motion
 from skyloop.drivers.msp.setpoints import Phase, Report, SetpointController
 from skyloop.emulators.msp.board import bit
 from skyloop.emulators.msp.settings import BoardSettings
@@ -100,6 +102,60 @@ def test_a_descent_from_height_is_not_taken_for_the_ground() -> None:
     assert bench.board.armed
     assert bench.height_m > 1.0
     assert bench.climb_m_s == pytest.approx(-0.6, abs=0.1)
+
+
+NOISES = (0.05, 0.1, 0.2)  # of the climb [m/s]; that of a position of 1 cm is 0.056 m/s
+SEEDS = 20
+
+
+def descent(climb: float, noise: float, seed: int, seconds: float) -> tuple[SetpointController, list[float]]:
+    """One that is asked to sink at 0.4 m/s, and what it does; the throttle, as share of the one that carries it."""
+    setpoints, chance, now_ns, shares = SetpointController(), random.Random(seed), NS_PER_S, []
+    setpoints.on_report(Report(True), now_ns)
+    setpoints.adopt(0.3, now_ns)
+    setpoints.apply(Attitude(climb=-0.4), now_ns)
+    for tick in range(round(seconds / 0.02)):
+        now_ns += NS_PER_S // 50
+        true = climb if tick > 50 else -0.4
+        setpoints.on_motion(Motion(climb_m_s=true + chance.gauss(0.0, noise), height_m=0.5, precise=True))
+        setpoints.channels(now_ns)
+        if setpoints.phase is Phase.STANDING:
+            break
+        shares.append(setpoints.throttle / (setpoints.hover or 1.0))
+    return setpoints, shares
+
+
+@pytest.mark.parametrize("noise", [0.0, *NOISES])
+def test_a_touch_down_is_seen_through_the_noise_of_positions(noise: float) -> None:
+    """It stayed armed while its throttle fell: 0.6 s of noise below 0.1 m/s never came."""
+    for seed in range(SEEDS):
+        setpoints, shares = descent(0.0, noise, seed, 1.0 + 3.0)
+        assert setpoints.phase is Phase.STANDING, seed
+        assert setpoints.hover == pytest.approx(0.3, rel=0.2), "the throttle that carries it is not unlearnt"
+        assert len(shares) * 0.02 > 1.0 + 0.6
+
+
+@pytest.mark.parametrize("noise", [0.0, *NOISES])
+def test_a_slow_sink_is_not_taken_for_a_touch_down(noise: float) -> None:
+    for seed in range(SEEDS):
+        setpoints, shares = descent(-0.15, noise, seed, 30.0)
+        assert setpoints.phase is Phase.FLYING, seed
+        assert min(shares) > 0.7, "nothing is taken away"
+
+
+@pytest.mark.parametrize("climb", [-0.15, -0.4])
+@pytest.mark.parametrize("noise", NOISES)
+def test_a_landing_by_noisy_positions(noise: float, climb: float) -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.noise_m = noise / 5.6
+    bench.fly(climb=climb)
+    while bench.height_m > 0.06:
+        bench.run(0.1)
+        assert bench.board.armed
+        assert bench.height_m < 0.3 or bench.climb_m_s > climb - 0.15
+    bench.until(lambda: not bench.board.armed, 3.0)
+    assert bench.height_m < 0.06
 
 
 @pytest.mark.parametrize("world_speed", [1.0, 0.6, 0.45, 0.3])
@@ -361,6 +417,39 @@ def test_sticks_are_held_back_while_none_is_acknowledged() -> None:
     assert sent <= 21, "not the 25 of a healthy link: what waits would be obeyed late"
 
 
+@pytest.mark.parametrize("function", [Function.BOXNAMES, Function.MODE_RANGES, Function.RX_MAP])
+def test_what_is_found_again_in_flight_is_not_steered_by_guesses(function: Function) -> None:
+    """One lost answer made its arm switch or its order of sticks unknown: it was disarmed in the air."""
+    bench = Bench()
+    bench.take_off()
+    bench.fly(climb=0.8)
+    bench.run(2.0)
+    bench.fly()
+    bench.deaf = True
+    bench.until(lambda: bench.sink.link_state is LinkState.LOST, 2.0)
+    bench.deaf = False
+    bench.unanswered = {function}
+    for _ in range(45):
+        bench.run(0.1)
+        assert bench.board.armed
+    assert abs(bench.climb_m_s) < 0.3
+    assert len(bench.texts("setup_unread")) == 1
+    bench.unanswered = set()
+    bench.run(2.5)
+    assert bench.board.armed
+    assert len(bench.texts("firmware")) == 2, "they were read at last"
+
+
+def test_what_does_not_tell_the_order_of_its_sticks_is_asked_until_it_does() -> None:
+    bench = Bench()
+    bench.unanswered = {Function.RX_MAP}
+    bench.run(5.0)
+    assert LinkState.UP not in {state for state, _ in bench.sink.links}
+    assert not [frame for frame in bench.sent if frame.function == Function.SET_RAW_RC]
+    bench.unanswered = set()
+    bench.until(lambda: bench.sink.link_state is LinkState.UP, 5.0)
+
+
 # Stops ---------------------------------------------------------------------------------------------------------------
 
 
@@ -419,8 +508,17 @@ def test_what_does_not_disarm_by_a_stop_is_not_told_to_have_landed() -> None:
         told.add(setpoints.flight_state())
     assert [event.data["reason"] for event in setpoints.pop_events()] == ["stop_given_up"]
     assert told == {FlightState.UNKNOWN}
+    for _ in range(2):
+        with pytest.raises(DriverError, match="still armed"):
+            setpoints.apply(ResetEmergency(), now_ns)
+        assert setpoints.flight_state() is FlightState.UNKNOWN
+        assert "still armed" in setpoints.ask_takeoff(now_ns)
+        assert setpoints.channels(now_ns)[:4].count(1000) == 1, "no throttle"
+        setpoints.lost()
     setpoints.on_report(Report(False), now_ns)
     assert setpoints.flight_state() is FlightState.LANDED
+    setpoints.apply(ResetEmergency(), now_ns)
+    assert "still armed" not in setpoints.ask_takeoff(now_ns)
 
 
 def test_a_stop_pressed_in_a_long_loss_does_not_disarm_what_flies_when_the_link_is_back() -> None:
@@ -495,6 +593,22 @@ def test_a_climb_that_is_lost_before_the_lift_off_ends_the_take_off() -> None:
     bench.poses = False
     bench.until(lambda: bool(bench.texts("no_takeoff")), 2.0)
     assert "no longer measured" in bench.texts("no_takeoff")[0]
+
+
+def test_the_throttle_is_not_raised_while_the_flight_controller_is_not_heard() -> None:
+    """Poses still told its climb, and the take-off went on asking for one."""
+    bench = Bench()
+    bench.ready()
+    bench.fly(climb=0.5)
+    bench.until(lambda: bench.session.setpoints.phase is Phase.SPOOLING, 2.0)
+    bench.deaf = True
+    for _ in range(150):
+        with suppress(DriverError):
+            bench.session.command(Attitude(climb=0.5), bench.clock.now_ns)
+        bench.tick()
+    assert "nothing is received" in bench.texts("no_takeoff")[0]
+    assert not bench.board.armed
+    assert bench.height_m < 0.06
 
 
 def test_one_that_was_started_just_now_says_what_it_waits_for() -> None:

@@ -32,6 +32,7 @@ class Rig:
         self.sink = RecordingSink()
         self.on = True
         self.deaf = False  # it hears nothing, and is heard
+        self.mute = False  # it hears, and is not heard
         self.said: list[str] = []
         self._chance = random.Random(7)
         self._lost = lost
@@ -68,10 +69,10 @@ class Rig:
                     board.receive(datagram, PILOT)
         answers, self._told = self.bench.answers[self._told :], len(self.bench.answers)
         for text, _ in answers:
-            if self.on and not self._is_lost():
+            if self.on and not self.mute and not self._is_lost():
                 session.on_reply(text.encode(), self.now_ns)
         state = board.state_string() if board.client is not None and self._ticks % STATE_TICKS == 0 else None
-        if state is not None and self.on and not self._is_lost():
+        if state is not None and self.on and not self.mute and not self._is_lost():
             session.on_state(state, self.now_ns)
         for publish in session.drain():
             publish(self.sink)

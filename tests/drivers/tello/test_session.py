@@ -133,6 +133,22 @@ def test_a_take_off_that_a_landing_withdraws_before_it_shows_is_landed(after_s: 
     assert not [text for text in rig.said if text.startswith(("rc", "land", "takeoff"))]
 
 
+def test_a_drone_that_falls_over_in_its_take_off_is_not_started_again() -> None:
+    """It was, while somebody walked up to it: until 8 s had passed since the take-off was asked for."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.TAKING_OFF, 4.0)
+    rig.bench.logic.receive(b"emergency", PILOT)
+    rig.take_said()
+    rig.until(lambda: rig.state is FlightState.LANDED, 5.0)
+    rig.run(8.0)
+    assert "takeoff" not in rig.said
+    assert rig.reasons.count("no_takeoff") == 1
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+
+
 def test_a_drone_that_refuses_to_take_off_is_told() -> None:
     rig = Rig()
     rig.ready()
@@ -375,6 +391,67 @@ def test_a_landing_of_a_drone_that_is_not_heard_is_not_kept_for_ever() -> None:
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
     rig.run(0.5)
     assert "land" not in rig.said
+
+
+def unheard() -> Rig:
+    """It hears, and has not been heard for a while; whoever flew it is there and commands nothing."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.do(Velocity(forward=0.3))
+    rig.mute = True
+    rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
+    return rig
+
+
+def test_what_is_not_heard_any_more_lands_by_itself() -> None:
+    """``command`` and level sticks kept it in the air until its battery was empty."""
+    rig = unheard()
+    rig.run(3.1)
+    assert "rc 0 0 0 0" in rig.take_said(), "it does not fly on with the sticks of before"
+    for _ in range(50):
+        rig.session.command(Hover(), rig.now_ns, new=False)  # the library's own
+        rig.session.command(Velocity(forward=0.3), rig.now_ns)  # a program that goes on
+        rig.run(0.5)
+    assert not rig.take_said()
+    assert rig.bench.flight is FlightState.LANDED
+    rig.run(6.0)
+    assert set(rig.take_said()) == {"command"}, "it may have been switched off and on"
+    rig.mute = False
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
+    rig.run(3.0)
+    assert rig.bench.flight is FlightState.LANDED
+
+
+@pytest.mark.parametrize("asked_s", [1.0, 10.0])
+def test_what_a_person_asks_for_reaches_what_is_not_heard(asked_s: float) -> None:
+    rig = unheard()
+    rig.run(asked_s)
+    rig.take_said()
+    rig.do(Hover())
+    rig.run(0.2)
+    assert "rc 0 0 0 0" in rig.take_said()
+    rig.do(Land())
+    rig.until(lambda: rig.bench.flight is FlightState.LANDED, 8.0)
+    assert "land" in rig.said
+
+
+def test_a_stop_reaches_what_lands_by_itself() -> None:
+    rig = unheard()
+    rig.run(10.0)
+    rig.do(EmergencyStop())
+    rig.until(lambda: rig.bench.flight is FlightState.LANDED, 4.0)
+
+
+def test_what_is_heard_again_in_the_air_is_flown_on() -> None:
+    rig = unheard()
+    rig.run(8.0)
+    rig.mute = False
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
+    rig.do(Hover())
+    rig.run(20.0)
+    assert rig.state is FlightState.HOVERING
 
 
 def test_a_hover_that_nobody_decided_leaves_a_drone_alone_whose_stop_was_given_up() -> None:

@@ -175,7 +175,8 @@ class ArdroneSession(VehicleSession):
         demo = navdata.get(Demo)
         self._detect_break(state, now_ns)
         self._state, self._received_ns = state, now_ns
-        self.setpoints.on_condition(Condition(state, control_state(demo) if demo is not None else None), now_ns)
+        condition = Condition(state, control_state(demo) if demo is not None else None)
+        self.setpoints.on_condition(condition, now_ns, self.reception.passed_ns)
         if self.configurator.on_acknowledge(bool(state & State.COMMAND_ACK)):
             self.due_ns = 0
         for event in self._health.changes(state):

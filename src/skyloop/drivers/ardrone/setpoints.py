@@ -1,9 +1,11 @@
 """Set-points to ``REF`` and ``PCMD``: what is sent to the drone at each tick. Pure.
 
 ``REF`` has take-off, landing and emergency as bits that must be repeated until navdata shows the new state. The
-emergency bit toggles: it is set only while the drone is known to be in the other state, and cleared as soon as navdata
-shows the change. ``PCMD`` takes roll (positive to the right), pitch (negative nose down), climb (positive up) and yaw
-rate (positive clockwise), each from -1 to 1: shares of the limits that the drone is configured with.
+emergency bit toggles when it is set after it was clear. It is set once for what is asked for, and repeated as packets
+get lost, until navdata shows the change; again only after navdata that the drone made later showed no effect, as one
+toggle too many would undo the first. ``PCMD`` takes roll (positive to the right), pitch (negative nose down), climb
+(positive up) and yaw rate (positive clockwise), each from -1 to 1: shares of the limits that the drone is configured
+with.
 """
 
 from __future__ import annotations
@@ -112,7 +114,8 @@ def _within(value: float, limit: float) -> float:
 
 TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not started by then refuses to
 RISES_NS: Final = nanoseconds(3.0)  #: so long after a take-off was sent what rises is no other program's flight
-TOGGLE_NS: Final = nanoseconds(0.5)  #: the emergency bit is cleared and set again if it showed no effect for so long
+#: So long after the emergency bit changed, by the clocks of both ends, navdata show what that did.
+TOGGLE_NS: Final = nanoseconds(0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +134,10 @@ class Condition:
     def emergency(self) -> bool:
         """Whether the motors are cut."""
         return bool(self.state & State.EMERGENCY)
+
+
+#: After so long without navdata a drone may stand that flew: it lands by itself where it hears nothing for 2 s.
+SILENT_NS: Final = nanoseconds(0.25)
 
 
 class Decision(Enum):
@@ -158,8 +165,13 @@ class SetpointController:
         self._decided_ns = 0
         self._rises_until_ns = 0  # a take-off was sent, and may show until then
         self._releasing = False  # a reset was asked for, and does not show
-        self._edge_ns = 0  # when the emergency bit was set or cleared last for want of an effect
+        self._emergency = False  # whether the newest navdata showed one, even if it is lost since
+        self._bit = False  # whether the emergency bit was sent last
+        self._bit_due = False  # it is to be set, whatever navdata show
+        self._changed_ns = 0  # when it changed, was asked for, or an emergency was over
+        self._passed_ns = 0  # of the drone's time since then, up to the newest navdata
         self._received_ns = 0
+        self._late_ns = 0  # so old are navdata that waited, and come in a row after a gap
         self._warned_blind = False
         self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
         self._events: list[VehicleEvent] = []
@@ -211,7 +223,7 @@ class SetpointController:
         self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
         self._releasing = False
         if not self.stop.active:
-            self._edge_ns = now_ns
+            self._ask_bit(now_ns)
         self.stop.press(now_ns)
 
     def _forget_flight(self, given_up: VehicleEvent) -> None:
@@ -231,7 +243,8 @@ class SetpointController:
         self.stop.reset()
         self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
         if self.condition.emergency and not self._releasing:
-            self._releasing, self._edge_ns = True, now_ns
+            self._releasing = True
+            self._ask_bit(now_ns)
 
     def _take_off(self, now_ns: int) -> None:
         if self.condition is None:
@@ -263,8 +276,26 @@ class SetpointController:
 
     # What is received ---------------------------------------------------------------------------------------------
 
-    def on_condition(self, condition: Condition, now_ns: int) -> None:
-        """Handle the newest navdata."""
+    def on_condition(self, condition: Condition, now_ns: int, passed_ns: int | None = None) -> None:
+        """Handle the newest navdata.
+
+        Args:
+            condition: What they say.
+            now_ns: The present time.
+            passed_ns: The drone's own time since the navdata before; None: as much as here. What was on its way for
+                long, and comes at once, is no news.
+        """
+        gap_ns = now_ns - self._received_ns
+        passed_ns = gap_ns if passed_ns is None else passed_ns
+        self._passed_ns += passed_ns
+        in_a_row = 2 * gap_ns < passed_ns  # else nothing waits any more
+        if gap_ns >= SILENT_NS and self._received_ns:
+            self._late_ns = gap_ns - passed_ns
+        elif self._late_ns:
+            self._late_ns = max(0, self._late_ns + gap_ns - passed_ns) if in_a_row else 0
+        if self.condition is None or (self._emergency and not condition.emergency):
+            self._changed_ns, self._passed_ns = now_ns, 0  # navdata have to go on saying so: these may be old
+        self._emergency = condition.emergency
         if self.condition is not None and self.condition.flying and not condition.flying:
             self._stick = None
         self.condition, self._received_ns = condition, now_ns
@@ -307,14 +338,31 @@ class SetpointController:
         moving = motion(self._stick, self.reference_rad if self._stick is not None else None)
         return [moving] if bits is None else [("REF", (int(Ref.FIXED | bits),)), moving]
 
+    def _ask_bit(self, now_ns: int) -> None:
+        self._bit_due = not self._bit  # where it is set already, an effect is waited for
+        self._on_bit(now_ns)
+
+    def _on_bit(self, now_ns: int) -> None:
+        self._changed_ns = now_ns
+        self._passed_ns = self._received_ns - now_ns  # so old are the newest navdata, or what is on its way after them
+
     def _emergency_bits(self, now_ns: int) -> Ref | None:
         self.stop.step(None if self.condition is None else self.condition.emergency, now_ns)
-        if not (self._releasing or (self.stop.active and not self.stop.shown)):
+        wanted = self._releasing or (self.stop.active and not self.stop.shown)
+        waited_ns = min(self._received_ns - self._changed_ns, self._passed_ns)
+        without_effect = self.condition is not None and waited_ns >= TOGGLE_NS
+        before = self._bit
+        if not wanted:
+            self._bit = self._bit_due = False
+        elif before and without_effect:
+            self._bit, self._bit_due = False, True  # cleared for one tick, for the next edge
+        elif self._bit_due or without_effect:
+            self._bit, self._bit_due = True, False
+        if self._bit is not before:
+            self._on_bit(now_ns)
+        if not wanted:
             return None
-        if self.condition is None or self._received_ns - self._edge_ns < TOGGLE_NS:
-            return Ref.EMERGENCY
-        self._edge_ns = now_ns  # data came since, and show no effect: clear the bit once, for the next edge
-        return Ref(0)
+        return Ref.EMERGENCY if self._bit else Ref(0)
 
     def _flight_bits(self, now_ns: int) -> Ref | None:
         if self._decision is Decision.TAKE_OFF:
@@ -330,5 +378,7 @@ class SetpointController:
             return Ref(0)
         if self.condition is None:
             return None  # it goes on with whatever it does
+        if self.condition.flying and max(self._late_ns, now_ns - self._received_ns) >= SILENT_NS:
+            return None  # as one that stands would take off
         by_itself = self.condition.control is ControlState.LANDING and not self._landing_is_ours
         return Ref.TAKEOFF if self.condition.flying and not by_itself else Ref(0)

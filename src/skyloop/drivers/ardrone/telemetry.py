@@ -23,6 +23,8 @@ from skyloop.wire.ardrone.options import LAYOUTS, Demo, PhysMeasures, RawMeasure
 
 # Datagrams as they come ----------------------------------------------------------------------------------------------
 
+#: Between two datagrams, as the drone makes them: few of them, or all.
+PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
 RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: after it a lower sequence is a new count, and not a late datagram
 _MICROSECOND_BITS: Final = 21
 _TIME_WRAP_S: Final = 1 << 11
@@ -37,6 +39,7 @@ class Reception:
 
     def __init__(self) -> None:
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late", "missed", "restarts", "unknown"), 0))
+        self.passed_ns = 0  #: the drone's own time between the two newest that were accepted, by their numbers
         self._sequence = 0
         self._accepted_ns = 0
         self._watch = RestartWatch()
@@ -48,9 +51,11 @@ class Reception:
         except DecodeError:
             self.counts["damaged"] += 1
             return None
+        before = self._sequence
         if not self._is_new(navdata.sequence, now_ns):
             self.counts["late"] += 1
             return None
+        self.passed_ns = max(0, navdata.sequence - before) * PERIODS_NS[State.DEMO in navdata.state]
         self.counts["received"] += 1
         self.counts["unknown"] += len(navdata.unknown)
         return navdata

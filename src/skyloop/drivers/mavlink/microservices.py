@@ -179,10 +179,13 @@ class CommandSender:
     """Sends commands and keeps their results.
 
     Level-triggered: a caller that wants an effect calls :meth:`request` again and again until it shows.
+
+    Args:
+        target: System and component, until the vehicle is found.
     """
 
-    def __init__(self) -> None:
-        self.target = (1, 1)  #: system and component
+    def __init__(self, target: tuple[int, int] = (1, 1)) -> None:
+        self.target = target  #: system and component
         self._out: list[Message] = []
         self._sent: dict[VehicleCommand, tuple[int, int]] = {}  # when last, and how often
         self._answers: dict[int, tuple[int, int]] = {}  # command: result, when

@@ -20,13 +20,13 @@ from skyloop.drivers.mavlink.microservices import (
 )
 from skyloop.drivers.mavlink.options import ConnectionKind, MavlinkOptions, Peer, limits_text, takeoff_height
 from skyloop.drivers.mavlink.parameters import ParameterExchange
-from skyloop.drivers.mavlink.setpoints import SetpointController
+from skyloop.drivers.mavlink.setpoints import CUT, SetpointController
 from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
 from skyloop.drivers.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, VehicleEvent, VehicleSession
 from skyloop.errors import DriverError
-from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Severity, Takeoff, Value
+from skyloop.messages import AnyAction, EmergencyStop, EventKind, FlightState, Idle, LinkState, Severity, Takeoff, Value
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
@@ -70,7 +70,8 @@ def rank_of(message: Message) -> Rank:
     """Return how important a message to the vehicle is on a slow line."""
     kind = message.get_type()
     if kind == "COMMAND_LONG" and message.command in _URGENT:
-        return Rank.COMMAND
+        stops = (message.command, (message.param1, message.param2)) == (CUT.number, CUT.arguments)
+        return Rank.STOP if stops else Rank.COMMAND
     if kind in _SETPOINTS:
         return Rank.SETPOINT
     return Rank.POSE if kind in _POSES else Rank.QUERY
@@ -98,7 +99,7 @@ class MavlinkSession(VehicleSession):
         self.codec = Codec(options.own_system, OWN_COMPONENT, key=options.key)
         self.telemetry = Telemetry()
         self.parameters = ParameterExchange()
-        self.commands = CommandSender()
+        self.commands = CommandSender((options.system or 1, options.component))
         self.clock = VehicleClock()
         self.autopilot: AutopilotProfile | None = None  #: None until it is recognised, and for one not known here
         self.setpoints: SetpointController | None = None  #: None until then, and for what can't be flown
@@ -161,13 +162,18 @@ class MavlinkSession(VehicleSession):
         Raises:
             DriverError: The vehicle can't be flown, can't do this now, or somebody else has it.
         """
+        if isinstance(action, EmergencyStop) and self._kind is None:  # found in flight, maybe, in a moment
+            self._stop.press(now_ns)
+            self.due_ns = now_ns
+            return action
         if self.setpoints is None:
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
             return action  # nothing comes of it; pilots on the ground send it all the time
-        if isinstance(action, Takeoff) and self._wakes_up(self.vehicle_state(now_ns), now_ns):
+        vehicle = self.vehicle_state(now_ns)
+        if isinstance(action, Takeoff) and self._wakes_up(vehicle, now_ns):
             raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))
-        applied = self.setpoints.apply(action, self.vehicle_state(now_ns), now_ns, alone=alone, new=new)
+        applied = self.setpoints.apply(action, vehicle, now_ns, alone=alone, new=new)
         self._keep(action, now_ns)
         due_ns = self.setpoints.due_ns(now_ns)
         self.due_ns = min(self.due_ns, now_ns if due_ns is None else max(now_ns, due_ns))
@@ -325,6 +331,9 @@ class MavlinkSession(VehicleSession):
             stops = self.setpoints.step_stop(None, now_ns)
             if stops or self.setpoints.step_blind(now_ns):
                 out += self.commands.pop_messages()
+        elif self._stop.step(None, now_ns):
+            self.commands.request(CUT, now_ns, 0.0)
+            out += self.commands.pop_messages()
         packets += [
             Packet(self._encoded(message), peer, rank_of(message)) for message in out if self._axes.sent(message)
         ]
@@ -348,6 +357,8 @@ class MavlinkSession(VehicleSession):
         messages = (
             self.setpoints.messages(vehicle, now_ns) if self.setpoints is not None and vehicle is not None else []
         )
+        if not self._heard_by_it:
+            messages = []  # they would wait somewhere, and be followed when somebody reads again
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 
     def _heartbeats(self, peer: Peer, now_ns: int) -> list[Packet]:

@@ -103,6 +103,7 @@ class SetpointController:
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
         self._stepped_ns = 0  # when what is wanted now had its last step; 0: it has not had one
         self._arms_until_ns: int | None = None  # a take-off that a landing broke off may arm it until then
+        self._disarms_until_ns = 0  # a take-off that was given up may arm it until then, which is undone
         self._blind_until_ns = 0
         self._events: list[VehicleEvent] = []
 
@@ -322,6 +323,8 @@ class SetpointController:
             return []
         if self.goal is Goal.TAKE_OFF:
             return self._step_takeoff(vehicle, now_ns)
+        if self.goal is Goal.NOTHING and vehicle.airborne is False and now_ns < self._disarms_until_ns:
+            self.goal = Goal.LAND if vehicle.armed else Goal.NOTHING
         if vehicle.airborne is False and self.goal is not Goal.LAND:
             self._flight_is_over()
         elif self.ownership.observe(vehicle, now_ns):
@@ -388,9 +391,10 @@ class SetpointController:
             self._leave(vehicle)
         elif takeoff.given_up:
             self._notify(f"the vehicle did not take off: {takeoff.given_up}", reason="no_takeoff")
-            disarm = vehicle.armed and takeoff.arm_asked_ns is not None
             self._end()
-            self.goal = Goal.LAND if disarm else Goal.NOTHING
+            if takeoff.arm_asked_ns is not None:
+                self.goal = Goal.LAND if vehicle.armed else Goal.NOTHING
+                self._disarms_until_ns = takeoff.arm_asked_ns + ARMED_NS
         return messages
 
     def _step_following(self, vehicle: VehicleState, now_ns: int) -> list[Message]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 from skyloop.drivers.msp.firmware import Setup
@@ -28,6 +29,7 @@ class Identification:
 
     def __init__(self, questions: Questions, done: Callable[[Setup], None]) -> None:
         self.setup = Setup()
+        self.missing: list[str] = []  #: what must be known to send it any sticks, and could not be read
         self._questions = questions
         self._done = done
         for function, handler in (
@@ -57,11 +59,14 @@ class Identification:
     def ask_settings(self) -> None:
         """Go on with the settings, once it is known who it is."""
         ask = self._questions.ask
+        for what, function, handler in (
+            ("numbers of its modes", Function.BOXIDS, self._on_box_numbers),
+            ("names of its modes", Function.BOXNAMES, self._on_box_names),
+            ("switches of its modes", Function.MODE_RANGES, self._on_ranges),
+            ("order of its sticks", Function.RX_MAP, self._on_sticks),
+        ):
+            ask(function, _reading(handler, partial(self.missing.append, what)))
         for function, handler in (
-            (Function.BOXIDS, self._on_box_numbers),
-            (Function.BOXNAMES, self._on_box_names),
-            (Function.MODE_RANGES, self._on_ranges),
-            (Function.RX_MAP, self._on_sticks),
             (Function.RX_CONFIG, self._on_rx),
             (Function.FAILSAFE_CONFIG, self._on_failsafe),
             (Function.RC_TUNING, self._on_tuning),
@@ -125,12 +130,16 @@ class Identification:
         self._done(self.setup)
 
 
-def _reading(handler: Callable[[bytes], None]) -> Callable[[bytes | None], None]:
-    """Return a handler to which what is not known, or can't be read, makes no difference."""
+def _reading(
+    handler: Callable[[bytes], None], otherwise: Callable[[], None] = lambda: None
+) -> Callable[[bytes | None], None]:
+    """Return a handler that calls ``otherwise`` for what is not known, or can't be read."""
 
     def read(payload: bytes | None) -> None:
         if payload is not None:
             with suppress(DecodeError):
                 handler(payload)
+                return
+        otherwise()
 
     return read

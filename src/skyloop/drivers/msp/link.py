@@ -68,7 +68,7 @@ class MspLink(ConnectionLink[MspSession, ByteStream]):
         if self._connection is None or self._broken or not data:
             return
         try:
-            self._connection.write(data)
+            self._connection.write(data, Rank.STOP if self.session.urgent else Rank.SETPOINT)
         except OSError as error:
             self._on_broken(error, now_ns)
 

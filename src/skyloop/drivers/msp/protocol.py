@@ -67,12 +67,14 @@ class MspSession(VehicleSession):
         self.reported = Reported()
         self.sticks_hz: float | None = None  #: acknowledged
         self.unknown = 0  #: frames that answer nothing
+        self.urgent = False  #: what was due last is an emergency stop
         self._parser = Parser()
         self._questions = Questions()
         self._identification: Identification | None = None
         self._telemetry: Telemetry | None = None
         self._known = False  # who it is was asked since it was found
         self._refused_variant = ""
+        self._unread = ""  # what it did not tell of its settings
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns
         self._sticks: deque[int] = deque()  # when those without an acknowledgement were sent
@@ -306,7 +308,7 @@ class MspSession(VehicleSession):
         return made
 
     def _due_sticks(self, now_ns: int) -> bytes:
-        urgent = self._step_stop(now_ns)
+        self.urgent = urgent = self._step_stop(now_ns)
         if self.setup is None or not (urgent or (self._may_steer and now_ns >= self._sticks_due_ns)):
             return b""
         while self._sticks and now_ns - self._sticks[0] >= STICKS_LOST_NS:
@@ -369,7 +371,17 @@ class MspSession(VehicleSession):
             self._set_link_state(LinkState.DEGRADED, text)
 
     def _on_setup(self, setup: Setup) -> None:
-        self.setup, self._known = setup, True
+        assert self._identification is not None
+        if self._identification.missing:  # its throttle or arm switch would be guessed: it is asked again
+            missing = ", ".join(self._identification.missing)
+            if missing != self._unread:
+                text = (
+                    f"the flight controller did not tell the {missing}: it is asked again, and not steered by guesses"
+                )
+                self._publish_event(message(text, "setup_unread", Severity.WARNING))
+            self._unread = missing
+            return
+        self.setup, self._known, self._unread = setup, True, ""
         self.reported.cells = setup.cells
         diagnostics = setup.diagnose(override=self.options.override)
         self.setpoints.set_up(setup, hindrances(diagnostics))

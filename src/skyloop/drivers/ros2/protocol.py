@@ -186,18 +186,19 @@ class RobotSession:
         """Repeat the velocity in force, and watch the link: to be called every :data:`PERIOD_S`."""
         now_ns = self._clock()
         blind = self._is_blind(now_ns)
+        since_ns = self._opened_ns if self._received_ns is None else self._received_ns
+        silent_s = seconds(now_ns - since_ns)
+        lost = silent_s > self._options.timeout_s
         with self._lock:
             if blind:
                 self._fields = {}
-                if self._velocity is not None and now_ns - self._commanded_ns > BLIND_NS:
-                    self._velocity = Velocity()  # nothing shows where it goes
+            if (blind or lost) and self._velocity is not None and now_ns - self._commanded_ns > BLIND_NS:
+                self._velocity = Velocity()  # nothing shows where it goes
             if self._velocity is not None:
                 self._robot.send(self._velocity)
             if self._pending is not None and now_ns - self._pending.since_ns > nanoseconds(ANSWER_S):
                 self._pending = None
-        since_ns = self._opened_ns if self._received_ns is None else self._received_ns
-        silent_s = seconds(now_ns - since_ns)
-        if silent_s > self._options.timeout_s:
+        if lost:
             self._lose(LinkState.LOST, silent_s, self._options.odom, self._options.image)
             return
         if blind and self._odometry_ns is not None:
@@ -234,8 +235,10 @@ class RobotSession:
             self._up = up
             self._robot.send(Velocity())
             return
-        if up and not new and self._refused:
-            raise DriverError(self._refused)
+        if up and not new:  # a take-off that was asked for once is called once, whatever became of it
+            if self._refused:
+                raise DriverError(self._refused)
+            return
         under_way = self._pending is not None and self._pending.state is state
         there = (self._state is FlightState.LANDED) is not up and self._state is not FlightState.UNKNOWN
         if self._up:

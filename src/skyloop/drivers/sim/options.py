@@ -3,17 +3,16 @@
 Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds of simulation a second (1); ``cameras``
 (``front,bottom``; ``fpv`` is a racer's, wide and tilted up; or ``none``); ``width``, ``height``, ``fps`` of all
 cameras; ``latency`` of all cameras [s]; ``noise`` a factor on every sensor's and camera's noise (1); ``wind`` a factor
-on the world's wind (1); ``battery`` charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar``
-or ``mujoco`` (``planar``); ``quality`` of the planar ones, ``fast``, ``smooth`` or ``best`` (``smooth``); ``native``
-the actions that the vehicle itself takes, the others being left to the proxy (all); ``position`` whether the vehicle
-knows its position, as with an indoor positioning system (1; ``none`` for one without); ``velocity`` whether it reports
-its velocity (1; ``none`` for one that does not); ``truth`` whether feedback carries the true state too (1); ``rate`` of
-feedback [1/s] (40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified,
-or that is modelled down to its rotors, ``racer``, ``iris`` or ``crazyflie`` (``quadrotor``); ``autopilot`` the real
-firmware that flies it, ``ardupilot``, ``betaflight`` or ``px4`` (none), on an ``iris``, or a ``racer`` for Betaflight,
-if no other is named; ``autopilot_folder`` where it keeps its settings (they last as long as the drone). With
-``autopilot`` all other options, and ``rate``, are those of the driver that speaks to the firmware, ``mavlink://`` or
-``msp://``.
+on the world's wind (1); ``battery`` charge at the start, 0 to 1 (1); ``quality`` of the cameras' images, ``fast``,
+``smooth`` or ``best`` (``smooth``); ``native`` the actions that the vehicle itself takes, the others being left to the
+proxy (all); ``position`` whether the vehicle knows its position, as with an indoor positioning system (1; ``none`` for
+one without); ``velocity`` whether it reports its velocity (1; ``none`` for one that does not); ``truth`` whether
+feedback carries the true state too (1); ``rate`` of feedback [1/s] (40); ``vehicle`` whose response it has,
+``quadrotor`` or ``ardrone``, as identified, or that is modelled down to its rotors, ``racer``, ``iris`` or
+``crazyflie`` (``quadrotor``); ``autopilot`` the real firmware that flies it, ``ardupilot``, ``betaflight`` or ``px4``
+(none), on an ``iris``, or a ``racer`` for Betaflight, if no other is named; ``autopilot_folder`` where it keeps its
+settings (they last as long as the drone). With ``autopilot`` all other options, and ``rate``, are those of the driver
+that speaks to the firmware, ``mavlink://`` or ``msp://``.
 """
 
 from __future__ import annotations
@@ -33,11 +32,10 @@ from skyloop.sim.vehicles import VEHICLES
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA, FPV_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
-RENDERERS: Final = ("planar", "mujoco")
 ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
 KNOWN: Final = {
     *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),
-    *("renderer", "quality", "native", "position", "velocity", "truth", "rate", "vehicle"),
+    *("quality", "native", "position", "velocity", "truth", "rate", "vehicle"),
     *("autopilot", "autopilot_folder"),
 }
 AUTOPILOT_VEHICLES: Final = {
@@ -66,9 +64,6 @@ def options_of(uri: VehicleUri) -> SimOptions:
     quality = options.get("quality", "smooth")
     if quality not in QUALITIES:
         raise UnknownNameError("quality of pictures", quality, QUALITIES)
-    renderer = options.get("renderer", "planar")
-    if renderer not in RENDERERS:
-        raise UnknownNameError("renderer", renderer, RENDERERS)
     vehicle = options.get("vehicle", "quadrotor" if autopilot is None else AUTOPILOT_VEHICLES[autopilot])
     if vehicle not in VEHICLES:
         raise UnknownNameError("simulated vehicle", vehicle, VEHICLES)
@@ -86,7 +81,6 @@ def options_of(uri: VehicleUri) -> SimOptions:
         noise=noise,
         wind=uri.number("wind", 1.0, minimum=0.0, maximum=20.0),
         battery=uri.number("battery", 1.0, minimum=0.001, maximum=1.0),
-        renderer=renderer,
         quality=quality,
         native=_native(options.get("native")),
         position=options.get("position") != "none" and uri.flag("position", default=True),

@@ -11,9 +11,17 @@ from skyloop.clock import nanoseconds
 from skyloop.drivers.tello.options import TelloOptions
 from skyloop.drivers.tello.setpoints import SetpointController
 from skyloop.drivers.tello.telemetry import Health, feedback_of, native_of
-from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, RestartWatch, VehicleEvent, VehicleSession, message
+from skyloop.drivers.vehicle_session import (
+    KEPT_NS,
+    Arrival,
+    LinkTimeouts,
+    RestartWatch,
+    VehicleEvent,
+    VehicleSession,
+    message,
+)
 from skyloop.errors import DecodeError
-from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
+from skyloop.messages import AnyAction, EmergencyStop, Hover, LinkState, Severity, Value
 from skyloop.messages.checkup import Diagnostic
 from skyloop.wire.tello.commands import ENTER, Sdk, decoded, ports
 from skyloop.wire.tello.replies import Shape, answers, is_error, shape_of
@@ -136,6 +144,7 @@ LOST_NS: Final = nanoseconds(1.5)
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
 ENTER_NS: Final = nanoseconds(0.5)  #: between two ``command`` while no state comes
 ALIVE_NS: Final = nanoseconds(4.0)  #: between questions that keep the drone from landing by itself after 15 s
+ALONE_NS: Final = nanoseconds(30.0)  #: without any command it has landed by then: it begins to after 15 s
 DEAF: Final = 2  #: questions in a row without an answer: our commands are not received
 VIDEO_NS: Final = nanoseconds(2.0)  #: without video that can be shown for so long it is asked for
 ALIVE: Final = "wifi?"
@@ -179,6 +188,7 @@ class TelloSession(VehicleSession):
         self._video_ns = video_ns
         self._health = Health()
         self._entered_ns = now_ns - ENTER_NS
+        self._lost_ns = self._sent_ns = now_ns  # when it was lost, or a hover asked for since; when anything was sent
         self._alive_ns = now_ns
         self._asked_video_ns = 0
         self._asking_version = False
@@ -208,6 +218,8 @@ class TelloSession(VehicleSession):
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns, new=new)
         self._keep(action, now_ns)
+        if new and isinstance(action, Hover):
+            self._lost_ns = now_ns
         if isinstance(action, EmergencyStop):
             self._flips.clear()
             self.due_ns = now_ns
@@ -310,7 +322,8 @@ class TelloSession(VehicleSession):
         self._check_silence(now_ns)
         self.due_ns = now_ns + TICK_NS
         texts = []
-        if self._received_ns is None and now_ns - self._entered_ns >= ENTER_NS:
+        alone = self._lands_by_itself(now_ns)
+        if self._received_ns is None and not alone and now_ns - self._entered_ns >= ENTER_NS:
             self._entered_ns = now_ns
             texts.append(ENTER)
             if self.options.own_ports:
@@ -319,7 +332,7 @@ class TelloSession(VehicleSession):
         for motion in [*self.setpoints.motions(now_ns), *flips]:
             self.conversation.moved(motion, now_ns)
             texts.append(motion)
-        stick = self.setpoints.stick()
+        stick = None if alone else self.setpoints.stick()
         if stick is not None and (now_ns - self._rc_ns >= HURRY_NS):
             self._rc_ns = now_ns
             texts.append(stick.text)
@@ -327,7 +340,17 @@ class TelloSession(VehicleSession):
             self._keep_alive(now_ns)
             self._keep_video(now_ns)
             texts += self.conversation.messages(now_ns)
+        if texts:
+            self._sent_ns = now_ns
         return [text.encode("ascii") for text in texts]
+
+    def _lands_by_itself(self, now_ns: int) -> bool:
+        """Return whether only landings and stops are sent, as all else would keep what is not heard in the air."""
+        if not self.setpoints.flies_unheard or now_ns - self._lost_ns < KEPT_NS:
+            return False
+        if now_ns - self._sent_ns >= ALONE_NS:
+            self.setpoints.forget_flight()
+        return self.setpoints.flies_unheard
 
     def _keep_alive(self, now_ns: int) -> None:
         """Ask something now and then: it keeps the drone awake, and shows whether our commands are received."""
@@ -375,7 +398,7 @@ class TelloSession(VehicleSession):
     # Losing and finding ----------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        self._received_ns = None
+        self._received_ns, self._lost_ns = None, now_ns
         self._watch.forget()
         self.ready = self._asking_version = False
         self.conversation.abandon()

@@ -129,6 +129,11 @@ class SetpointController:
         """Changes when something else is to be sent."""
         return self._decision, self._stick, self.stop.active
 
+    @property
+    def flies_unheard(self) -> bool:
+        """Whether it flew when it was heard last, and may still."""
+        return not self.receiving and self._was_in_air
+
     def flight_state(self) -> FlightState:
         """Return the flight state for feedback."""
         if self.stop.shown:
@@ -232,13 +237,21 @@ class SetpointController:
         self._steering, self.left_alone = False, True
         return True
 
+    def forget_flight(self) -> None:
+        """Take it for landed: it was not heard, and sent nothing, for as long as it takes it to land by itself."""
+        self._was_in_air = self._steering = False
+
     # What is received ---------------------------------------------------------------------------------------------
 
     def on_state(self, now_ns: int) -> None:
         """Handle that the watch has seen a new state."""
-        phase = self.watch.phase
+        phase, rose = self.watch.phase, self._was_in_air and self._decision is Decision.TAKE_OFF
         self.receiving, self._state_ns = True, now_ns
         self._was_in_air = phase.airborne
+        if rose and phase is FlightState.LANDED:  # it fell over, or was stopped: a take-off begins once
+            self._decide(Decision.STAY, now_ns)
+            text = "the drone began to take off, and its motors stopped: it is not started again"
+            self._events.append(message(text, "no_takeoff", Severity.WARNING))
         shown = {Decision.TAKE_OFF: FlightState.HOVERING, Decision.LAND: FlightState.LANDED}.get(self._decision)
         if phase is shown and not (self._decision is Decision.LAND and now_ns < self._rises_until_ns):
             self._decide(Decision.STAY, now_ns)

@@ -1,14 +1,12 @@
-"""The interface between a simulation and its renderers."""
+"""What the renderer draws, and what it returns."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.world import TargetState
 
 Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
@@ -18,7 +16,7 @@ Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
 class SceneState:
     """The poses of everything that moves at one time.
 
-    A renderer may keep what it computed from a state for as long as it is given the same object, so a state's arrays
+    The renderer may keep what it computed from a state for as long as it is given the same object, so a state's arrays
     must not be written to afterwards.
 
     Attributes:
@@ -32,25 +30,3 @@ class SceneState:
     drone_rotations: NDArray[np.float64]
     targets: tuple[TargetState, ...] = ()
     light: float = 1.0
-
-
-class Renderer(Protocol):
-    """Renders what an ideal sensor behind a camera's lens sees: with distortion, without noise, blur or vignetting.
-
-    Those are :class:`~skyloop.sim.render.effects.SensorEffects`. A renderer may keep buffers between calls: use one in
-    one thread at a time.
-    """
-
-    def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:
-        """Render an image.
-
-        Args:
-            state: The poses of everything that moves.
-            pose: Of the camera.
-            model: Of the camera.
-            out: Where to write the image; None creates an array.
-
-        Returns:
-            BGR, shape (model.height, model.width, 3), uint8.
-        """
-        ...

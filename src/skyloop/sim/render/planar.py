@@ -1,4 +1,4 @@
-"""The renderer that works everywhere: on one core, no display, no GPU, no system packages.
+"""The renderer of simulated cameras: on one core, no display, no GPU, no system packages.
 
 First it is found which quad each sample of the picture shows (``visibility``), then every pixel is coloured once
 (``shading``): hidden surfaces cost little. Where the samples of a pixel see different quads, all four are coloured and
@@ -22,7 +22,6 @@ import numpy as np
 from skyloop.errors import UsageError
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render.base import Image, SceneState
-from skyloop.sim.render.brightness import dimmed
 from skyloop.sim.render.compiled import COMPILER, CompiledPainter, Compiler
 from skyloop.sim.render.opencv import cv2
 from skyloop.sim.render.painter import Painter
@@ -53,10 +52,21 @@ def use_one_core() -> None:
     cv2.setNumThreads(1)
 
 
-class PlanarRenderer:
-    """Renders a :class:`~skyloop.sim.render.scene.Scene`. Implements :class:`~skyloop.sim.render.base.Renderer`.
+def dimmed(picture: Image, light: float) -> Image:
+    """Multiply all values of an image by a factor of at least 0, in place, rounded, and return it.
 
-    It holds buffers, so it is for one thread at a time; several renderers may share a scene.
+    By a table of 256 values, so that it is the same bit by bit on every machine.
+    """
+    table = np.clip(np.rint(np.arange(256) * light), 0, 255).astype(np.uint8)
+    np.copyto(picture, cv2.LUT(picture, table))
+    return picture
+
+
+class PlanarRenderer:
+    """Renders what an ideal sensor behind a camera's lens sees: with distortion, without noise, blur or vignetting.
+
+    Those are :class:`~skyloop.sim.render.effects.SensorEffects`. It holds buffers, so it is for one thread at a time;
+    several renderers may share a scene.
 
     Args:
         scene: What is rendered.
@@ -75,7 +85,16 @@ class PlanarRenderer:
         self._posed: tuple[SceneState, Posed] | None = None
 
     def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:
-        """Render an image; see :meth:`skyloop.sim.render.base.Renderer.render`.
+        """Render an image.
+
+        Args:
+            state: The poses of everything that moves.
+            pose: Of the camera.
+            model: Of the camera.
+            out: Where to write the image; None creates an array.
+
+        Returns:
+            BGR, shape (model.height, model.width, 3), uint8.
 
         Raises:
             UsageError: ``out`` or the state does not fit, or the model's distortion can't be inverted.

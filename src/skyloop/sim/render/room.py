@@ -23,16 +23,14 @@ SIDES = 6  #: quads of a box; in ``static_quads`` the shell comes first, then bo
 _LEAN = np.array([-0.16, 0.20])
 
 
-def static_quads(world: World, atlas: AtlasBuilder, *, painted_shadows: bool = True) -> Quads:
+def static_quads(world: World, atlas: AtlasBuilder) -> Quads:
     """Return all of a world that never moves.
 
     Args:
         world: The world.
         atlas: Gets the textures.
-        painted_shadows: Whether what stands on the floor has its soft shadow in the floor's texture; not for a renderer
-            that casts shadows itself.
     """
-    parts = [_shell(world, atlas, world.solids() if painted_shadows else ())]
+    parts = [_shell(world, atlas, world.solids())]
     parts += [_box(box, atlas) for box in world.solids()]
     for panel in world.panels:
         shapes = QuadBuilder()

@@ -1,0 +1,5 @@
+"""Skyloop's own ends, those of ``skyloop bench``; see :mod:`benchmarks.measuring.contract`."""
+
+from skyloop.bench import Application, Listening, Vehicle, proxy_name
+
+__all__ = ["Application", "Listening", "Vehicle", "proxy_name"]

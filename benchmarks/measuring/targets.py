@@ -1,0 +1,65 @@
+"""The targets of the delays, and whether a run held them."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from benchmarks.measuring.contenders import FLOOR, OURS
+from benchmarks.measuring.delays import Delays
+from benchmarks.measuring.schedule import COMMAND, FEEDBACK, LARGE, SMALL, VIDEO, Size
+from benchmarks.measuring.statistics import Summary
+
+#: Medians, Skyloop's to the floor's, at most; by size of the frames and channel.
+FLOOR_MEDIAN: Final = {(SMALL, COMMAND): 1.4, (SMALL, FEEDBACK): 1.4, (SMALL, VIDEO): 1.4, (LARGE, VIDEO): 1.1}
+#: 99th percentiles, Skyloop's to the floor's, at most.
+FLOOR_P99: Final = {(SMALL, COMMAND): 2.0, (SMALL, FEEDBACK): 2.0, (SMALL, VIDEO): 2.0, (LARGE, VIDEO): 2.0}
+#: Medians, rclpy's to Skyloop's, at least.
+ROS_MEDIAN: Final = {(SMALL, COMMAND): 5.0, (SMALL, FEEDBACK): 5.0, (SMALL, VIDEO): 8.0, (LARGE, VIDEO): 30.0}
+#: Medians, ZeroMQ's to Skyloop's, at least.
+ZEROMQ_MEDIAN: Final = {(SMALL, COMMAND): 1.0}
+
+
+class Verdict(NamedTuple):
+    """One target, and the figure that was measured."""
+
+    what: str
+    figure: float
+    limit: float
+    at_least: bool = False
+
+    @property
+    def held(self) -> bool:
+        """Whether the figure holds the target."""
+        return self.figure >= self.limit if self.at_least else self.figure <= self.limit
+
+
+def judge_delays(results: Delays) -> list[Verdict]:
+    """Return the verdicts on the targets of which this run has both figures."""
+
+    def pair(size: Size, channel: str, other: str) -> tuple[Summary, Summary] | None:
+        ours = results.summary(OURS.name, str(size), channel)
+        theirs = results.summary(other, str(size), channel)
+        return None if ours is None or theirs is None else (ours, theirs)
+
+    verdicts = []
+    for (size, channel), limit in FLOOR_MEDIAN.items():
+        if found := pair(size, channel, FLOOR.name):
+            figure = found[0].median_us / found[1].median_us
+            verdicts.append(Verdict(f"{_name(size, channel)}: median to the floor's", figure, limit))
+    for (size, channel), limit in FLOOR_P99.items():
+        if found := pair(size, channel, FLOOR.name):
+            figure = found[0].p99_us / found[1].p99_us
+            verdicts.append(Verdict(f"{_name(size, channel)}: 99th percentile to the floor's", figure, limit))
+    for peer, title, limits in (("ros2", "rclpy", ROS_MEDIAN), ("zeromq", "ZeroMQ", ZEROMQ_MEDIAN)):
+        for (size, channel), limit in limits.items():
+            if found := pair(size, channel, peer):
+                figure, what = (
+                    found[1].median_us / found[0].median_us,
+                    f"{_name(size, channel)}: {title}'s median to ours",
+                )
+                verdicts.append(Verdict(what, figure, limit, at_least=True))
+    return verdicts
+
+
+def _name(size: Size, channel: str) -> str:
+    return f"{channel} {size}" if channel == VIDEO else channel
