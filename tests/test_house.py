@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 from skyloop.client import Drone, Swarm
@@ -31,6 +32,8 @@ def _is_own(attribute: ast.Attribute) -> bool:
 
 def private_uses(source: str, names: set[str]) -> list[str]:
     """Uses of these names on other objects, and on ``self`` in classes derived from a drone or a swarm."""
+    if not re.search(rf"(?<!\bself)\.({'|'.join(names)})\b|\bclass .*\b(Drone|Swarm)\b", source):
+        return []  # most modules need no parsing
     tree = ast.parse(source)
     kinds = {kind.__name__ for kind in KINDS}
     heirs = [
