@@ -29,6 +29,7 @@ from skyloop.client.connect import Target
 from skyloop.client.statistics import distribution
 from skyloop.control import Controller
 from skyloop.errors import SkyloopError
+from skyloop.extend import Known
 from skyloop.messages import Applied, Event, EventKind, Failsafe, Feedback
 
 LAND_AFTER_S: Final = 5.0  #: as is usual of ``failsafe.land_after_s``
@@ -109,7 +110,7 @@ def fly(*targets: Target, seconds: float, land_after_s: float = LAND_AFTER_S) ->
     """
     with swarm(*targets, access="observe") as watchers:
         # Over each proxy's name, so that the watcher and the pilot of an address share its private proxy.
-        reach = {name: drone._core.reach or drone.name for name, drone in watchers.items()}
+        reach = {name: Known(drone).reach or drone.name for name, drone in watchers.items()}
         pilots = swarm(reach, on_error="raise", on_exit="land")
         try:
             pilots.each(lambda drone: drone.config.__setitem__("failsafe.land_after_s", land_after_s), "configuring")

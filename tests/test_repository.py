@@ -126,6 +126,7 @@ def test_what_is_measured_of_a_module(gauge: ModuleType) -> None:
     assert found.imports == {"p", "p.a", "p.b", "p.c", "p.d"}
     assert found.chained == {"p", "p.a", "p.b"}
     assert gauge.measure_file("p.e", MODULE, "client", known).core_uses == 0
+    assert gauge.measure_file("skyloop.extend", MODULE, "(top)", known).core_uses == 0
 
 
 @pytest.mark.parametrize(

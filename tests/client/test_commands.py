@@ -12,11 +12,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from skyloop import extend
 from skyloop.client import Authority, AuthorityStatus, Drone, command_schedule
 from skyloop.client.core import DroneCore
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
+    AnswerTakeover,
     AnyAction,
     Attitude,
     AuthorityGranted,
@@ -42,6 +44,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.messages.config import MAX_REASON
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.proxy.core.intents import TAKEOFF_NS
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
@@ -834,3 +837,14 @@ def test_emergency_stop_needs_no_authority(proxy: ScriptedProxy, drone: Drone) -
     assert proxy.commands == []
     assert drone.request_authority().state == "held"
     assert drone.reset_emergency()
+
+
+def test_an_answer_to_who_asks_for_the_authority_is_waited_for(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.answers[AnswerTakeover] = Done()
+    extend.commands(drone).answer(1, 7, False, "a" * 10_000, wait=True)
+    asked = proxy.requests[-1]
+    assert isinstance(asked, AnswerTakeover)
+    assert (asked.lease, asked.app_id, asked.grant, asked.reason) == (1, 7, False, "a" * MAX_REASON)
+    proxy.answers[AnswerTakeover] = Refused(Refusal.NO_AUTHORITY, "it is not held any more")
+    with pytest.raises(RefusedError, match="not held any more"):
+        extend.commands(drone).answer(1, 7, True, "", wait=True)

@@ -50,7 +50,7 @@ class Recorder:
     def _core(self) -> Self:
         return self
 
-    def let_go(self, reason: str) -> None:
+    def let_go(self, reason: str, *, land: bool) -> None:
         assert reason
         self.hovers += 1
 

@@ -17,6 +17,7 @@ import typer
 from skyloop.cli import wording
 from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
 from skyloop.errors import AuthorityError, LinkError, NoAnswerError, SkyloopError, UsageError
+from skyloop.extend import Known, let_go
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -212,8 +213,7 @@ def _lands_for_others(name: str) -> bool:
 
 def _stay(drone: Drone) -> None:
     """Hover, and begin no return any more."""
-    drone._core.commands.bar()
-    drone._core.let_go("its return was interrupted")
+    let_go(drone, "its return was interrupted", for_good=True)
 
 
 def _return(name: str, priority: int, height_m: float | None, flown: list[Drone], interrupted: threading.Event) -> str:
@@ -257,7 +257,7 @@ def _stop(name: str) -> str:
         while time.monotonic() < end_s:
             drone.emergency_stop()
             time.sleep(_REPEAT_S)
-            if core.state.newest is not None and core.state.newest.state is FlightState.EMERGENCY:
+            if (newest := Known(drone).newest) is not None and newest.state is FlightState.EMERGENCY:
                 return "motors off"
         if _on_the_ground(drone):
             return "motors off, on the ground"

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import SkyloopError
+from skyloop.extend import Known, let_go
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -77,8 +78,8 @@ class Flight:
                 left = None if seconds is None else max(0.0, deadline - time.monotonic())
                 summary = self._controller.run(seconds=left, until=lambda: reloader.waiting)
             except Exception as error:  # noqa: BLE001  the user's code may raise anything
-                self._cancel(self._drone._core.listeners)  # they would fly on
-                self._drone._core.let_go("the controller failed")
+                self._cancel(Known(self._drone).listeners)  # they would fly on
+                let_go(self._drone, "the controller failed")
                 self._report(what_failed(error))
                 self._report("the controller failed: hovering; save the file to continue, Ctrl-C lands")
                 if not self._await_mended(reloader, make, deadline):
@@ -100,15 +101,15 @@ class Flight:
 
     def _take(self, reloader: Reloader, make: Make) -> bool:
         """Put what was loaded in the place of the present controller, if it can be; whichever goes commands no more."""
-        found, core = reloader.take(), self._drone._core
-        older = list(core.listeners)
+        found, known = reloader.take(), Known(self._drone)
+        older = known.listeners
         try:
             if found is None or isinstance(found, SkyloopError):
                 raise found or SkyloopError("nothing was loaded")
             after = make(found)
             after.on_reload(self._controller)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
-            self._cancel([one for one in core.listeners if one not in older])
+            self._cancel([one for one in known.listeners if one not in older])
             self._report(what_failed(error))
             return False
         self._cancel(older)

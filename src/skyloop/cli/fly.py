@@ -17,6 +17,7 @@ from skyloop.cli.flight_progress import FlightProgress
 from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, OptionalNameArgument, join_network, one_drone
 from skyloop.cli.text import coloured
 from skyloop.errors import UsageError
+from skyloop.extend import end_flight
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -150,7 +151,7 @@ def run(
 def land(drone: Drone) -> None:
     """End the flight: land what is in the air and in our hands. Who interrupts that too leaves it to the proxy."""
     try:
-        problem = drone._core.end_flight(say)
+        problem = end_flight(drone, say)
     except KeyboardInterrupt:
         say("left in the air: its proxy lets it hover, then lands it")
         raise

@@ -14,6 +14,7 @@ from rich.text import Text
 from skyloop.cli.keyboard import KEY_MAP, Deflection, Hands, Keyboard, Order
 from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
 from skyloop.errors import AuthorityError, SkyloopError
+from skyloop.extend import Known, commands, let_go
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -124,19 +125,19 @@ class Teleop:
         if order == "held":
             return "Esc is held, which stops no motors: press it twice"
         if order == "centre":
-            drone._core.let_go("all keys are let go")
+            let_go(drone, "all keys are let go")
             return ""
         if order == "takeoff":
             drone.takeoff(wait=False)
         elif order == "land":
             drone.land(wait=False)
         elif order == "hover":
-            if drone.feedback().state.airborne or drone._core.commands.wants_flight:  # a take-off may not show yet
+            if drone.feedback().state.airborne or commands(drone).wants_flight:  # a take-off may not show yet
                 drone.hover()
         elif order == "take":
             drone.request_authority()
         elif order == "release":
-            drone._core.commands.release(wait=False)
+            commands(drone).release(wait=False)
         return order
 
     def _steer(self, sticks: Deflection) -> None:
@@ -162,4 +163,4 @@ class Teleop:
 def _page(drone: Drone) -> CockpitProcess:
     from skyloop.cockpit.child import CockpitProcess
 
-    return CockpitProcess(drone._core.reach, port=None)
+    return CockpitProcess(Known(drone).reach, port=None)

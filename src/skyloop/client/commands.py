@@ -343,16 +343,25 @@ class CommandSender:
     def _wait(self, ready: Callable[[], bool], timeout_s: float) -> bool:
         return self.notifier.wait_for(lambda: self._closed or ready(), timeout_s)
 
-    def answer(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
-        """Answer an application that asks for the authority. Does not wait; an answer that is too late changes nothing.
+    def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
+        """Answer an application that asks for the authority; an answer that is too late changes nothing.
 
         Args:
             lease: The lease that is asked for.
             app_id: Number of the application that asks.
             grant: Whether to hand it over.
             reason: Why not, for people; cut to the length that a message can hold.
+            wait: Wait until the proxy has it.
+
+        Raises:
+            RefusedError: With ``wait``, if the authority is not held any more.
+            LinkError: With ``wait``, if the proxy does not answer.
         """
-        self._connection.ask(AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON]), lambda _: None, ANSWER_S)
+        answer = AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON])
+        if not wait:
+            self._connection.ask(answer, lambda _: None, ANSWER_S)
+        elif isinstance(reply := self._connection.call(lambda: answer, ANSWER_S), Refused):
+            raise RefusedError(reply.message, code=reply.code.value)
 
     def release(self, *, wait: bool = True) -> None:
         """Release the authority, or leave the queue. Does nothing if it is neither held nor wanted.

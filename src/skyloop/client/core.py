@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Final, Literal, Protocol, TypedDict
+from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 
 from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
@@ -100,10 +100,30 @@ class DroneOptions(TypedDict, total=False):
     keep_warm: Callable[[bool], None] | None
 
 
+class StreamOptions(TypedDict, total=False):
+    """How H.264 is wanted; with none of these, as the vehicle itself encoded it."""
+
+    kbit_s: int | None  #: encoded by the proxy at this rate, once for all who ask for the same [kbit/s]
+    max_fps: float | None  #: most pictures a second; None: all
+    scale: float  #: factor for width and height, above 0 and up to 1
+    subscriber: str  #: encoded by the proxy for this subscriber alone, at the rate that the path to it carries
+
+
+class InboxOptions(TypedDict, total=False):
+    """What one thread waits for."""
+
+    feedback: bool  #: whether feedback is wanted; True if left out
+    frames: bool  #: whether frames are wanted; True if left out
+    camera: str | None  #: name of the camera; None: the vehicle's first
+    results: bool  #: whether results of processors are wanted
+    processors: Iterable[str] | None  #: names of the processors whose results are wanted; None: all
+    max_age_s: float | None  #: oldest age of a result that is accepted [s]; None: any
+
+
 class DroneCore:
     """The parts of one drone, wired, with its beginning and its end. May be used from any thread.
 
-    It is ``drone._core`` for Skyloop's other packages, and may change with any version.
+    It is the client's own: other packages use :mod:`skyloop.extend`.
     """
 
     def __init__(
@@ -284,13 +304,7 @@ class DroneCore:
 
         Nobody decided that, so a vehicle that others fly, that lands or that returns is left alone, here and by the
         proxy, and so is what the application itself has landed or stopped. A take-off that does not show is ended.
-
-        Args:
-            reason: Why, for the log.
-            land: Land, rather than hover.
-
-        Returns:
-            Whether something was sent.
+        With ``land`` it lands, rather than hovers. Returns whether something was sent.
         """
         commands, feedback, kind = self.commands, self.state.newest, type(self.commands.newest)
         if self.closed or kind in LANDING or (kind is Hover and not land):
@@ -571,34 +585,9 @@ class DroneCore:
         )
         return channel if request == channel.request else self.state.video(channel.camera, request)
 
-    def stream(
-        self,
-        camera: str | None = None,
-        *,
-        kbit_s: int | None = None,
-        max_fps: float | None = None,
-        scale: float = 1.0,
-        subscriber: str = "",
-    ) -> StreamChannel:
-        """Return the channel of a camera's H.264: with no other argument, as the vehicle itself encoded it.
-
-        Args:
-            camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Encoded by the proxy with this rate [kbit/s], once for all who ask for the same.
-            max_fps: Most pictures a second; None: all.
-            scale: Factor for width and height, above 0 and up to 1.
-            subscriber: Encoded by the proxy for this subscriber alone, with the rate that the path to it carries.
-
-        Raises:
-            UnknownNameError: If the vehicle has no camera of this name.
-            UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range.
-            ClosedError: If the drone was closed.
-        """
-        name = self.channel(camera).camera.name
-        return self.state.stream(
-            VideoRequest(name, encoding="h264", kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
-        )
+    def stream(self, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
+        """Return the channel of a camera's H.264; see :func:`skyloop.extend.stream_channel`."""
+        return self.state.stream(VideoRequest(self.channel(camera).camera.name, encoding="h264", **how))
 
     def result_channel(self, processor: str) -> ResultChannel:
         """Return the channel of a processor's results, whether or not such a processor runs.
@@ -620,17 +609,7 @@ class DroneCore:
         processors: Iterable[str] | None = None,
         max_age_s: float | None = None,
     ) -> Mailboxes:
-        """Return mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
-
-        Controllers run on them. They fill while they are open as a context manager.
-
-        Args:
-            feedback: Whether feedback is wanted.
-            frames: Whether frames are wanted.
-            camera: Name of the camera; None: the vehicle's first.
-            results: Whether results of processors are wanted.
-            processors: Names of the processors whose results are wanted; None: all.
-            max_age_s: Oldest age of a result that is accepted [s]; None: any.
+        """Return mailboxes of what is wanted; see :func:`skyloop.extend.inbox`.
 
         Raises:
             UsageError: If ``max_age_s`` or the name of a processor is unusable.
@@ -652,22 +631,7 @@ class DroneCore:
     def join_processor(
         self, name: str, *, code: str, camera: str | None = None, shared: bool = True, timeout_s: float = 5.0
     ) -> Membership:
-        """Become a worker of a processor, as ``skyloop process`` does. The membership ends with the drone.
-
-        Args:
-            name: Name of the processor.
-            code: Identifies the code that runs, the same for all workers of a name; at most 128 characters.
-            camera: Name of the camera; None: the vehicle's first.
-            shared: Each frame goes to one of the workers; if False, each worker gets all.
-            timeout_s: How long to wait for the proxy's answer [s].
-
-        Raises:
-            NameTakenError: If another application runs other code under this name.
-            RefusedError: If the proxy refuses for another reason.
-            NoAnswerError: If the proxy does not answer in time.
-            UsageError: If ``name`` or ``code`` is unusable, or from an inline callback.
-            UnknownNameError: If the vehicle has no camera of this name.
-        """
+        """Become a worker of a processor; see :func:`skyloop.extend.join_processor`."""
         self.check_may_wait()
         if not isinstance(code, str) or len(code) > MAX_CODE:
             raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")

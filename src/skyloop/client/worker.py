@@ -28,7 +28,7 @@ RENEW_S: Final = 0.25  #: how often the membership is renewed [s]; a worker coun
 
 
 class Membership:
-    """One worker of a processor; made by :meth:`skyloop.client.core.DroneCore.join_processor`.
+    """One worker of a processor; made by :func:`skyloop.extend.join_processor`.
 
     Ends with :meth:`close`, and with the drone. The proxy forgets a worker when its connection ends; after a
     reconnection it joins again by itself.

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.clock import Clock, monotonic_ns, seconds
 from skyloop.cockpit.broadcast import Wake, call_soon
+from skyloop.extend import stream_channel
 from skyloop.messages import CameraInfo, EncodedFrame
 
 if TYPE_CHECKING:
@@ -143,7 +144,8 @@ class EncodedFeed:
         """
         if self._channel is None:
             form = self.form
-            channel = self._drone._core.stream(
+            channel = stream_channel(
+                self._drone,
                 self.camera,
                 kbit_s=form.kbit_s,
                 max_fps=form.max_fps,

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Self
 
 from skyloop.client import AuthorityStatus, Drone
-from skyloop.client.commands import ANSWER_S
 from skyloop.client.completion import OUTDONE, OVERRULED
-from skyloop.client.core import DroneCore
 from skyloop.clock import monotonic_ns
-from skyloop.errors import LinkError, RefusedError
-from skyloop.messages import AnswerTakeover, AnyAction, FlightState, Idle, LinkState, Outcome, Refused
+from skyloop.errors import LinkError
+from skyloop.extend import Known, commands, let_go, open_unasked
+from skyloop.messages import AnyAction, FlightState, Idle, LinkState, Outcome
 from skyloop.transport.base import Dialer
 
 
@@ -34,22 +33,20 @@ class PilotConnection(Drone):
         Raises:
             SkyloopError: It can't be opened.
         """
-        core = DroneCore(dial, app=app, on_exit="hover")
-        core.open(timeout_s=timeout_s, acquire=False)
-        return cls(core)
+        return open_unasked(cls, dial, app=app, timeout_s=timeout_s, on_exit="hover")
 
     def set_flown_by_person(self) -> None:
         """Hold nothing on its own, only while the page is known to be there, as a person flies by it."""
-        self._core.commands.flown_by_person()
+        commands(self).flown_by_person()
 
     def present_until(self, until_ns: int) -> None:
         """Count the page as present until then, on this process's monotonic clock; afterwards this pilot is silent."""
-        self._core.commands.present_until(until_ns)
+        commands(self).present_until(until_ns)
 
     @property
     def is_silent(self) -> bool:
         """Whether the page was not known to be there for too long."""
-        return not self._core.commands.is_present(monotonic_ns())
+        return not commands(self).is_present(monotonic_ns())
 
     @property
     def is_linked(self) -> bool:
@@ -81,9 +78,7 @@ class PilotConnection(Drone):
             RefusedError: The authority is not held any more.
             LinkError: The proxy does not answer.
         """
-        reply = self._core.connection.call(lambda: AnswerTakeover(lease, app_id, grant, reason), ANSWER_S)
-        if isinstance(reply, Refused):
-            raise RefusedError(reply.message, code=reply.code.value)
+        commands(self).answer(lease, app_id, grant, reason, wait=True)
 
     @property
     def proxy_now_ns(self) -> int:
@@ -93,23 +88,23 @@ class PilotConnection(Drone):
     def command(self, action: AnyAction) -> bool:
         """Make ``action`` the newest set-point; see :meth:`Drone.command`."""
         sent = super().command(action)
-        self._newest = action, self._core.commands.intent
+        self._newest = action, commands(self).intent
         return sent
 
     def has_ended(self, action: AnyAction) -> bool:
         """Whether a failsafe, a lost link or a lost lease ended this action, and it could be sent again now."""
         newest, intent = self._newest
-        outcome = self._core.commands.outcome(intent) if newest is action else None
-        return outcome is not None and outcome.fate in OVERRULED and self._core.commands.may_ask
+        outcome = commands(self).outcome(intent) if newest is action else None
+        return outcome is not None and outcome.fate in OVERRULED and commands(self).may_ask
 
     @property
     def intent(self) -> int:
         """Number of the newest command."""
-        return self._core.commands.intent
+        return commands(self).intent
 
     def refusal(self, first: int) -> Outcome | None:
         """What the proxy refused, or ended, of the commands from this number on; None but for :meth:`has_ended`."""
-        told = self._core.commands.told
+        told = commands(self).told
         if told is None or told.reason is None or told.intent < first or told.fate in (*OUTDONE, *OVERRULED):
             return None
         return told
@@ -117,24 +112,13 @@ class PilotConnection(Drone):
     @property
     def is_told(self) -> bool:
         """Whether the proxy tells what becomes of the newest command: it has arrived there."""
-        newest, (_, intent) = self._state.newest, self._newest
+        newest, (_, intent) = Known(self).newest, self._newest
         outcome = None if newest is None else newest.outcome
         return outcome is not None and outcome.app_id == self.app_id and outcome.intent >= intent
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
-        """Hover, or land, because the cockpit finds that it has to: the only place where it does so by itself.
-
-        Nobody decided that, so it takes the vehicle from nobody who flies it by other means, and ends neither a landing
-        nor a failsafe. Never raises; if somebody else has the authority, or the link is lost, the proxy sees to it.
-
-        Args:
-            reason: Why, for the log.
-            land: Land, rather than hover.
-
-        Returns:
-            Whether something was sent.
-        """
-        return self._core.let_go(reason, land=land)
+        """Hover, or land, because the cockpit finds that it has to; see :func:`skyloop.extend.let_go`."""
+        return let_go(self, reason, land=land)
 
     @property
     def is_flying(self) -> bool:

@@ -10,6 +10,7 @@ from skyloop.clock import nanoseconds
 from skyloop.control.airframe import AirframeLaw
 from skyloop.control.controller import Controller
 from skyloop.errors import UnknownNameError, UsageError
+from skyloop.extend import let_go
 from skyloop.messages import Attitude, CameraInfo, EventKind, Feedback, Severity, Velocity
 from skyloop.messages.annotation import Shape
 
@@ -92,7 +93,7 @@ class Behaviour(Controller):
             if not self.blind:
                 self.blind = True
                 self.emit("no frames arrive: hovering", Severity.WARNING)
-            self.drone._core.let_go("no frames arrive")
+            let_go(self.drone, "no frames arrive")
 
     def on_frame(self, frame: Frame) -> None:
         """Search the frame, send the law's set-point, and draw what was found."""
@@ -127,7 +128,7 @@ class Behaviour(Controller):
             text = f"{problem}: hovering" if problem else "the vehicle's motion is known again: flying on"
             self.emit(text, Severity.WARNING if problem else Severity.INFO)
         if problem:
-            self.drone._core.let_go(problem)
+            let_go(self.drone, problem)
         else:
             self.steer(wanted)
 
@@ -151,7 +152,7 @@ class Behaviour(Controller):
         """
         self.done = True
         self.emit(text, severity)
-        self.drone._core.let_go(text)
+        let_go(self.drone, text)
         self._end()
 
     def emit(self, text: str, severity: Severity = Severity.INFO) -> None:

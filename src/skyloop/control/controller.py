@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.errors import AuthorityError, ClosedError, UsageError
+from skyloop.extend import Known, commands, inbox, let_go
 from skyloop.messages import EventKind, Failsafe, LinkState
 from skyloop.messages.command import SET_POINTS
 
@@ -162,7 +163,8 @@ class Controller:
         wants_frames = own.on_frame is not Controller.on_frame
         wants_results = own.on_result is not Controller.on_result
         wants_feedback = own.on_feedback is not Controller.on_feedback or not (wants_frames or wants_results)
-        inbox = self.drone._core.inbox(
+        mailboxes = inbox(
+            self.drone,
             feedback=wants_feedback,
             frames=wants_frames,
             camera=self.camera,
@@ -174,11 +176,11 @@ class Controller:
             self._stopped.clear()
         checks = self._checks = _Checks(self)
         try:
-            with inbox:
-                self._inbox = inbox
-                return _Run(self, inbox, self._stopped, checks).go(seconds, until)
+            with mailboxes:
+                self._inbox = mailboxes
+                return _Run(self, mailboxes, self._stopped, checks).go(seconds, until)
         except BaseException as error:
-            self.drone._core.let_go(f"{type(self).__name__} ended by {type(error).__name__}")
+            let_go(self.drone, f"{type(self).__name__} ended by {type(error).__name__}")
             raise
         finally:
             self._inbox = None
@@ -213,15 +215,14 @@ class _Checks:
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
-        core = controller.drone._core
-        self._state, self._commands = core.state, core.commands
-        self._first_intent = core.commands.intent
-        self._last_event = self._state.recent[-1] if self._state.recent else None
+        self.known, self._commands = Known(controller.drone), commands(controller.drone)
+        self._first_intent = self._commands.intent
+        self._last_event = next(reversed(controller.drone.recent_events()), None)
         self._flew = self._steered = False
 
     def look(self) -> None:
         """Note whether the vehicle is in the air, and is sent set-points; called all the time."""
-        newest = self._state.newest
+        newest = self.known.newest
         self._flew = self._flew or (newest is not None and newest.state.airborne)
         if not self._steered and self._commands.intent > self._first_intent:
             self._steered = isinstance(self._commands.newest, SET_POINTS)
@@ -253,10 +254,10 @@ class _Checks:
 
     def _events(self) -> list[Event]:
         """Return the events since the begin that concern this application."""
-        events = list(self._state.recent)
+        events = self._controller.drone.recent_events()
         if self._last_event in events:
             del events[: events.index(self._last_event) + 1]
-        return [event for event in events if event.app == self._controller.drone._core.app]
+        return [event for event in events if event.app == self.known.app]
 
 
 class _Run:
@@ -304,7 +305,7 @@ class _Run:
         self._checks.look()
         if self._stopped.is_set():
             return "stopped"
-        if self._drone._core.ending or self._ended():
+        if self._checks.known.is_ending or self._ended():
             return "closed"
         if deadline_ns is not None and self._inbox.clock() >= deadline_ns:
             return "time"
@@ -345,7 +346,7 @@ class _Run:
         try:
             callback(sample)
         except ClosedError:
-            if not self._drone._core.ending:
+            if not self._checks.known.is_ending:
                 raise
         except AuthorityError:
             status = self._drone.authority

@@ -8,6 +8,7 @@ from skyloop.control.behaviour import Behaviour
 from skyloop.control.landing_law import LandingLaw, LandingPhase
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.errors import UsageError
+from skyloop.extend import let_go
 from skyloop.messages import FlightState, Polyline, Severity, Text
 from skyloop.messages.annotation import Colour, Shape
 from skyloop.vision import MarkerDetector
@@ -122,6 +123,6 @@ class LandOnMarker(Behaviour):
         """Send velocities until the law is down; then let the vehicle's own landing stop the motors."""
         if self.phase is LandingPhase.DOWN:
             # Each step anew: a link that is down for a moment ends no landing.
-            self.drone._core.let_go("it is down on its marker", land=True)
+            let_go(self.drone, "it is down on its marker", land=True)
         else:
             super().steer(wanted)

@@ -16,6 +16,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import STALE_S
 from skyloop.control.behaviour import BLIND_S, Behaviour
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
+from skyloop.extend import let_go
 from skyloop.messages import Attitude, Feedback, Text, Velocity
 from skyloop.messages.annotation import Shape
 from skyloop.messages.rows import ACTIONS, STATE, set_point, state_row
@@ -300,7 +301,7 @@ class OnnxPolicy(Behaviour):
         if self._phase is PolicyPhase.FLYING:
             super().steer(wanted)
         else:
-            self.drone._core.let_go("the policy gives no action")
+            let_go(self.drone, "the policy gives no action")
 
     def _written(self, wanted: Velocity | Attitude) -> Text:
         names = ACTIONS[self.network.action]

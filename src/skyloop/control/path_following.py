@@ -18,6 +18,7 @@ from skyloop.control.path_law import PathLaw, PathSettings
 from skyloop.control.position import Fix, PositionSource, fix_of
 from skyloop.control.waypoint import Waypoint, lacking
 from skyloop.errors import UsageError
+from skyloop.extend import let_go
 from skyloop.messages import EventKind, Feedback, Severity, Vector
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ class _PathFlyer(Controller):
 
     def _finish(self) -> None:
         self.done = True
-        self.drone._core.let_go("the path is flown")
+        let_go(self.drone, "the path is flown")
         self._end()
 
     def _lose(self) -> None:
@@ -122,7 +123,7 @@ class _PathFlyer(Controller):
             self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is not known: hovering", Severity.WARNING)
         if self._law is not None:
             self._law.pause()
-        self.drone._core.let_go("the position is not known")
+        let_go(self.drone, "the position is not known")
 
 
 class FollowPath(_PathFlyer):

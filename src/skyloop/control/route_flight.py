@@ -16,6 +16,7 @@ from skyloop.control.route import Route
 from skyloop.control.route_check import RouteCheck, check_route, conditions_of
 from skyloop.control.route_law import PHOTO_S, Command, Effect, Progress, RouteLaw, RouteState, TakePhoto
 from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
+from skyloop.extend import ask, commands, let_go
 from skyloop.files import write
 from skyloop.messages import EventKind, Fate, Feedback, Land, Position, Severity
 from skyloop.vision.opencv import opencv
@@ -119,11 +120,9 @@ class FlyRoute(Controller):
             if isinstance(effect, Command):
                 self._leg = None
                 if isinstance(effect.action, Position):
-                    self._leg = self.drone._core.ask(effect.action)
+                    self._leg = ask(self.drone, effect.action)
                 else:  # it hovers or lands because of how the route goes, not of a person
-                    self.drone._core.let_go(
-                        f"the route is {self.law.state.value}", land=isinstance(effect.action, Land)
-                    )
+                    let_go(self.drone, f"the route is {self.law.state.value}", land=isinstance(effect.action, Land))
             elif isinstance(effect, TakePhoto):
                 threading.Thread(target=self._photograph, args=(effect,), name="skyloop-photo", daemon=True).start()
             else:
@@ -149,9 +148,9 @@ class FlyRoute(Controller):
 
     def _why_ended(self) -> str:
         """Return why the present leg is not flown any more, once; empty if it is."""
-        commands = self.drone._core.commands
-        outcome = None if self._leg is None else commands.outcome(self._leg)
-        if outcome is None or not outcome.failed or not commands.may_ask:
+        flown = commands(self.drone)
+        outcome = None if self._leg is None else flown.outcome(self._leg)
+        if outcome is None or not outcome.failed or not flown.may_ask:
             return ""
         self._leg = None
         if outcome.fate in (Fate.REPLACED, Fate.WITHDRAWN):

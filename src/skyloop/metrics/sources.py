@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from skyloop.clock import NS_PER_S
+from skyloop.extend import Known
 from skyloop.messages import Failsafe, FlightState, LinkState
 from skyloop.metrics.catalogue import Reading
 from skyloop.metrics.endpoint import Endpoint, Source, serve
@@ -132,7 +133,7 @@ def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
         drone: Connected to it.
     """
     yield from _states("skyloop_client_link_state", (name,), drone.link.application, LinkState)
-    for channel, stats in drone._core.state.stats(drone._core.commands.sends).items():
+    for channel, stats in Known(drone).stats.items():
         if channel != "feedback" and (not channel.startswith("video/") or "?" in channel):
             continue  # forms of video are as many as pages ask for, and an observer sends no commands
         labels = (name, channel)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from skyloop.client import Drone, Frame
 from skyloop.client.channels import VideoChannel
 from skyloop.client.frame import Arrival
 from skyloop.client.mailbox import Mailbox
 from skyloop.client.worker import Membership
+from skyloop.extend import video_channel
 from skyloop.messages import ProcessorShare
 
 
@@ -35,8 +36,8 @@ class Frames:
         self._drone = drone
         self._membership = membership
         self._came = came
-        self._how: dict[str, Any] = {} if max_fps is None else {"max_fps": max_fps}
-        self._usual = drone._core.channel(membership.camera)
+        self._max_fps = max_fps
+        self._usual = video_channel(drone, membership.camera)
         self._channel: VideoChannel | None = None  # subscribed now
         self._buffer: Mailbox[Arrival] = Mailbox()
         self._sink = self._arrived
@@ -70,8 +71,8 @@ class Frames:
     # On the receiving thread, except on entering --------------------------------------------------------------
 
     def _follow(self, share: ProcessorShare) -> None:
-        part = (share.part, share.parts)
-        self._turn_to(self._drone._core.channel(share.camera, part=part, **self._how) if share.parts else None)
+        part, fps = (share.part, share.parts), self._max_fps
+        self._turn_to(video_channel(self._drone, share.camera, max_fps=fps, part=part) if share.parts else None)
 
     def _turn_to(self, channel: VideoChannel | None) -> None:
         with self._lock:

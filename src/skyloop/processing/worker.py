@@ -14,6 +14,7 @@ from skyloop.client import Drone, Frame
 from skyloop.client.frame import Arrival
 from skyloop.client.results import checked_age, checked_name
 from skyloop.errors import UsageError
+from skyloop.extend import join_processor
 from skyloop.messages import Severity
 from skyloop.messages.log import MAX_TEXT
 from skyloop.processing.frames import Frames
@@ -68,7 +69,7 @@ class Worker:
 
         Raises:
             NameTakenError: If another application runs other code under this name.
-            SkyloopError: Whatever else :meth:`skyloop.client.core.DroneCore.join_processor` raises.
+            SkyloopError: Whatever else :func:`skyloop.extend.join_processor` raises.
         """
         self.settings = settings
         self._drone = drone
@@ -80,8 +81,8 @@ class Worker:
         self._busy_since_s: float | None = None
         self._reported_s = -math.inf
         self._reported_refusal = False
-        self.membership = drone._core.join_processor(
-            settings.name, code=settings.code, camera=settings.camera, shared=settings.shared
+        self.membership = join_processor(
+            drone, settings.name, code=settings.code, camera=settings.camera, shared=settings.shared
         )
         self.membership.ready = self._ready
         self._frames = Frames(drone, self.membership, self._tally.came, max_fps=settings.max_fps)

@@ -9,6 +9,7 @@ from typing import Protocol, Self
 
 from skyloop.client import Drone, connect
 from skyloop.errors import UsageError
+from skyloop.extend import Known
 from skyloop.messages import EventKind
 from skyloop.recording.child import Order, RecorderProcess, check_installed
 from skyloop.recording.engine import Engine
@@ -48,7 +49,7 @@ class Recorder:
         if in_process:
             self._backend = self._within(drones, path, options)
         else:
-            targets = tuple(drone if isinstance(drone, str) else str(drone._core.reach) for drone in drones)
+            targets = tuple(drone if isinstance(drone, str) else str(Known(drone).reach) for drone in drones)
             self._backend = RecorderProcess(Order(targets, str(path.absolute()), options), self._on_event)
 
     def _within(self, drones: Sequence[Drone | str], path: Path, options: Options) -> Engine:
@@ -191,7 +192,7 @@ def record(
         overwrite=overwrite,
     )
     names = [drone if isinstance(drone, str) else drone.name for drone in several]
-    alone = [drone.name for drone in several if isinstance(drone, Drone) and drone._core.reach is None]
+    alone = [drone.name for drone in several if isinstance(drone, Drone) and Known(drone).reach is None]
     if in_process is False and alone:
         raise UsageError(f"{alone[0]} can't be reached from another process: record it in this one")
     where = first_path(Path(path), names, options)

@@ -17,6 +17,7 @@ from skyloop.client.frame import Arrival, to_bgr
 from skyloop.client.mailbox import Mailbox
 from skyloop.clock import nanoseconds
 from skyloop.errors import MissingExtraError, SkyloopError
+from skyloop.extend import Known, stream_channel, video_channel
 from skyloop.logfile.layout import Channel, Drops, FrameRecord
 from skyloop.messages import (
     Annotation,
@@ -197,7 +198,7 @@ class Stream:
         self.newest_ns = 0  #: arrival of the newest decodable frame, or the start
         self._put = put
         self._channel = f"{VIDEO}.{camera}"
-        self._topic = drone._core.stream(camera, subscriber=subscriber)
+        self._topic = stream_channel(drone, camera, subscriber=subscriber)
         self._chain = Chain()
         self._begun = False
         self._sink = self._arrived
@@ -239,14 +240,14 @@ class Video:
         self.channel = f"{VIDEO}.{camera}"
         self.gaps = Gaps()
         self._put = put
-        self._topic = drone._core.channel(camera)
+        self._topic = video_channel(drone, camera)
         self._encode = encoder(options)
         self._format = "png" if options.encoding == "png" else "jpeg"
         self._stream: Stream | None = None
-        if options.keeps_stream(drone._core.channel(camera).camera):
+        if options.keeps_stream(self._topic.camera):
             self._stream = Stream(put, drone, camera)
-        elif encoded_far and drone._core.connection.variants:
-            self._stream = Stream(put, drone, camera, f"{drone._core.subscriber}-view")
+        elif encoded_far and (known := Known(drone)).is_far:
+            self._stream = Stream(put, drone, camera, f"{known.subscriber}-view")
         self._lock = threading.Lock()  # guards the subscription to frames
         self._listening = self._ended = False
         self._failed = 0

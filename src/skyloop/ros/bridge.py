@@ -10,9 +10,9 @@ from typing import Any, Final, Self
 
 from skyloop.client import Drone
 from skyloop.client.connect import NAME_TIMEOUT_S, dial_by_name
-from skyloop.client.core import DroneCore
 from skyloop.client.warm_up import keeper
 from skyloop.errors import UsageError
+from skyloop.extend import open_unasked
 from skyloop.messages import Event, Severity
 from skyloop.ros.names import Frames, namespaces_of
 from skyloop.ros.parameters import Parameters
@@ -144,9 +144,8 @@ class Bridge:
 
 def _connect(name: str, timeout_s: float) -> Drone:
     """Connect as a pilot that does not ask for the authority yet."""
-    core = DroneCore(dial_by_name(name), app="skyloop ros", stall_s=timeout_s, keep_warm=keeper(PERIOD_S))
-    core.open(timeout_s=NAME_TIMEOUT_S, acquire=False)
-    return Drone(core)
+    dial, warm = dial_by_name(name), keeper(PERIOD_S)
+    return open_unasked(Drone, dial, app="skyloop ros", timeout_s=NAME_TIMEOUT_S, stall_s=timeout_s, keep_warm=warm)
 
 
 def _log(node: Any, event: Event) -> None:

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from skyloop.client import Drone
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UsageError
+from skyloop.extend import Known
 from skyloop.logfile.layout import ClockPair
 from skyloop.messages import Value
 from skyloop.messages.encoded import H264, Chain
@@ -71,7 +72,7 @@ class FoxgloveServer:
         self._starts: set[str] = set()  # topics that nobody was subscribed to before
         self._known: dict[str, tuple[ViewTopic, tuple[Source, ...]]] = {}
         for number, drone in enumerate(drones):
-            for topic in topics(drone.name, drone.capabilities, far=drone._core.connection.variants):
+            for topic in topics(drone.name, drone.capabilities, far=Known(drone).is_far):
                 before = self._known[topic.name][1] if topic.name in self._known else ()
                 self._known[topic.name] = topic, (*before, *((number, channel) for channel in topic.channels))
         self._chains: dict[str, Chain] = {}  # H.264 that viewers were given, by topic

@@ -1,0 +1,200 @@
+"""A drone beyond its public face, for Skyloop's own controllers, recorder, cockpit, processors, ROS bridge and CLI.
+
+Only the client uses a drone's private attributes; every other package uses this module, which may change with any
+version. Its functions may be called from any thread, and none waits unless its docstring says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Unpack
+
+if TYPE_CHECKING:
+    from skyloop.client import ChannelStats, Drone, Listener
+    from skyloop.client.channels import VideoChannel
+    from skyloop.client.core import DroneOptions, InboxOptions, StreamOptions
+    from skyloop.client.streams import StreamChannel
+    from skyloop.client.telemetry import Mailboxes
+    from skyloop.client.worker import Membership
+    from skyloop.errors import SkyloopError
+    from skyloop.messages import AnyAction, Feedback, Outcome
+    from skyloop.transport.base import Dialer
+
+D = TypeVar("D", bound="Drone")
+
+
+class Known:
+    """A drone's state in this process. Reading it sends no request, subscribes to nothing, and never raises."""
+
+    def __init__(self, drone: Drone) -> None:
+        core = self._core = drone._core
+        self.app: Final = core.app  #: name of this application, as events give it
+        self.reach: Final = core.reach  #: name or address by which another process reaches the vehicle; None: it can't
+        self.subscriber: Final = core.subscriber  #: unique to this drone object, for :func:`stream_channel`
+
+    @property
+    def newest(self) -> Feedback | None:
+        """The newest feedback, however old; None before the first."""
+        return self._core.state.newest
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether the end of the flight has begun, or the drone is closed: commands raise :class:`ClosedError`."""
+        return self._core.ending
+
+    @property
+    def is_far(self) -> bool:
+        """Whether frames come over a network, in the encoding that each consumer requests."""
+        return self._core.connection.variants
+
+    @property
+    def listeners(self) -> list[Listener[Any]]:
+        """The application's callbacks that were not cancelled."""
+        return list(self._core.listeners)
+
+    @property
+    def stats(self) -> dict[str, ChannelStats]:
+        """Statistics by channel, like :attr:`skyloop.Drone.stats` but without a request to the proxy."""
+        return self._core.state.stats(self._core.commands.sends)
+
+
+class Commands(Protocol):
+    """The commands of this application and their outcomes. Each command is an intent, which has a number."""
+
+    @property
+    def newest(self) -> AnyAction: ...  #: the set-point that is repeated now; idle if none is
+    @property
+    def intent(self) -> int: ...  #: number of the newest intent
+    @property
+    def wants_flight(self) -> bool: ...  #: whether the newest set-point keeps, or brings, the vehicle in the air
+    @property
+    def may_ask(self) -> bool: ...  #: whether the authority is held and there is a connection
+    @property
+    def told(self) -> Outcome | None: ...  #: the proxy's newest report on these intents
+
+    def outcome(self, intent: int) -> Outcome | None: ...  #: how it ended; None while it is under way
+    def release(self, *, wait: bool = True) -> None: ...  #: the authority; NoAnswerError if the proxy is silent
+    def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
+        """Answer a request to hand over the authority; see :meth:`skyloop.client.commands.CommandSender.answer`."""
+
+    # The presence of the person who flies: while it is required and they are absent, only an emergency stop is sent.
+    def flown_by_person(self) -> None: ...  #: their presence is required from now on
+    def present_until(self, until_ns: int) -> None: ...  #: on this process's clock [ns]; never shortens it
+    def is_present(self, now_ns: int) -> bool: ...  #: also True where no presence is required
+
+
+def commands(drone: Drone) -> Commands:
+    """Return this application's commands and outcomes; :meth:`skyloop.Drone.command` and :func:`ask` send one."""
+    return drone._core.commands
+
+
+def ask(drone: Drone, action: AnyAction) -> int:
+    """Command ``action``, whose numbers were checked, as :meth:`skyloop.Drone.command`; return the intent's number."""
+    return drone._core.ask(action)
+
+
+def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:
+    """Hover, or land, because the library finds that it has to, and not because a person chose to. Never raises.
+
+    A vehicle that others fly, that lands or that returns is left alone, and so is one that the application itself has
+    landed or stopped; a take-off that does not show yet is ended. Without the authority only the set-point is dropped.
+
+    Args:
+        drone: The drone.
+        reason: Why, for the log.
+        land: Land, rather than hover.
+        for_good: Further commands of the application raise :class:`ClosedError`, except for an emergency stop.
+
+    Returns:
+        Whether something was sent.
+    """
+    if for_good:
+        drone._core.commands.bar()
+    return drone._core.let_go(reason, land=land)
+
+
+def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **options: Unpack[DroneOptions]) -> D:
+    """Connect as a pilot that does not ask for the authority yet. Waits for the first feedback.
+
+    Args:
+        kind: ``Drone``, or a class derived from it.
+        dial: Makes a connection to the proxy each time one is needed.
+        app: Name of this application, 1 to 64 characters.
+        timeout_s: Time for the proxy to answer and to send feedback [s].
+        **options: As for :class:`skyloop.client.core.DroneCore`.
+
+    Raises:
+        SkyloopError: As :meth:`skyloop.client.core.DroneCore.open`.
+    """
+    from skyloop.client.core import DroneCore
+
+    core = DroneCore(dial, app=app, **options)
+    core.open(timeout_s=timeout_s, acquire=False)
+    return kind(core)
+
+
+def end_flight(drone: Drone, report: Callable[[str], object]) -> SkyloopError | None:
+    """Land what this application flies, or let it hover, as ``on_exit`` says, and close. Waits until it has landed.
+
+    ``report`` is called with each step, a text for people, on this thread. Returns what went wrong, or None.
+    """
+    return drone._core.end_flight(report)
+
+
+def video_channel(
+    drone: Drone, camera: str | None = None, *, max_fps: float | None = None, part: tuple[int, int] | None = None
+) -> VideoChannel:
+    """Return the channel of a camera's frames; it calls its consumers on the receiving thread.
+
+    Args:
+        drone: The drone.
+        camera: Name of the camera; None: the vehicle's first.
+        max_fps: Most frames a second; None: all.
+        part: (k, n): only every n-th frame, from k; None: all.
+
+    Raises:
+        UnknownNameError: If the vehicle has no camera of this name.
+        UnsupportedError: If the vehicle has no camera.
+        UsageError: If an option is out of range.
+        ClosedError: If the drone was closed.
+    """
+    return drone._core.channel(camera, max_fps=max_fps, part=part)
+
+
+def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
+    """Return the channel of a camera's H.264: with no options, as the vehicle itself encoded it.
+
+    It calls its consumers on the receiving thread, and raises what :func:`video_channel` raises.
+    """
+    return drone._core.stream(camera, **how)
+
+
+def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:
+    """Return mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
+
+    They fill while they are open as a context manager. It raises what :func:`video_channel` raises.
+    """
+    return drone._core.inbox(**wanted)
+
+
+def join_processor(
+    drone: Drone, name: str, *, code: str, camera: str | None = None, shared: bool = True, timeout_s: float = 5.0
+) -> Membership:
+    """Become a worker of a processor, as ``skyloop process`` does, up to the drone's end. Waits for the proxy's answer.
+
+    Args:
+        drone: The drone.
+        name: Name of the processor.
+        code: Identifies the code that runs, the same for all workers of a name; at most 128 characters.
+        camera: Name of the camera; None: the vehicle's first.
+        shared: Each frame goes to one of the workers; if False, each worker gets all.
+        timeout_s: How long to wait [s].
+
+    Raises:
+        NameTakenError: If another application runs other code under this name.
+        RefusedError: If the proxy refuses for another reason.
+        NoAnswerError: If the proxy does not answer in time.
+        UsageError: If ``name`` or ``code`` is unusable, or from an inline callback.
+        UnknownNameError: If the vehicle has no camera of this name.
+    """
+    return drone._core.join_processor(name, code=code, camera=camera, shared=shared, timeout_s=timeout_s)

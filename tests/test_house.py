@@ -1,0 +1,68 @@
+"""The borders between packages: only the client uses the private attributes of a drone or a swarm."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+from skyloop.client import Drone, Swarm
+
+SOURCE = Path(__file__).parents[1] / "src" / "skyloop"
+KINDS = (Drone, Swarm)
+#: The client, its asyncio face, and the one module through which other packages reach further.
+INSIDE = ("client/", "aio/", "extend.py")
+
+
+def private_names() -> set[str]:
+    """Private attributes and methods that the two classes set or define."""
+    found = set()
+    for name in ("drone", "swarm"):
+        tree = ast.parse((SOURCE / "client" / f"{name}.py").read_text())
+        for kind in (each for each in tree.body if isinstance(each, ast.ClassDef)):
+            if kind.name in {one.__name__ for one in KINDS}:
+                found |= {one.name for one in kind.body if isinstance(one, ast.FunctionDef)}
+                found |= {one.attr for one in ast.walk(kind) if isinstance(one, ast.Attribute) and _is_own(one)}
+    return {name for name in found if name.startswith("_") and not name.startswith("__")}
+
+
+def _is_own(attribute: ast.Attribute) -> bool:
+    return isinstance(attribute.value, ast.Name) and attribute.value.id == "self"
+
+
+def private_uses(source: str, names: set[str]) -> list[str]:
+    """Uses of these names on other objects, and on ``self`` in classes derived from a drone or a swarm."""
+    if not re.search(rf"(?<!\bself)\.({'|'.join(names)})\b|\bclass .*\b(Drone|Swarm)\b", source):
+        return []  # most modules need no parsing
+    tree = ast.parse(source)
+    kinds = {kind.__name__ for kind in KINDS}
+    heirs = [
+        one
+        for one in ast.walk(tree)
+        if isinstance(one, ast.ClassDef) and kinds & {ast.unparse(base).split(".")[-1] for base in one.bases}
+    ]
+    inherited = {id(node) for heir in heirs for node in ast.walk(heir)}
+    return [
+        f"{node.lineno}: {ast.unparse(node)}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and node.attr in names and (not _is_own(node) or id(node) in inherited)
+    ]
+
+
+def test_private_attributes_are_found() -> None:
+    names = private_names()
+    assert {"_core", "_state", "_listen", "_drones", "_leave"} <= names
+    mine = "class Mine(Drone):\n    def f(self, other):\n        return self._core, self._own, other.sync._state"
+    assert private_uses(mine, names) == ["3: self._core", "3: other.sync._state"]
+    assert not private_uses("class Theirs:\n    def f(self):\n        return self._state\n", names)
+
+
+def test_only_the_client_uses_private_attributes() -> None:
+    names = private_names()
+    found = [
+        f"{module}:{use}"
+        for path in sorted(SOURCE.rglob("*.py"))
+        if not (module := path.relative_to(SOURCE).as_posix()).startswith(INSIDE)
+        for use in private_uses(path.read_text(), names)
+    ]
+    assert not found, "use skyloop.extend, or add to it"
