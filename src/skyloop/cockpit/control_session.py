@@ -1,7 +1,7 @@
 """One page's control of one drone: from its messages to the vehicle's commands, and the answers to them.
 
 A command is carried out if it comes in time (:func:`skyloop.cockpit.commands.untimely`); else it is refused, and never
-carried out later.
+carried out later. Only sticks that were let go make the vehicle hover however late that is heard.
 
 The page is watched (*dead-man*): while it flies by sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
 vehicle hovers. A page that has not shown for :data:`GONE_S` that it receives from the cockpit is a silent pilot:
@@ -190,7 +190,7 @@ class ControlSession:
             self._on_ping(command, now_ns)
             return
         try:
-            if problem:
+            if problem and not (isinstance(command, HoverHere) and command.automatic):  # which is said only once
                 raise RefusedError(problem)
             if _decides(command):
                 self._decisions += 1
