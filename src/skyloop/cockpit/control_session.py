@@ -144,14 +144,16 @@ class ControlSession:
             Fly: self._fly,
             GoTo: lambda command: self._set_out(command, lambda pilot: to_place(command, pilot)),
             FlyBack: lambda command: self._set_out(command, to_start),
-            FlyRoute: lambda command: self._run_in_turn(command, partial(self._fly_route, held=self._still_held())),
+            FlyRoute: lambda command: self._run_in_turn(
+                command, partial(self._fly_route, held=self._still_held(command))
+            ),
             PauseRoute: lambda command: self._steer_route(command, RouteSession.pause),
             ResumeRoute: lambda command: self._steer_route(command, RouteSession.resume),
             SkipWaypoint: lambda command: self._steer_route(command, RouteSession.skip),
             StopRoute: lambda command: self._steer_route(command, RouteSession.end),
             SelectTarget: lambda command: self._run_in_turn(command, self._select_target),
             FollowTarget: lambda command: self._run_in_turn(
-                command, partial(self._follow_target, held=self._still_held())
+                command, partial(self._follow_target, held=self._still_held(command))
             ),
             SetFollowMode: self._set_follow_mode,
             StopFollowing: self._stop_following,
@@ -287,7 +289,7 @@ class ControlSession:
         held()
         check = await asyncio.to_thread(check_for, self._station.drone, route, wait_s=0.0)
         problem = next((one.reason for one in check.findings if one.severity == "error"), "")
-        if problem := problem or untimely(command, seconds(self._clock())):
+        if problem:
             raise RefusedError(f"the route can't be flown: {problem}")
         pilot = held()
         with self._in_place_of(pilot, "another route was begun"):
@@ -431,16 +433,19 @@ class ControlSession:
             raise AuthorityError(f"{pilot.authority.holder or 'another application'} has control", code="no_authority")
         return pilot
 
-    def _still_held(self) -> Callable[[], PilotConnection]:
+    def _still_held(self, command: AnyCommand) -> Callable[[], PilotConnection]:
         """Return what stands for :meth:`_held` in a job that waits for answers.
 
-        It raises :class:`RefusedError` once anything else was commanded, or ended a flight: the newest decision counts.
+        It raises :class:`RefusedError` once anything else was commanded, or ended a flight, as the newest decision
+        counts; or once the command is too old.
         """
         number = self._decisions
 
         def held() -> PilotConnection:
             if self._decisions != number:
                 raise RefusedError("something else was commanded meanwhile, or the page was away")
+            if problem := untimely(command, seconds(self._clock())):
+                raise RefusedError(problem)
             return self._held()
 
         return held
