@@ -1,7 +1,7 @@
 """One page's control of one drone: from its messages to the vehicle's commands, and the answers to them.
 
 A command is carried out if it comes in time (:func:`skyloop.cockpit.commands.untimely`); else it is refused, and never
-carried out later. Only sticks that were let go make the vehicle hover however late that is heard.
+carried out later. Only the hover of released sticks is carried out at any age.
 
 The page is watched (*dead-man*): while it flies by sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
 vehicle hovers. A page that has not shown for :data:`GONE_S` that it receives from the cockpit is a silent pilot:
