@@ -103,19 +103,23 @@ export class CommandSender {
     return this.results.get(what) ?? null;
   }
 
+  /** Only an emergency stop waits for a connection. */
+  canSend(command: { do: string }): boolean {
+    return this.isLive || STOPS.has(command.do);
+  }
+
   /** Send a command. False if it can't be sent; the listener has been called then. */
   send(command: { do: string }): boolean {
     const now_ms = this.now_ms();
     this.number += 1;
     const pending: Pending = { command, n: this.number, pressed_ms: now_ms, on_its_way: false, went: false };
-    const stop = STOPS.has(command.do);
-    if (!stop && !this.isLive) {
+    if (!this.canSend(command)) {
       this.end(command.do, "not_sent", this.silence(now_ms));
       return false;
     }
     this.pending.set(command.do, pending);
     this.show(command.do, "pending", "");
-    return this.transmit(pending) || stop;
+    return this.transmit(pending) || STOPS.has(command.do);
   }
 
   /** Sticks: what does not go now is forgotten. */

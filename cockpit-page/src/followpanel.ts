@@ -4,6 +4,7 @@ import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom
 import { FOLLOW_MODES, type FollowMessage, type FollowMode, type Point, type Size } from "./follow.js";
 import { figure } from "./format.js";
 import { named, t } from "./language/index.js";
+import { UNREAD_MS } from "./question.js";
 import { lengthText } from "./units.js";
 
 export interface FollowDeeds {
@@ -28,6 +29,8 @@ export class FollowPanel {
   private readonly stop = h("button", { type: "button", class: "follow-stop", onclick: () => this.deeds.stop() });
   private problem = "";
   private can = "";
+  /** It opens under the finger that marked the target: a second press that was meant for the picture is no choice. */
+  private unread: ReturnType<typeof setTimeout> | null = null;
   private at: ((size: Size) => Point) | null = null;
   private height = 0;
 
@@ -50,10 +53,13 @@ export class FollowPanel {
     this.at = at;
     this.distance.value = "";
     this.show({ type: "follow", state: "tracking", camera: "", phase: "starting" });
-    (this.modes.follow.disabled ? this.element : this.modes.follow).focus({ preventScroll: true });
+    this.unread = setTimeout(() => this.read(), UNREAD_MS);
+    this.allow(this.can);
+    this.element.focus({ preventScroll: true });
   }
 
   close(): void {
+    this.read();
     // What had the focus here would leave it nowhere, and a text field would go on keeping the keys.
     if (this.element.contains(document.activeElement)) this.element.closest<HTMLElement>(".pane")?.focus({ preventScroll: true });
     setHidden(this.element, true);
@@ -63,8 +69,17 @@ export class FollowPanel {
   /** Why nothing can be flown now, in words; empty: it can. */
   allow(why: string): void {
     this.can = why;
-    for (const mode of FOLLOW_MODES) setDisabled(this.modes[mode], why !== "");
+    for (const mode of FOLLOW_MODES) setDisabled(this.modes[mode], why !== "" || this.unread !== null);
     this.explain();
+  }
+
+  /** It may be chosen from now on, by Enter too if the focus was not moved meanwhile. */
+  private read(): void {
+    if (this.unread === null) return;
+    clearTimeout(this.unread);
+    this.unread = null;
+    this.allow(this.can);
+    if (document.activeElement === this.element && !this.modes.follow.disabled) this.modes.follow.focus({ preventScroll: true });
   }
 
   show(message: FollowMessage): void {
@@ -105,6 +120,6 @@ export class FollowPanel {
 
   private go(mode: FollowMode): void {
     const distance = this.distance.valueAsNumber;
-    if (!this.can) this.deeds.go(mode, Number.isFinite(distance) ? distance : null);
+    if (!this.can && this.unread === null) this.deeds.go(mode, Number.isFinite(distance) ? distance : null);
   }
 }

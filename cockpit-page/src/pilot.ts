@@ -124,27 +124,23 @@ export class Pilot {
   }
 
   release(): void {
-    this.end();
-    this.send({ do: "release" });
+    this.replace({ do: "release" });
   }
 
   /** Take-off, landing, hover, the way back, emergency stop and its end. */
   act(deed: "takeoff" | "hover" | "land" | "return" | "stop" | "reset"): void {
-    this.end();
-    const sent = this.send({ do: deed });
+    const sent = this.replace({ do: deed });
     this.going = sent && deed === "return";
     if (sent && deed === "stop") [this.stopping, this.stopped] = [true, false];
   }
 
   goTo(x: number, y: number, z: number): void {
-    this.end();
-    this.going = this.send({ do: "goto", x, y, z });
+    this.going = this.replace({ do: "goto", x, y, z });
   }
 
   /** Along a route that was checked. */
   flyRoute(id: string): void {
-    this.end();
-    this.going = this.send({ do: "route", id });
+    this.going = this.replace({ do: "route", id });
   }
 
   steerRoute(deed: "route_pause" | "route_resume" | "route_skip" | "route_stop"): void {
@@ -163,8 +159,7 @@ export class Pilot {
 
   /** Fly after what is tracked, or go on in another way. */
   flyAfter(mode: FollowMode, distance_m: number | null): void {
-    this.end();
-    this.following = this.send({ do: "follow_mode", mode, ...(distance_m === null ? {} : { distance_m }) });
+    this.following = this.replace({ do: "follow_mode", mode, ...(distance_m === null ? {} : { distance_m }) });
   }
 
   stopFollowing(): void {
@@ -186,8 +181,8 @@ export class Pilot {
     // A vehicle may show a stop within one round: a stick that is held all the while must be centred first all the same.
     if (this.stopped) this.stopping = this.stopped = false;
     if (this.mine && !isCentred(sticks)) {
-      this.going = this.following = false;
-      this.steering = this.commands.steer({ do: "fly", ...sticks, touches } satisfies Command);
+      if (this.commands.steer({ do: "fly", ...sticks, touches } satisfies Command)) [this.steering, this.going, this.following] = [true, false, false];
+      else this.rest();
     } else if (this.steering) {
       this.rest();
     }
@@ -210,6 +205,13 @@ export class Pilot {
     return this.commands.send(command);
   }
 
+  /** Send what takes the place of what this page has under way: if it can't be sent, that ends all the same. */
+  private replace(command: Command): boolean {
+    if (this.commands.canSend(command)) this.end();
+    else this.rest();
+    return this.send(command);
+  }
+
   private end(): void {
     this.steering = this.going = this.following = false;
   }
@@ -228,7 +230,7 @@ export class Pilot {
 
   private refused(command: string, why: string): void {
     if (command === "stop") this.stopped = true;
-    if (["goto", "fly", "route", "return", "follow_mode"].includes(command)) this.end();
+    if (["goto", "route", "return", "follow_mode"].includes(command)) this.end(); // sticks fly on until they are let go
     this.listener.refused(command, why);
   }
 

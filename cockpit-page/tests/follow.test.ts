@@ -4,8 +4,9 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { contain } from "../src/drawing.js";
 import { beside, between, type Box, foundAt, foundIn, isLarge, nudged, toFrame, toView } from "../src/follow.js";
-import { figures } from "../src/followpanel.js";
+import { figures, FollowPanel } from "../src/followpanel.js";
 import type { Drawing, Shape } from "../src/model.js";
+import { UNREAD_MS } from "../src/question.js";
 
 const FRAME = { width: 320, height: 240 };
 const square = ([x, y, w, h]: Box): [number, number][] => [[x, y], [x + w, y], [x + w, y + h], [x, y + h]];
@@ -85,4 +86,61 @@ test("what is not known is left out of the figures", () => {
   assert.equal(figures({ confidence: 0.914, range_m: 4.23, range_deviation_m: 0.51, lost_s: 0 }), "91 % · 4.2 m ± 0.5 m");
   assert.equal(figures({ confidence: null, range_m: 4.23, range_deviation_m: null, lost_s: 1.26 }), "4.2 m · not seen for 1.3 s");
   assert.equal(figures({}), "");
+});
+
+/** As much of an element as a panel uses. */
+class FakeElement {
+  hidden = false;
+  disabled = false;
+  textContent = "";
+  value = "";
+  valueAsNumber = Number.NaN;
+  style = { setProperty: () => undefined };
+  private readonly attributes = new Map<string, string>();
+  private readonly listeners = new Map<string, (event: object) => void>();
+  append(): void {}
+  contains(other: unknown): boolean { return other === this; }
+  closest(): null { return null; }
+  focus(): void { Object.assign(document, { activeElement: this }); }
+  getAttribute(name: string): string | null { return this.attributes.get(name) ?? null; }
+  setAttribute(name: string, value: string): void {
+    this.attributes.set(name, value);
+    if (name === "hidden") this.hidden = true;
+  }
+  addEventListener(name: string, act: (event: object) => void): void { this.listeners.set(name, act); }
+  tell(name: string, event: object = {}): void { this.listeners.get(name)?.(event); }
+}
+
+test("a second quick press on what was marked, under which the panel opens, flies nothing", (context) => {
+  context.mock.timers.enable({ apis: ["setTimeout"] });
+  const made: FakeElement[] = [];
+  const createElement = (): FakeElement => (made.push(new FakeElement()), made.at(-1) as FakeElement);
+  Object.assign(globalThis, { document: { activeElement: null, createElement } });
+  const went: string[] = [];
+  const panel = new FollowPanel({ go: (mode) => went.push(mode), stop: () => went.push("stop") });
+  const follow = made.find((one) => one.getAttribute("data-mode") === "follow") as FakeElement;
+  const distance = made.find((one) => one.getAttribute("type") === "number") as FakeElement;
+  const press = (): void => (follow.disabled ? undefined : follow.tell("click"));
+  panel.allow("");
+  for (const round of [1, 2]) {
+    panel.open(() => [0, 0]);
+    context.mock.timers.tick(UNREAD_MS - 1);
+    panel.allow("");
+    press();
+    distance.tell("keydown", { key: "Enter" });
+    assert.equal(went.length, round - 1, "nobody can have read it by then");
+    assert.equal(document.activeElement, panel.element);
+    context.mock.timers.tick(1);
+    assert.equal(document.activeElement, follow, "Enter follows");
+    press();
+    assert.deepEqual(went, Array(round).fill("follow"));
+    panel.close();
+  }
+  panel.open(() => [0, 0]);
+  panel.close();
+  panel.allow("take control first");
+  panel.open(() => [0, 0]);
+  context.mock.timers.tick(UNREAD_MS);
+  assert.ok(follow.disabled, "there is another reason");
+  assert.equal(document.activeElement, panel.element);
 });

@@ -250,6 +250,37 @@ test("sticks that are let go, or count no more, as no answers come, hover all th
   assert.ok(Math.abs((sent.findLast((message) => message["do"] === "hover")?.["at_s"] as number) - 1001.2) < 0.1);
 });
 
+test("sticks that could not be sent, or were refused, were flying before: they hover when they are let go", () => {
+  const { pilot, sent, receive, live, at } = flown();
+  live();
+  receive(held(true));
+  pilot.steer(FORWARD);
+  at(1200);
+  pilot.steer(FORWARD); // still in the hand when the answers became old
+  assert.deepEqual(doings(sent), ["fly", "hover"]);
+  const late = flown();
+  late.live();
+  late.receive(held(true));
+  late.pilot.steer(FORWARD);
+  late.receive({ type: "refused", do: "fly", n: 0, why: "it arrived 0.6 s after it was requested" });
+  late.pilot.steer(CENTRED);
+  assert.deepEqual(doings(late.sent), ["fly", "hover"]);
+});
+
+test("what is to take the place of a flight and can't be sent leaves it hovering", () => {
+  for (const act of [(pilot: Pilot) => pilot.act("hover"), (pilot: Pilot) => pilot.act("land"), (pilot: Pilot) => pilot.goTo(4, 5, 6), (pilot: Pilot) => pilot.flyRoute("2")]) {
+    const { pilot, sent, receive, live, at } = flown();
+    live();
+    receive(held(true));
+    pilot.goTo(1, 2, 3);
+    at(1200);
+    act(pilot);
+    assert.deepEqual(doings(sent), ["goto", "hover"]);
+    assert.equal(sent.at(-1)?.["automatic"], true);
+    assert.ok(!pilot.going);
+  }
+});
+
 test("a hover that nobody pressed says so, and sticks say how often hands were seen", () => {
   const { pilot, sent, receive, live } = flown();
   live();

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.client.parameters import Config
-from skyloop.cockpit.commands import UNTOUCHED_S, Fly, HandWatch
+from skyloop.cockpit.commands import LATE_S, UNTOUCHED_S, Fly, HandWatch
 from skyloop.cockpit.control_session import GONE_S
 from skyloop.cockpit.fleet import Fleet
 from skyloop.messages import Failsafe, FlightState, Hover, Land, Position, Velocity
@@ -95,6 +95,22 @@ def test_a_route_that_is_still_checked_does_not_override_what_was_pressed_since(
             why = pilot.wait("refused", do="route")["why"]
             assert "commanded meanwhile" in why
             assert node.flyer.place[0] < 1.0
+
+
+def test_a_flight_after_a_target_is_not_begun_when_the_answers_took_too_long(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with page(client) as first:
+        pilot = Marker(first)
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.select()
+            with slow_parameters(monkeypatch) as until_asked:
+                pilot.say("follow", camera="front", captured_ns=str(pilot.since_ns), box=BOX, mode="follow")
+                until_asked()
+                time.sleep(LATE_S + 0.1)
+            assert "after it was requested" in pilot.wait("refused", do="follow")["why"]
+            assert not count(node, FORWARD)
 
 
 def test_a_page_that_was_away_meanwhile_flies_no_route(

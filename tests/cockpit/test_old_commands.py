@@ -128,6 +128,18 @@ def test_old_sticks_fly_nothing_and_are_no_sign_of_life(client: TestClient, node
         pilot.wait("refused", do="fly")
 
 
+def test_sticks_that_were_let_go_hover_however_late_that_is_heard(client: TestClient, node: Node) -> None:
+    """It was refused as too old, and what is newer kept the velocity of before: a page says it only once."""
+    with page(client) as pilot:
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.say("fly", forward=0.3)
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            pilot.say("hover", automatic=True, at_s=time.monotonic() - LATE_S - 0.1)
+            until(lambda: node.flyer.state is FlightState.HOVERING)
+            pilot.wait("sent", do="hover")
+
+
 def test_each_order_is_answered_under_its_number(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.say("take", priority=4, n=1)

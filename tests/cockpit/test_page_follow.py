@@ -78,9 +78,15 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
         picture(page, "follow-drag")
         mouse.up()
         panel = page.pane.get_by_role("region", name="Target")
+
+        def chosen_by_enter() -> bool:
+            focused = "(button) => button === document.activeElement"
+            return bool(panel.get_by_role("button", name="Follow").evaluate(focused))
+
         page.wait_for_text(".follow-phase", "Tracked: nothing flies")
         picture(page, "follow-marked")
         assert drone.feedback().state is FlightState.HOVERING, "nothing flies yet"
+        page.until(chosen_by_enter, "the panel can be read by now")
         page.press("Enter")
         page.wait_for_text(".follow-phase", "following")
         assert panel.get_by_role("button", name="Follow").get_attribute("aria-pressed") == "true"
@@ -112,6 +118,7 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
         picture(page, "follow-detection")
         page.until(chosen, "it is chosen, although the drone still swings")
         page.wait_for_text(".follow-phase", "Tracked: nothing flies")
+        page.until(chosen_by_enter, "the panel can be read by now")
         page.press("Enter")
         page.until(lambda: drone.feedback().state is FlightState.FLYING, "it flies")
         page.press("h")

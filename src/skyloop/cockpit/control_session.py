@@ -1,7 +1,7 @@
 """One page's control of one drone: from its messages to the vehicle's commands, and the answers to them.
 
 A command is carried out if it comes in time (:func:`skyloop.cockpit.commands.untimely`); else it is refused, and never
-carried out later.
+carried out later. Only the hover of released sticks is carried out at any age.
 
 The page is watched (*dead-man*): while it flies by sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
 vehicle hovers. A page that has not shown for :data:`GONE_S` that it receives from the cockpit is a silent pilot:
@@ -144,14 +144,16 @@ class ControlSession:
             Fly: self._fly,
             GoTo: lambda command: self._set_out(command, lambda pilot: to_place(command, pilot)),
             FlyBack: lambda command: self._set_out(command, to_start),
-            FlyRoute: lambda command: self._run_in_turn(command, partial(self._fly_route, held=self._still_held())),
+            FlyRoute: lambda command: self._run_in_turn(
+                command, partial(self._fly_route, held=self._still_held(command))
+            ),
             PauseRoute: lambda command: self._steer_route(command, RouteSession.pause),
             ResumeRoute: lambda command: self._steer_route(command, RouteSession.resume),
             SkipWaypoint: lambda command: self._steer_route(command, RouteSession.skip),
             StopRoute: lambda command: self._steer_route(command, RouteSession.end),
             SelectTarget: lambda command: self._run_in_turn(command, self._select_target),
             FollowTarget: lambda command: self._run_in_turn(
-                command, partial(self._follow_target, held=self._still_held())
+                command, partial(self._follow_target, held=self._still_held(command))
             ),
             SetFollowMode: self._set_follow_mode,
             StopFollowing: self._stop_following,
@@ -190,7 +192,7 @@ class ControlSession:
             self._on_ping(command, now_ns)
             return
         try:
-            if problem:
+            if problem and not (isinstance(command, HoverHere) and command.automatic):  # which is said only once
                 raise RefusedError(problem)
             if _decides(command):
                 self._decisions += 1
@@ -287,7 +289,7 @@ class ControlSession:
         held()
         check = await asyncio.to_thread(check_for, self._station.drone, route, wait_s=0.0)
         problem = next((one.reason for one in check.findings if one.severity == "error"), "")
-        if problem := problem or untimely(command, seconds(self._clock())):
+        if problem:
             raise RefusedError(f"the route can't be flown: {problem}")
         pilot = held()
         with self._in_place_of(pilot, "another route was begun"):
@@ -431,16 +433,19 @@ class ControlSession:
             raise AuthorityError(f"{pilot.authority.holder or 'another application'} has control", code="no_authority")
         return pilot
 
-    def _still_held(self) -> Callable[[], PilotConnection]:
+    def _still_held(self, command: AnyCommand) -> Callable[[], PilotConnection]:
         """Return what stands for :meth:`_held` in a job that waits for answers.
 
-        It raises :class:`RefusedError` once anything else was commanded, or ended a flight: the newest decision counts.
+        It raises :class:`RefusedError` once anything else was commanded, or ended a flight, as the newest decision
+        counts; or once the command is too old.
         """
         number = self._decisions
 
         def held() -> PilotConnection:
             if self._decisions != number:
                 raise RefusedError("something else was commanded meanwhile, or the page was away")
+            if problem := untimely(command, seconds(self._clock())):
+                raise RefusedError(problem)
             return self._held()
 
         return held
