@@ -149,6 +149,29 @@ def test_a_drone_that_falls_over_in_its_take_off_is_not_started_again() -> None:
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
 
 
+@pytest.mark.parametrize("after_s", [0.0, 0.2, 0.5])
+def test_motors_that_ran_before_a_landing_show_no_take_off(after_s: float) -> None:
+    """They seemed to, and then to stop: what rose was told not to be started again, LANDED, and was not steered."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 10.0)
+    rig.run(3.0)
+    rig.do(Land())
+    rig.until(lambda: rig.bench.truth.state is FlightState.LANDED, 10.0)
+    rig.session.on_reply(b"ok", rig.now_ns)  # real ones answer as they touch down
+    rig.until(lambda: rig.state is FlightState.LANDED, 0.2)
+    rig.run(after_s)
+    rig.do(Takeoff())
+    rig.until(lambda: rig.bench.truth.state is FlightState.HOVERING, 5.0)
+    assert rig.state is FlightState.TAKING_OFF
+    rig.until(lambda: rig.state is FlightState.HOVERING, 2.0)
+    assert "no_takeoff" not in rig.reasons
+    rig.take_said()
+    rig.run(1.0)
+    assert "rc 0 0 0 0" in rig.said
+
+
 def test_a_drone_that_refuses_to_take_off_is_told() -> None:
     rig = Rig()
     rig.ready()
