@@ -447,6 +447,22 @@ def test_what_is_not_heard_any_more_lands_by_itself() -> None:
     assert rig.bench.flight is FlightState.LANDED
 
 
+@pytest.mark.parametrize("after_s", [0.1, 0.6])
+def test_a_take_off_that_is_lost_before_it_shows_lands_by_itself(after_s: float) -> None:
+    """``command``, twice a second, kept it in the air for as long as it was not heard."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.run(after_s)
+    rig.mute = True
+    rig.until(lambda: rig.bench.truth.state is FlightState.HOVERING, 5.0)
+    rig.run(30.0)
+    assert rig.bench.truth.state is FlightState.LANDED
+    rig.mute = False
+    rig.until(lambda: rig.session.ready, 40.0)
+    assert rig.state is FlightState.LANDED
+
+
 @pytest.mark.parametrize("asked_s", [1.0, 10.0])
 def test_what_a_person_asks_for_reaches_what_is_not_heard(asked_s: float) -> None:
     rig = unheard()
