@@ -37,11 +37,16 @@ class Bench:
     """A drone on the ground, seen by cameras if ``poses``; ``cut``: nothing passes; ``deaf``: no reply passes.
 
     ``world_speed``: of the simulated world, beside the clock of board and driver. ``noise_m``: of the poses' height.
-    ``unanswered``: functions whose replies do not pass.
+    ``unanswered``: functions whose replies do not pass. ``seed``: of the noise.
     """
 
     def __init__(
-        self, settings: BoardSettings | None = None, text: str = "msp://tcp:127.0.0.1:5761", *, poses: bool = True
+        self,
+        settings: BoardSettings | None = None,
+        text: str = "msp://tcp:127.0.0.1:5761",
+        *,
+        poses: bool = True,
+        seed: int = 3,
     ) -> None:
         world = replace(load_world("empty", 0), targets=())
         self.simulation = Simulation(world, seed=1, parameters=BATTERY_FREE)
@@ -53,7 +58,7 @@ class Bench:
         self.unanswered: set[int] = set()
         self.world_speed = 1.0
         self.noise_m = 0.0
-        self._random = random.Random(3)
+        self._random = random.Random(seed)
         self._behind_s = 0.0
         self.sent: list[Frame] = []
         self._parser = Parser()

@@ -219,8 +219,7 @@ class MspSession(VehicleSession):
                 self.setpoints.report = Report(armed, names, overridden)
                 self.setpoints.adopt(self._armed_throttle, now_ns)
         self.setpoints.on_report(Report(armed, names, overridden), now_ns)
-        if not armed:
-            self.motion.stands()
+        self.motion.stands(does=not armed)
 
     def _on_pilot(self, widths: list[int], now_ns: int) -> None:
         if len(widths) < 4:
