@@ -500,6 +500,20 @@ def test_a_stop_is_sent_at_once_though_the_flight_controller_is_behind() -> None
     assert not bench.board.armed
 
 
+@pytest.mark.parametrize("silent", [False, True])
+@pytest.mark.parametrize("function", [Function.BOXNAMES, Function.MODE_RANGES, Function.RX_MAP])
+def test_a_stop_reaches_what_does_not_tell_its_settings(function: Function, silent: bool) -> None:
+    """It was not sent at all to what a new proxy found in flight."""
+    bench = Bench(BoardSettings(failsafe=FailsafeConfig(20.0, 60.0, 1000, 10.0, 1)))
+    bench.take_off()
+    bench.reconnect()
+    (bench.unanswered if silent else bench.refused).add(function)
+    bench.run(8.0)
+    assert bench.board.armed
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.until(lambda: not bench.board.armed, 0.1)
+
+
 def test_a_stop_of_what_is_just_being_found_in_flight_is_not_undone_by_taking_it_over() -> None:
     bench = Bench()
     bench.take_off()
