@@ -37,7 +37,8 @@ class Bench:
     """A drone on the ground, seen by cameras if ``poses``; ``cut``: nothing passes; ``deaf``: no reply passes.
 
     ``world_speed``: of the simulated world, beside the clock of board and driver. ``noise_m``: of the poses' height.
-    ``unanswered``: functions whose replies do not pass. ``refused``: functions that it does not know. ``seed``: of the noise.
+    ``unanswered``: functions whose replies do not pass. ``refused``: functions that it does not know.
+    ``seed``: of the noise.
     """
 
     def __init__(
