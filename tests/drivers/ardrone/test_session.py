@@ -574,6 +574,20 @@ def test_a_stop_whose_toggle_the_drone_did_not_see_gets_another() -> None:
     assert rig.drone.toggles == 1
 
 
+@pytest.mark.parametrize("port_open", [False, True])
+def test_such_a_stop_is_as_soon_where_no_navdata_are_configured(port_open: bool) -> None:
+    """Few come then, and were taken for many: the next toggle came after 7.5 s, or never while it was set up anew."""
+    rig = Rig()
+    rig.navdata_steps = 7
+    rig.drone.stubborn = {"general:navdata_demo"}
+    rig.port_open = port_open
+    rig.run(1.0)
+    assert State.BOOTSTRAP in rig.drone.state
+    rig.drone.hear_bit()
+    rig.session.command(EmergencyStop(), rig.clock.now_ns)
+    assert 0.4 < rig.until(lambda: State.EMERGENCY in rig.drone.state, 8.0) < 0.8
+
+
 def test_motors_that_another_program_releases_soon_are_stopped_again() -> None:
     rig = flying()
     rig.session.command(EmergencyStop(), rig.clock.now_ns)

@@ -22,7 +22,7 @@ from skyloop.sim.host import Report
 from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
-from skyloop.wire.msp.frames import Frame, Parser, encode
+from skyloop.wire.msp.frames import Direction, Frame, Parser, encode
 
 TICK_S: Final = 0.008
 POSE_TICKS: Final = 2
@@ -37,11 +37,17 @@ class Bench:
     """A drone on the ground, seen by cameras if ``poses``; ``cut``: nothing passes; ``deaf``: no reply passes.
 
     ``world_speed``: of the simulated world, beside the clock of board and driver. ``noise_m``: of the poses' height.
-    ``unanswered``: functions whose replies do not pass.
+    ``unanswered``: functions whose replies do not pass. ``refused``: functions that it does not know.
+    ``seed``: of the noise.
     """
 
     def __init__(
-        self, settings: BoardSettings | None = None, text: str = "msp://tcp:127.0.0.1:5761", *, poses: bool = True
+        self,
+        settings: BoardSettings | None = None,
+        text: str = "msp://tcp:127.0.0.1:5761",
+        *,
+        poses: bool = True,
+        seed: int = 3,
     ) -> None:
         world = replace(load_world("empty", 0), targets=())
         self.simulation = Simulation(world, seed=1, parameters=BATTERY_FREE)
@@ -51,9 +57,10 @@ class Bench:
         self.poses = poses
         self.cut = self.deaf = False
         self.unanswered: set[int] = set()
+        self.refused: set[int] = set()
         self.world_speed = 1.0
         self.noise_m = 0.0
-        self._random = random.Random(3)
+        self._random = random.Random(seed)
         self._behind_s = 0.0
         self.sent: list[Frame] = []
         self._parser = Parser()
@@ -111,6 +118,8 @@ class Bench:
         for frame in self._parser.feed(data):
             self.sent.append(frame)
             reply = self.board.answer(frame, self.clock.now_ns)
+            if frame.function in self.refused:
+                reply = Frame(frame.function, b"", Direction.ERROR)
             if reply is not None and not self.deaf and frame.function not in self.unanswered:
                 self.session.receive(encode(reply), self.clock.now_ns)
 

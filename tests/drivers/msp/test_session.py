@@ -158,6 +158,25 @@ def test_a_landing_by_noisy_positions(noise: float, climb: float) -> None:
     assert bench.height_m < 0.06
 
 
+@pytest.mark.parametrize("noise_m", [0.018, 0.036])
+@pytest.mark.parametrize("seed", range(3))
+def test_noisy_heights_show_no_lift_off(noise_m: float, seed: int) -> None:
+    """They did, on the ground: it stood there armed, told to fly, and learnt a throttle that carries nothing."""
+    bench = Bench(seed=seed)
+    bench.noise_m = noise_m
+    stands_m = bench.height_m
+    bench.ready()
+    bench.fly(climb=0.7)
+    bench.until(lambda: bench.session.setpoints.phase is Phase.FLYING, 20.0)
+    assert 0.03 < bench.height_m - stands_m < 0.2
+    assert bench.session.setpoints.hover == pytest.approx(0.32, abs=0.05)
+    bench.until(lambda: bench.height_m > 1.0, 5.0)
+    bench.fly(climb=-0.4)
+    bench.until(lambda: not bench.board.armed, 8.0)
+    bench.run(1.0)
+    assert bench.feedback.altitude_m == pytest.approx(0.0, abs=0.06 + 2 * noise_m)
+
+
 @pytest.mark.parametrize("world_speed", [1.0, 0.6, 0.45, 0.3])
 def test_what_still_rises_when_it_should_sink_does_not_stand(world_speed: float) -> None:
     """A real one rose past its height, in a simulation slower than its clock: it was disarmed at 1.6 m, and fell."""
@@ -479,6 +498,20 @@ def test_a_stop_is_sent_at_once_though_the_flight_controller_is_behind() -> None
     assert [frame.function for frame in bench.sent if frame.function == Function.SET_RAW_RC]
     bench.tick()
     assert not bench.board.armed
+
+
+@pytest.mark.parametrize("silent", [False, True])
+@pytest.mark.parametrize("function", [Function.BOXNAMES, Function.MODE_RANGES, Function.RX_MAP])
+def test_a_stop_reaches_what_does_not_tell_its_settings(function: Function, silent: bool) -> None:
+    """It was not sent at all to what a new proxy found in flight."""
+    bench = Bench(BoardSettings(failsafe=FailsafeConfig(20.0, 60.0, 1000, 10.0, 1)))
+    bench.take_off()
+    bench.reconnect()
+    (bench.unanswered if silent else bench.refused).add(function)
+    bench.run(8.0)
+    assert bench.board.armed
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.until(lambda: not bench.board.armed, 0.1)
 
 
 def test_a_stop_of_what_is_just_being_found_in_flight_is_not_undone_by_taking_it_over() -> None:

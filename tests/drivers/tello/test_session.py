@@ -149,6 +149,29 @@ def test_a_drone_that_falls_over_in_its_take_off_is_not_started_again() -> None:
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
 
 
+@pytest.mark.parametrize("after_s", [0.0, 0.2, 0.5])
+def test_motors_that_ran_before_a_landing_show_no_take_off(after_s: float) -> None:
+    """They seemed to, and then to stop: what rose was told not to be started again, LANDED, and was not steered."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 10.0)
+    rig.run(3.0)
+    rig.do(Land())
+    rig.until(lambda: rig.bench.truth.state is FlightState.LANDED, 10.0)
+    rig.session.on_reply(b"ok", rig.now_ns)  # real ones answer as they touch down
+    rig.until(lambda: rig.state is FlightState.LANDED, 0.2)
+    rig.run(after_s)
+    rig.do(Takeoff())
+    rig.until(lambda: rig.bench.truth.state is FlightState.HOVERING, 5.0)
+    assert rig.state is FlightState.TAKING_OFF
+    rig.until(lambda: rig.state is FlightState.HOVERING, 2.0)
+    assert "no_takeoff" not in rig.reasons
+    rig.take_said()
+    rig.run(1.0)
+    assert "rc 0 0 0 0" in rig.said
+
+
 def test_a_drone_that_refuses_to_take_off_is_told() -> None:
     rig = Rig()
     rig.ready()
@@ -422,6 +445,22 @@ def test_what_is_not_heard_any_more_lands_by_itself() -> None:
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
     rig.run(3.0)
     assert rig.bench.flight is FlightState.LANDED
+
+
+@pytest.mark.parametrize("after_s", [0.1, 0.6])
+def test_a_take_off_that_is_lost_before_it_shows_lands_by_itself(after_s: float) -> None:
+    """``command``, twice a second, kept it in the air for as long as it was not heard."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.run(after_s)
+    rig.mute = True
+    rig.until(lambda: rig.bench.truth.state is FlightState.HOVERING, 5.0)
+    rig.run(30.0)
+    assert rig.bench.truth.state is FlightState.LANDED
+    rig.mute = False
+    rig.until(lambda: rig.session.ready, 40.0)
+    assert rig.state is FlightState.LANDED
 
 
 @pytest.mark.parametrize("asked_s", [1.0, 10.0])

@@ -290,7 +290,8 @@ class SetpointController:
             self._late_ns = gap_ns - passed_ns
         elif self._late_ns:
             self._late_ns = max(0, self._late_ns + gap_ns - passed_ns) if in_a_row else 0
-        if self.condition is None or (self._emergency and not condition.emergency):
+        found = self.condition is None and gap_ns >= SILENT_NS
+        if found or (self._emergency and not condition.emergency):
             self._changed_ns, self._passed_ns = now_ns, 0  # navdata have to go on saying so: these may be old
         self._emergency = condition.emergency
         if self.condition is not None and self.condition.flying and not condition.flying:

@@ -23,7 +23,7 @@ from skyloop.wire.ardrone.options import LAYOUTS, Demo, PhysMeasures, RawMeasure
 
 # Datagrams as they come ----------------------------------------------------------------------------------------------
 
-#: Between two datagrams, as the drone makes them: few of them, or all.
+#: Between two datagrams, as the drone makes them: few of them, as before its set-up, or all.
 PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
 RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: after it a lower sequence is a new count, and not a late datagram
 _MICROSECOND_BITS: Final = 21
@@ -55,7 +55,8 @@ class Reception:
         if not self._is_new(navdata.sequence, now_ns):
             self.counts["late"] += 1
             return None
-        self.passed_ns = max(0, navdata.sequence - before) * PERIODS_NS[State.DEMO in navdata.state]
+        few = bool(navdata.state & (State.DEMO | State.BOOTSTRAP))
+        self.passed_ns = max(0, navdata.sequence - before) * PERIODS_NS[few]
         self.counts["received"] += 1
         self.counts["unknown"] += len(navdata.unknown)
         return navdata

@@ -23,6 +23,7 @@ GPS_NS: Final = nanoseconds(1.0)
 GAP_NS: Final = nanoseconds(0.4)  #: after a longer one the velocity begins anew
 SMOOTH_S: Final = 0.05  #: time constant of the velocity from poses
 LEAST_SATELLITES: Final = 5
+GROUND_SAMPLES: Final = 10  #: the height of the ground is averaged over about so many
 EARTH_RADIUS_M: Final = 6_371_000.0
 
 
@@ -76,6 +77,7 @@ class MotionEstimate:
         self._heading_rad: float | None = None  # as yaw, counter-clockwise from east
         self._turned_rad: float | None = None  # what poses' yaw differs from it
         self._ground: dict[str, float] = {}  # height of each source where the vehicle stood last
+        self._stood = 0  # samples of it
         self.satellites: int | None = None
 
     @property
@@ -114,12 +116,17 @@ class MotionEstimate:
         """Forget what the flight controller reported: it is no longer received."""
         self._altitude = self._gps = None
 
-    def stands(self) -> None:
-        """Take the present height for that of the ground."""
-        if self._pose is not None:
-            self._ground["pose"] = self._pose.position_m[2]
-        if self._altitude is not None:
-            self._ground["altitude"] = self._altitude[0].height_m
+    def stands(self, *, does: bool) -> None:
+        """Learn the height of the ground while it stands: one sample may be wrong by more than shows a lift-off."""
+        self._stood = min(GROUND_SAMPLES, self._stood + 1) if does else 0
+        if does and self._pose is not None:
+            self._learn("pose", self._pose.position_m[2])
+        if does and self._altitude is not None:
+            self._learn("altitude", self._altitude[0].height_m)
+
+    def _learn(self, source: str, height_m: float) -> None:
+        before_m = self._ground.get(source, height_m)
+        self._ground[source] = before_m + (height_m - before_m) / self._stood
 
     def at(self, now_ns: int) -> Motion:
         """Return what is known now."""

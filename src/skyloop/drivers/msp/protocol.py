@@ -75,6 +75,7 @@ class MspSession(VehicleSession):
         self._known = False  # who it is was asked since it was found
         self._refused_variant = ""
         self._unread = ""  # what it did not tell of its settings
+        self._partly = False  # what it did tell was kept, for a stop
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns
         self._sticks: deque[int] = deque()  # when those without an acknowledgement were sent
@@ -219,8 +220,7 @@ class MspSession(VehicleSession):
                 self.setpoints.report = Report(armed, names, overridden)
                 self.setpoints.adopt(self._armed_throttle, now_ns)
         self.setpoints.on_report(Report(armed, names, overridden), now_ns)
-        if not armed:
-            self.motion.stands()
+        self.motion.stands(does=not armed)
 
     def _on_pilot(self, widths: list[int], now_ns: int) -> None:
         if len(widths) < 4:
@@ -309,7 +309,8 @@ class MspSession(VehicleSession):
 
     def _due_sticks(self, now_ns: int) -> bytes:
         self.urgent = urgent = self._step_stop(now_ns)
-        if self.setup is None or not (urgent or (self._may_steer and now_ns >= self._sticks_due_ns)):
+        known = self.setup is not None or (urgent and self._partly)
+        if not known or not (urgent or (self._may_steer and now_ns >= self._sticks_due_ns)):
             return b""
         while self._sticks and now_ns - self._sticks[0] >= STICKS_LOST_NS:
             self._sticks.popleft()
@@ -339,13 +340,12 @@ class MspSession(VehicleSession):
     def _count(self, now_ns: int) -> None:
         """Measure how many sticks a second are taken."""
         since_ns = now_ns - self._counted_ns
-        if since_ns < COUNT_NS:
+        if since_ns < COUNT_NS or self.setup is None:
             return
         self.sticks_hz = self._acknowledged / seconds(since_ns)
         self._counted_ns, self._acknowledged = now_ns, 0
         slow = self.sticks_hz < LEAST_STICKS_HZ
         if slow and not self._slow and self._received_ns is not None:
-            assert self.setup is not None
             pace = _pace(self.sticks_hz, self.setup.identity.variant)
             self._publish_event(message(f"{pace.detail}: {pace.advice}", "slow", Severity.WARNING, rate=self.sticks_hz))
         self._slow = slow
@@ -380,6 +380,7 @@ class MspSession(VehicleSession):
                 )
                 self._publish_event(message(text, "setup_unread", Severity.WARNING))
             self._unread = missing
+            self._keep_part()
             return
         self.setup, self._known, self._unread = setup, True, ""
         self.reported.cells = setup.cells
@@ -404,6 +405,13 @@ class MspSession(VehicleSession):
         bundle = (Function.ATTITUDE, Function.ALTITUDE, Function.STATUS_EX) if bundles else ()
         self._telemetry = Telemetry(streams, bundle)
 
+    def _keep_part(self) -> None:
+        """Keep what was read of its settings: by that at least a stop is sent."""
+        identification = self._identification
+        if self.setup is None and identification and identification.setup.identity.variant in SUPPORTED:
+            self.setpoints.set_up(identification.setup, "its settings were not read")
+            self._partly = True
+
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events()
 
@@ -415,6 +423,7 @@ class MspSession(VehicleSession):
         Sticks go on as they were, for what flies may still hear them.
         """
         del now_ns
+        self._keep_part()
         self._received_ns = self._asked_ns = self._identification = None
         self._known, self._refused_variant, self._wakes_until_ns = False, "", None
         self._questions.clear()

@@ -49,7 +49,7 @@ PASSING: Final = frozenset(
     }
 )
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] that shows it, precise or not
-LATE_S: Final = 0.15  #: so long after the throttle carried it a lift-off shows
+LATE_S: Final = {True: 0.35, False: 0.15}  #: so long after the throttle carried it a lift-off shows, precise or not
 OTHER: Final = 0.15  #: share by which the throttle that was learnt may differ from the one that lifted it
 GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: without headway a descent met something
 HEADWAY: Final = 0.4  #: of the descent that is asked for
@@ -138,6 +138,7 @@ class SetpointController:
         self._abort_ns: int | None = None
         self._still_ns: int | None = None
         self._smooth_climb = self._smooth_wanted = 0.0  # measured and asked for, equally late
+        self._smooth_height = 0.0
         self._blind_ns: int | None = None
         self._sink = 1.0
         self._asked_ns: int | None = None  # when a take-off was asked for that has not begun
@@ -259,7 +260,7 @@ class SetpointController:
         self.phase, self._since_ns = phase, now_ns
         self._abort_ns = self._still_ns = self._blind_ns = None
         self._sink, self._asked_ns = 1.0, None
-        self._smooth_climb = self._smooth_wanted = 0.0
+        self._smooth_climb = self._smooth_wanted = self._smooth_height = 0.0
         self._cut = self._cut and phase is Phase.STANDING
         if phase is Phase.SPOOLING:
             self.throttle = IDLE if self.hover is None else SPOOL_FROM * self.hover
@@ -407,9 +408,8 @@ class SetpointController:
             lacking = "nothing is received from it" if motion.precise else "its climb is no longer measured"
             self._give_up(lacking, now_ns)
             return
-        high, fast = LIFTED[motion.precise]
-        if motion.climb_m_s > fast or (motion.height_m is not None and motion.height_m > high):
-            carried = max(SPOOL_FROM * self.throttle, self.throttle - SPOOL_PER_S * LATE_S)
+        if self._lifted(motion.climb_m_s, motion.height_m or 0.0, step_s):
+            carried = max(SPOOL_FROM * self.throttle, self.throttle - SPOOL_PER_S * LATE_S[motion.precise])
             if self.hover is not None:  # of an earlier flight
                 carried = max((1 - OTHER) * carried, min((1 + OTHER) * carried, self.hover))
             self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, carried))
@@ -418,6 +418,16 @@ class SetpointController:
             self._give_up(f"it did not leave the ground at {self.limits.throttle:.0%} throttle", now_ns)
         elif self._abort_ns is None:
             self.throttle = min(self.limits.throttle, self.throttle + SPOOL_PER_S * step_s)
+
+    def _lifted(self, climb: float, height: float, step_s: float) -> bool:
+        """Return whether it has left the ground: by poses once noise can't be what shows it."""
+        if self._motion.precise:
+            share = 1 - math.exp(-step_s / SMOOTH_S)
+            self._smooth_climb += share * (climb - self._smooth_climb)
+            self._smooth_height += share * (height - self._smooth_height)
+            climb, height = self._smooth_climb, self._smooth_height
+        high, fast = LIFTED[self._motion.precise]
+        return climb > fast or height > high
 
     def _give_up(self, why: str, now_ns: int) -> None:
         self._refused = why, now_ns

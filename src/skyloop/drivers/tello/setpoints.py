@@ -117,7 +117,7 @@ class SetpointController:
         self._sent_ns: int | None = None  # the take-off or landing
         self._rises_until_ns = 0  # a take-off was sent, and may show until then
         self._state_ns = 0  # when its state came last
-        self._was_in_air = False  # when its state came last
+        self._was_in_air = False  # when its state came last, or it was to rise just then
         self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
         self._events: list[VehicleEvent] = []
 
@@ -128,7 +128,7 @@ class SetpointController:
 
     @property
     def flies_unheard(self) -> bool:
-        """Whether it flew when it was heard last, and may still."""
+        """Whether it flew or was to rise when it was heard last, and may fly still."""
         return not self.receiving and self._was_in_air
 
     def flight_state(self) -> FlightState:
@@ -275,6 +275,7 @@ class SetpointController:
     def lost(self, now_ns: int) -> None:
         """Cancel a take-off and level the sticks: nothing is received any more. A landing is still sent."""
         self.receiving = False
+        self._was_in_air |= now_ns < self._rises_until_ns
         if self._decision is Decision.TAKE_OFF:
             self._decide(Decision.STAY, now_ns)
         self._stick = LEVEL

@@ -179,7 +179,8 @@ class FlightWatch:
 
     def _rises(self, high: bool, motors: bool | None, in_phase_ns: int) -> bool:
         """Return whether a drone that stood does not any more. Being carried about is no take-off."""
-        if self.rising and (high or motors):
+        begun = self._counted_ns is not None and self._counted_ns > self._phase_ns  # or they ran before it landed
+        if self.rising and (high or (motors and begun)):
             return True
         return bool(high and motors and in_phase_ns > GRACE_NS)
 
