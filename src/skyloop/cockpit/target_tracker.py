@@ -20,9 +20,9 @@ from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.cockpit.kept_frames import KEPT_S
 from skyloop.control.follow_target import detections_of
 from skyloop.errors import DecodeError, MissingExtraError, SkyloopError, UsageError
+from skyloop.estimation import assignment
 from skyloop.messages import Text
 from skyloop.vision import LongTermTracker
-from skyloop.vision.object_tracks import assignment
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
@@ -48,7 +48,7 @@ def warm_up() -> None:
         tracker = LongTermTracker()
         tracker.start(noise, (32.0, 32.0, 24.0, 32.0))
         tracker.update(noise)
-        assignment()
+        assignment("following a target", "vision")
 
 
 class Follower(Protocol):
