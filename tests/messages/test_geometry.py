@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from skyloop.messages import Feedback
-from skyloop.messages.geometry import euler_from_rotation, quaternion_from_euler, rotation_from_euler, wrap_angle
+from skyloop.messages.geometry import (
+    clamped,
+    euler_from_rotation,
+    in_16_bits,
+    quaternion_from_euler,
+    rotation_from_euler,
+    turned,
+    within,
+    wrap_angle,
+)
 
 angles = st.floats(-math.pi + 1e-6, math.pi - 1e-6)
 pitches = st.floats(-math.pi / 2 + 1e-3, math.pi / 2 - 1e-3)
@@ -49,6 +58,15 @@ def test_wrapped_angles_are_the_same_angle(angle: float) -> None:
     assert -math.pi <= wrapped < math.pi
     assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
     assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
+
+
+def test_a_quarter_turn_is_counter_clockwise() -> None:
+    assert turned(1.0, 0.0, math.pi / 2) == pytest.approx((0.0, 1.0))
+
+
+def test_nan_is_in_the_middle_of_any_range() -> None:
+    assert (clamped(math.nan, 2.0), within(math.nan, 2.0, 3.0), in_16_bits(math.nan)) == (0.0, 2.0, 0)
+    assert (in_16_bits(4e4), in_16_bits(-math.inf)) == (32767, -32768)
 
 
 def test_feedback_gives_its_rotation_once_it_knows_it() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -78,6 +79,9 @@ def test_box_and_score_are_the_networks(made: list[Network], weights: Path) -> N
     made[0].score, made[0].found = 1.2, (10, 20, 0, 40)
     found = tracker.update(IMAGE)
     assert (found.lost, found.score) == (True, 1.0)
+    made[0].score, made[0].found = math.nan, (10, 20, 30, 40)
+    found = tracker.update(IMAGE)
+    assert (found.lost, found.score) == (True, 0.0)
 
 
 def test_grey_images_are_coloured(made: list[Network], weights: Path) -> None:

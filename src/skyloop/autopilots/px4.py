@@ -22,6 +22,7 @@ from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_
 from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
 from skyloop.errors import UsageError
 from skyloop.files import wait_readable
+from skyloop.messages.geometry import in_16_bits
 from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, geodetic
 from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.sim.rotor_parameters import InstrumentParameters
@@ -297,10 +298,10 @@ class Px4(CoupledFirmware):
             round(latitude * 1e7),
             round(longitude * 1e7),
             round(altitude * 1000.0),
-            *(_short(v * 100.0) for v in (north, east, down)),
+            *(in_16_bits(v * 100.0) for v in (north, east, down)),
             speed_cm_s,
             speed_cm_s,
-            *(_short(a / 9.80665 * 1000.0) for a in flip(*readings.acceleration_m_s2)),
+            *(in_16_bits(a / 9.80665 * 1000.0) for a in flip(*readings.acceleration_m_s2)),
         )
 
     def _range(self, range_m: float) -> Any:
@@ -318,10 +319,6 @@ def _commands(controls: list[float]) -> Commands | None:
         return None
     front_right, rear_left, front_left, rear_right = (max(0.0, motor) for motor in motors)
     return front_left, front_right, rear_left, rear_right
-
-
-def _short(value: float) -> int:
-    return max(-32768, min(32767, round(value)))
 
 
 def _runs(instance: int) -> bool:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped
 from skyloop.messages import Feedback, FlightState, Vector, Velocity
-from skyloop.messages.geometry import rotation_from_euler, wrap_angle
+from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 
 Array = NDArray[np.float64]
 
@@ -77,8 +77,7 @@ class Motion:
 
     def to_body(self, horizontal: Array) -> tuple[float, float]:
         """Turn a horizontal vector (2,) from odometry axes into forward and left of the levelled body."""
-        c, s = math.cos(self.yaw), math.sin(self.yaw)
-        return float(c * horizontal[0] + s * horizontal[1]), float(c * horizontal[1] - s * horizontal[0])
+        return turned(float(horizontal[0]), float(horizontal[1]), -self.yaw)
 
     def stiffened(self, wanted: Array, share: float) -> Array:
         """Add a share of the present velocity error to a wanted velocity.
@@ -275,9 +274,8 @@ class TiltVelocity:
             push = GRAVITY_M_S2 * up[:2] / max(_STEEPEST, up[2])
             kept = math.exp(-self.drag_per_s * min(dt_s, STALE_S))
             self._velocity = kept * self._velocity + (1.0 - kept) / self.drag_per_s * push
-        c, s = math.cos(yaw), math.sin(yaw)
         x, y = self._velocity.tolist()
-        return c * x + s * y, c * y - s * x, 0.0
+        return *turned(x, y, -yaw), 0.0
 
 
 class AirframeLaw:

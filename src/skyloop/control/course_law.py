@@ -22,7 +22,7 @@ from skyloop.control.gate_law import Axis, GatePhase
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
 from skyloop.messages import Feedback
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import turned, wrap_angle
 
 Array = NDArray[np.float64]
 _SURE = 3.0  # standard deviations within which a sighting is of that pole
@@ -327,7 +327,9 @@ class CourseLaw(VelocityLaw):
         if self._seen >= s.sightings:
             goals = [gate - ahead * before for before in s.before_m]
         else:
-            goals = [gate - _turned(ahead, side) * far for far in s.views_m for side in (0.0, 0.5, -0.5)]
+            x, y = ahead.tolist()
+            ways = [np.asarray(turned(x, y, side)) for side in (0.0, 0.5, -0.5)]
+            goals = [gate - way * far for far in s.views_m for way in ways]
             goals = sorted(goals, key=lambda goal: self._hides(goal, gate, ahead))  # (keeps the order of equals)
             goals = goals[self._view :] + goals[: self._view]
         free = [goal for goal in goals if _room(goal, walls) >= 0.0]
@@ -421,11 +423,6 @@ class _Spot:
         self.place = self.place + gain @ sighting.miss
         # The odometry drifts: nothing is known better than to some centimetres.
         self._covariance = (np.eye(2) - gain) @ self._covariance + np.eye(2) * 1e-5
-
-
-def _turned(vector: Array, angle: float) -> Array:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
 def _room(place: Array, walls: Sequence[Wall]) -> float:

@@ -18,7 +18,7 @@ from skyloop.control.limiting import within
 from skyloop.control.waypoint import Waypoint, WaypointSettings, lacking, reached, velocity_to
 from skyloop.errors import NoAnswerError, SkyloopError, UnknownNameError, UsageError
 from skyloop.messages import AnyAction, Feedback, FlightState, Vector, Velocity
-from skyloop.messages.geometry import rotation_from_euler
+from skyloop.messages.geometry import rotation_from_euler, turned
 
 if TYPE_CHECKING:
     from skyloop.client import Swarm
@@ -257,7 +257,7 @@ class Formation:
         """Send each drone towards its goal, which moves by ``drift`` [m/s], and clear of the others."""
         towards = {name: velocity_to(goals[name], now[name], self._settings) for name in now}
         positions = _positions({**now, **others})
-        wanted = [_turned(towards[name], now[name], 1.0) + drift[name] for name in now]
+        wanted = [_in_world(towards[name], now[name]) + drift[name] for name in now]
         wanted += [_world_velocity(sample) for sample in others.values()]
         if len(positions) > 1:
             self._closest_m = min(self._closest_m, closest_approach(positions, positions).distance_m)
@@ -351,19 +351,17 @@ def _vector(place: NDArray[np.float64]) -> Vector:
     return x, y, z
 
 
-def _turned(velocity: Velocity, sample: Feedback, way: float) -> NDArray[np.float64]:
-    """Turn a velocity from the body's levelled axes into the world's, or back with ``way`` -1."""
-    rotation = rotation_from_euler(0.0, 0.0, way * (sample.yaw_rad or 0.0))
-    return np.asarray(rotation @ (velocity.forward, velocity.left, velocity.up), dtype=np.float64)
-
-
 def _world_velocity(sample: Feedback) -> NDArray[np.float64]:
     """Return the reported velocity in world axes; zero for a drone that does not report it, or not its yaw."""
     if sample.yaw_rad is None:
         return np.zeros(3)
-    return _turned(Velocity(*(sample.velocity_m_s or (0.0, 0.0, 0.0))), sample, 1.0)
+    return _in_world(Velocity(*(sample.velocity_m_s or (0.0, 0.0, 0.0))), sample)
+
+
+def _in_world(velocity: Velocity, sample: Feedback) -> NDArray[np.float64]:
+    return np.array([*turned(velocity.forward, velocity.left, sample.yaw_rad or 0.0), velocity.up])
 
 
 def _command(world: NDArray[np.float64], sample: Feedback, yaw_rate: float) -> Velocity:
-    forward, left, up = _vector(_turned(Velocity(*_vector(world)), sample, -1.0))
-    return Velocity(forward, left, up, yaw_rate)
+    x, y, up = _vector(world)
+    return Velocity(*turned(x, y, -(sample.yaw_rad or 0.0)), up, yaw_rate)

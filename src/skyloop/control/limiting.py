@@ -14,20 +14,13 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.messages import Value, Velocity
+from skyloop.messages.geometry import clamped, within
+
+__all__ = ["GRAVITY_M_S2", "SetpointLimiter", "SetpointLimits", "clamped", "lowered", "shortened", "within"]
 
 Array = NDArray[np.float64]
 GRAVITY_M_S2 = 9.80665  #: standard gravity
 _LONGEST_STEP_S = 0.2  # a longer pause gives no right to a larger step
-
-
-def within(value: float, low: float, high: float) -> float:
-    """Return the nearest value from ``low`` to ``high``; NaN counts as 0."""
-    return max(low, min(high, 0.0 if math.isnan(value) else value))
-
-
-def clamped(value: float, longest: float) -> float:
-    """Return the nearest value within ±``longest``; NaN counts as 0."""
-    return within(value, -longest, longest)
 
 
 def shortened(vector: Array, longest: float) -> Array:

@@ -23,7 +23,7 @@ from skyloop.control.pid import Gains, VectorPi
 from skyloop.control.position import Fix
 from skyloop.errors import UsageError
 from skyloop.messages import Value, Velocity
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import turned, wrap_angle
 
 Array = NDArray[np.float64]
 _LONGEST_STEP_S = 0.5  # a longer gap between two fixes does not move the path on by more
@@ -162,12 +162,9 @@ class PathLaw:
         wanted = ahead + self._loop.step(target - fix.position_m, min(dt_s, _LONGEST_STEP_S))
         if fix.velocity_m_s is not None:
             wanted += self.settings.velocity_gain * (wanted - fix.velocity_m_s)
-        c, s = math.cos(fix.yaw_rad), math.sin(fix.yaw_rad)
-        turn = self._turn(fix)
-        velocity = self._limiter.step(
-            np.array([c * wanted[0] + s * wanted[1], c * wanted[1] - s * wanted[0], wanted[2], turn]), dt_s
-        )
-        asked = (c * velocity.forward - s * velocity.left, s * velocity.forward + c * velocity.left, velocity.up)
+        x, y, up = wanted.tolist()
+        velocity = self._limiter.step(np.array([*turned(x, y, -fix.yaw_rad), up, self._turn(fix)]), dt_s)
+        asked = (*turned(velocity.forward, velocity.left, fix.yaw_rad), velocity.up)
         self._loop.applied(wanted, np.array(asked))
         return velocity
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from skyloop.control.airframe import Airframe
 from skyloop.messages import Feedback, Vector
+from skyloop.messages.geometry import turned
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -90,5 +91,4 @@ def _world_velocity(velocity: Vector | None, yaw: float) -> Vector | None:
     if velocity is None:
         return None
     forward, left, up = velocity
-    c, s = math.cos(yaw), math.sin(yaw)
-    return c * forward - s * left, s * forward + c * left, up
+    return *turned(forward, left, yaw), up

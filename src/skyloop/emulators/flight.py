@@ -9,10 +9,10 @@ from typing import Final
 from skyloop.emulators.vehicle import Vehicle
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Hover, Land, ResetEmergency, Takeoff
 from skyloop.messages import Velocity as VelocityAction
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import clamped, turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits
-from skyloop.wire.mavlink.axes import Vector, turned
+from skyloop.wire.mavlink.axes import Vector
 
 LIFT_M: Final = 0.3  #: what the simulated vehicle's own take-off does, before these loops go on
 LIMITS: Final = Limits(
@@ -169,7 +169,7 @@ class FlightControl:
 
     def yaw_rate_to(self, yaw: float) -> float:
         """Return the yaw rate that turns to this heading [rad/s]."""
-        return max(-YAW_RATE_RAD_S, min(YAW_RATE_RAD_S, YAW_GAIN_PER_S * wrap_angle(yaw - self.yaw)))
+        return clamped(YAW_GAIN_PER_S * wrap_angle(yaw - self.yaw), YAW_RATE_RAD_S)
 
     def _fly(self, action: AnyAction) -> None:
         if not action.finite:

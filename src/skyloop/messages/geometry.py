@@ -1,4 +1,7 @@
-"""Rotations as NumPy matrices and quaternions, with the axes and signs of ROS REP 103."""
+"""Numbers within limits, angles, and rotations as NumPy matrices and quaternions, with the axes of ROS REP 103. Pure.
+
+NaN passes no limit: it counts as 0, or as the number of the range that is nearest to 0.
+"""
 
 from __future__ import annotations
 
@@ -71,3 +74,24 @@ def euler_from_rotation(rotation: NDArray[np.float64]) -> tuple[float, float, fl
 def wrap_angle(angle: _Angle) -> _Angle:
     """Return the same angle, or angles in an array, within [-π, π) [rad]."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def turned(x: float, y: float, angle: float) -> tuple[float, float]:
+    """Turn a vector counter-clockwise [rad]: by the yaw, one in levelled body axes becomes one in world axes."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return cos * x - sin * y, sin * x + cos * y
+
+
+def within(value: float, low: float, high: float) -> float:
+    """Return the nearest value from ``low`` to ``high``; NaN counts as 0."""
+    return max(low, min(high, 0.0 if math.isnan(value) else value))
+
+
+def clamped(value: float, longest: float) -> float:
+    """Return the nearest value within ±``longest``; NaN counts as 0."""
+    return within(value, -longest, longest)
+
+
+def in_16_bits(value: float) -> int:
+    """Return the nearest whole number that a signed field of 16 bits holds."""
+    return round(within(value, -0x8000, 0x7FFF))

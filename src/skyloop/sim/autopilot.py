@@ -17,6 +17,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.messages.geometry import clamped
 from skyloop.sim.battery import Batteries
 from skyloop.sim.collisions import Contacts
 from skyloop.sim.control_loops import ControlLoops
@@ -211,14 +212,10 @@ class Autopilot:
 
 def clamp(action: Attitude | Velocity, limits: Limits) -> Attitude | Velocity:
     """Limit a set-point. The horizontal velocity keeps its direction."""
-    yaw_rate = _within(action.yaw_rate, limits.yaw_rate_rad_s)
+    yaw_rate = clamped(action.yaw_rate, limits.yaw_rate_rad_s)
     if isinstance(action, Attitude):
-        roll, pitch = _within(action.roll, limits.tilt_rad), _within(action.pitch, limits.tilt_rad)
-        return Attitude(roll, pitch, _within(action.climb, limits.climb_m_s), yaw_rate)
+        roll, pitch = clamped(action.roll, limits.tilt_rad), clamped(action.pitch, limits.tilt_rad)
+        return Attitude(roll, pitch, clamped(action.climb, limits.climb_m_s), yaw_rate)
     speed = (action.forward**2 + action.left**2) ** 0.5
     share = min(1.0, limits.speed_m_s / speed) if speed > 0 else 1.0
-    return Velocity(action.forward * share, action.left * share, _within(action.up, limits.climb_m_s), yaw_rate)
-
-
-def _within(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value))
+    return Velocity(action.forward * share, action.left * share, clamped(action.up, limits.climb_m_s), yaw_rate)

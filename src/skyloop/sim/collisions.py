@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from skyloop.messages.geometry import clamped
 from skyloop.sim.broad_phase import Indices, overlapping
 from skyloop.sim.columns import ARRAYS, NUMBERS, N, Operations, few
 from skyloop.sim.dynamics import STEP_S, BodyTable, column
@@ -312,8 +313,7 @@ class Collisions:
         With pressure p = F / πR² its torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
         """
         most = self._friction[drone] * impulse_m_s * (4 / 3) / self._radii[drone]
-        change = max(-most, min(most, spin_rad_s - float(self._bodies.rates[2, drone])))
-        self._bodies.turn(drone, change)
+        self._bodies.turn(drone, clamped(spin_rad_s - float(self._bodies.rates[2, drone]), most))
 
     # Drones ----------------------------------------------------------------------------------------------------
 

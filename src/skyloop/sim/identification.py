@@ -22,6 +22,7 @@ import numpy as np
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import read_text
 from skyloop.messages import Attitude, Takeoff
+from skyloop.messages.geometry import clamped
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.parameters import Limits, VehicleParameters, with_ideal_sensors
 from skyloop.sim.simulation import Simulation
@@ -216,7 +217,7 @@ def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: fl
     for number, value in enumerate(_held(command, times)):
         if value != given:
             given = value
-            share = min(max(given / FULL_TILT_COMMAND, -1.0), 1.0)
+            share = clamped(given / FULL_TILT_COMMAND, 1.0)
             for drone in drones:
                 simulation.command(drone, Attitude(pitch=share * limits.tilt_rad))
         for drone in drones:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skyloop.errors import UsageError
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import clamped, wrap_angle
 from skyloop.sim.streams import Purpose, stream
 from skyloop.sim.world import (
     AlongYaw,
@@ -217,7 +217,7 @@ def _with_yaw(positions: Iterator[tuple[Vec3, Vec3]], yaw: Yaw) -> Iterator[_Poi
             heading = 0.0 if wanted is None else wanted
         elif wanted is not None and not isinstance(yaw, FixedYaw):
             most = yaw.turn_rate_rad_s * GRID_S
-            heading += max(-most, min(most, wrap_angle(wanted - heading)))
+            heading += clamped(wrap_angle(wanted - heading), most)
         walked += 0.0 if last is None else math.dist(position, last)
         last = position
         yield _Point(position, velocity, heading, walked)

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from skyloop.messages.geometry import within
 from skyloop.vision.opencv import opencv
 from skyloop.vision.patches import Floats, features, patch
 from skyloop.vision.tracking import Box, Image, overlap
@@ -47,7 +48,7 @@ class Appearance:
 
     def similarity(self, other: Appearance) -> float:
         """Return how much they look alike, 0 to 1: texture and colour must both agree."""
-        texture = min(max(float(self.texture @ other.texture), 0.0), 1.0)
+        texture = within(float(self.texture @ other.texture), 0.0, 1.0)
         colour = float(np.abs(self.colour - other.colour).mean()) if self.colour.size else 0.0
         return texture * math.exp(-_COLOUR_WEIGHT * colour)
 

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.messages.geometry import within
 from skyloop.vision.opencv import opencv
 from skyloop.vision.patches import CELL, Floats, features, patch
 from skyloop.vision.tracking import Box, Image, Tracker, TrackResult
@@ -113,7 +114,7 @@ class CorrelationTracker(Tracker):
     def _update(self, image: Image) -> TrackResult:
         response = np.fft.irfft2(self._filter.response(self._spectrum(image)), s=self._window.shape)
         row, column = np.unravel_index(int(np.argmax(response)), response.shape)
-        score = float(min(max(response[row, column], 0.0), 1.0))
+        score = within(float(response[row, column]), 0.0, 1.0)
         rows, columns = response.shape
         moved = np.array(
             [

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from skyloop.errors import FileFormatError, UnsupportedError, UsageError
+from skyloop.messages.geometry import within
 from skyloop.vision import onnx
 from skyloop.vision.opencv import opencv
 from skyloop.vision.tracking import Box, Image, Tracker, TrackResult
@@ -70,7 +71,7 @@ class LearnedTracker(Tracker):
 
     def _update(self, image: Image) -> TrackResult:
         _, found = self._call("update", self._coloured(image))
-        score = min(max(float(self._tracker.getTrackingScore()), 0.0), 1.0)
+        score = within(float(self._tracker.getTrackingScore()), 0.0, 1.0)
         x, y, width, height = (float(part) for part in found)
         lost = score < self._lost_below or width <= 0 or height <= 0
         return TrackResult(None if lost else (x, y, width, height), score)

@@ -26,6 +26,7 @@ ANGLES = st.floats(-10.0, 10.0)
         (Attitude(yaw_rate=0.875), Stick(0.0, 0.0, 0.0, -0.5)),  # counter-clockwise
         (Attitude(-0.2, -0.2, -0.7, -1.75), Stick(-1.0, 1.0, -1.0, 1.0)),
         (Attitude(-9.0, 9.0, 9.0, 9.0), Stick(-1.0, -1.0, 1.0, -1.0)),
+        (Attitude(*[math.nan] * 4), Stick(0.0, 0.0, 0.0, 0.0)),  # and not full ones
     ],
 )
 def test_signs_and_scale(asked: Attitude, stick: Stick) -> None:

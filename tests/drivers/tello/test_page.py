@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 from skyloop.drivers.tello import options
 from skyloop.drivers.tello.parameters import SETTINGS, flip_parameter, scale_parameters
 from skyloop.drivers.tello.protocol import ALIVE_NS, DEGRADED_NS, ENTER_NS, LOST_NS
-from skyloop.drivers.tello.setpoints import Scale
+from skyloop.drivers.tello.setpoints import Scale, sticks_of
+from skyloop.messages import Attitude, Velocity
 from tests.docs.pages import rows, section
 
 
@@ -41,3 +43,8 @@ def test_what_a_full_stick_is() -> None:
     full = Scale()
     assert (full.speed, full.climb, full.yaw_rate) == (1.0, 1.0, 1.75)
     assert "taken for 1 m/s, 1 m/s of climb and 1.75 rad/s" in section("docs/tello.md", "## The driver")
+
+
+def test_nan_is_no_full_stick() -> None:
+    for action in (Attitude, Velocity):
+        assert sticks_of(action(*[math.nan] * 4), Scale(), Scale()) == sticks_of(action(), Scale(), Scale())

@@ -132,4 +132,3 @@ def test_north_is_north() -> None:
     assert axes.yaw_between(0.0) == pytest.approx(math.pi / 2)
     assert axes.swap(1.0, 2.0, 3.0) == (2.0, 1.0, -3.0)
     assert axes.flip(1.0, 2.0, 3.0) == (1.0, -2.0, -3.0)
-    assert axes.turned(1.0, 0.0, math.pi / 2) == pytest.approx((0.0, 1.0))

@@ -30,6 +30,7 @@ from skyloop.messages import (
     Severity,
     Takeoff,
 )
+from skyloop.messages.geometry import clamped
 from skyloop.wire.ardrone.at import AtMessage, Pcmd, Ref
 from skyloop.wire.ardrone.configuration import parse_value
 from skyloop.wire.ardrone.navdata import ControlState, State
@@ -77,10 +78,10 @@ def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
         yaw=_share(-action.yaw_rate, limits.yaw_rate_rad_s),
     )
     applied = Attitude(
-        roll=_within(action.roll, limits.tilt_rad),
-        pitch=_within(action.pitch, limits.tilt_rad),
-        climb=_within(action.climb, limits.climb_m_s),
-        yaw_rate=_within(action.yaw_rate, limits.yaw_rate_rad_s),
+        roll=clamped(action.roll, limits.tilt_rad),
+        pitch=clamped(action.pitch, limits.tilt_rad),
+        climb=clamped(action.climb, limits.climb_m_s),
+        yaw_rate=clamped(action.yaw_rate, limits.yaw_rate_rad_s),
     )
     return stick, applied
 
@@ -103,11 +104,7 @@ def motion(stick: Stick | None, reference_rad: float | None = None) -> AtMessage
 
 
 def _share(value: float, limit: float) -> float:
-    return max(-1.0, min(1.0, value / limit)) + 0.0  # without a negative zero
-
-
-def _within(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value))
+    return clamped(value / limit, 1.0) + 0.0  # without a negative zero
 
 
 TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not started by then refuses to

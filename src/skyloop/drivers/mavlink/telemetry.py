@@ -12,7 +12,8 @@ from skyloop.clock import NS_PER_S, seconds
 from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.earth import EarthOrigin
-from skyloop.wire.mavlink.axes import Vector, flip, swap, turned, yaw_between
+from skyloop.messages.geometry import turned
+from skyloop.wire.mavlink.axes import Vector, flip, swap, yaw_between
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.modes import Landed, ModeFlag, SystemState
 from skyloop.wire.mavlink.texts import Texts

@@ -19,6 +19,7 @@ from skyloop.drivers.msp.motion import Motion
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Idle, ResetEmergency, Severity
+from skyloop.messages.geometry import clamped
 from skyloop.wire.msp.curves import Curve, stick_for
 from skyloop.wire.msp.names import ARM_SWITCH, explained
 
@@ -197,8 +198,8 @@ class SetpointController:
         self._wanted = Attitude(
             roll=action.roll * share,
             pitch=action.pitch * share,
-            climb=_within(action.climb, limits.climb),
-            yaw_rate=_within(action.yaw_rate, min(limits.yaw_rate, self._turn(1.0))),
+            climb=clamped(action.climb, limits.climb),
+            yaw_rate=clamped(action.yaw_rate, min(limits.yaw_rate, self._turn(1.0))),
         )
         if self.phase is Phase.ARMING and self._wanted.climb <= 0:
             self._enter(Phase.STANDING, now_ns)  # nobody wants it any more: it must not arm when it can
@@ -422,10 +423,10 @@ class SetpointController:
             self._blind_ns = None
             self._events.append(message("no longer: its climb is not measured", "blind", active=False))
         error = self._wanted.climb - climb
-        lift = _within(self.gains.climb_p * error, LIFT_M_S2)
+        lift = clamped(self.gains.climb_p * error, LIFT_M_S2)
         stands = self._stands(climb, step_s, now_ns)
         if not stands:
-            hover *= 1 + self.gains.climb_i * _within(error, 1.0) * step_s / GRAVITY_M_S2
+            hover *= 1 + self.gains.climb_i * clamped(error, 1.0) * step_s / GRAVITY_M_S2
             self.hover = hover = max(LEAST_LEARNT, min(MOST_LEARNT, hover))
         upright = max(0.5, math.cos(self._wanted.roll) * math.cos(self._wanted.pitch))
         wanted = hover * (1 + lift / GRAVITY_M_S2) / upright * self._sink
@@ -457,7 +458,3 @@ class SetpointController:
             self._enter(Phase.STANDING, now_ns)
             return
         self.throttle = min(self.limits.throttle, BLIND * hover)
-
-
-def _within(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value))

@@ -28,6 +28,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.messages.geometry import clamped
 from skyloop.wire.tello.commands import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, LEVEL, MAX_STICK, Stick
 from skyloop.wire.tello.replies import is_error
 
@@ -59,19 +60,19 @@ def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[
     if isinstance(action, Velocity):
         speed = min(full.speed, limits.speed)
         applied = Velocity(
-            forward=_within(action.forward, speed),
-            left=_within(action.left, speed),
-            up=_within(action.up, climb),
-            yaw_rate=_within(action.yaw_rate, yaw),
+            forward=clamped(action.forward, speed),
+            left=clamped(action.left, speed),
+            up=clamped(action.up, climb),
+            yaw_rate=clamped(action.yaw_rate, yaw),
         )
         right, ahead = -applied.left / full.speed, applied.forward / full.speed
         return _stick(right, ahead, applied.up / full.climb, applied.yaw_rate / full.yaw_rate), applied
     tilt = min(full.tilt, limits.tilt)
     level = Attitude(
-        roll=_within(action.roll, tilt),
-        pitch=_within(action.pitch, tilt),
-        climb=_within(action.climb, climb),
-        yaw_rate=_within(action.yaw_rate, yaw),
+        roll=clamped(action.roll, tilt),
+        pitch=clamped(action.pitch, tilt),
+        climb=clamped(action.climb, climb),
+        yaw_rate=clamped(action.yaw_rate, yaw),
     )
     right, ahead = level.roll / full.tilt, level.pitch / full.tilt
     return _stick(right, ahead, level.climb / full.climb, level.yaw_rate / full.yaw_rate), level
@@ -79,10 +80,6 @@ def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[
 
 def _stick(right: float, forward: float, up: float, turn: float) -> Stick:
     return Stick(*(round(MAX_STICK * share) for share in (right, forward, up, -turn)))
-
-
-def _within(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value))
 
 
 AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that does not show is sent again

@@ -11,6 +11,7 @@ from typing import Final
 
 from skyloop.emulators.ardrone.configuration import Configuration
 from skyloop.messages import Attitude, Hover
+from skyloop.messages.geometry import clamped, turned, within
 from skyloop.sim.parameters import GRAVITY_M_S2, LIMIT_RANGES, Limits
 from skyloop.wire.ardrone.at import Pcmd
 
@@ -68,31 +69,21 @@ def set_point(
     if not progress.flags & Pcmd.PROGRESSIVE:
         return Hover()
     most_tilt = configuration.number("control:euler_angle_max")
-    right, ahead = _share(progress.roll), -_share(progress.pitch)
+    right, ahead = clamped(progress.roll, 1.0), -clamped(progress.pitch, 1.0)
     if progress.flags & Pcmd.ABSOLUTE and progress.heading is not None:
-        right, ahead = _turned(right, ahead, _clockwise_from_north(yaw_rad) - progress.heading * math.pi)
+        # Meant for a heading that is so much less far clockwise than the drone's.
+        right, ahead = turned(right, ahead, _clockwise_from_north(yaw_rad) - progress.heading * math.pi)
     roll, pitch = right * most_tilt, ahead * most_tilt
-    yaw_rate = -_share(progress.yaw) * configuration.number("control:control_yaw")
+    yaw_rate = -clamped(progress.yaw, 1.0) * configuration.number("control:control_yaw")
     if progress.flags & Pcmd.COMBINED_YAW and int(configuration.number("control:control_level")) & _COMBINED_YAW_LEVEL:
         yaw_rate -= GRAVITY_M_S2 * math.tan(roll) / max(forward_m_s, _LEAST_TURNING_SPEED_M_S)
-    climb = _share(progress.gaz) * configuration.number("control:control_vz_max") / 1000
+    climb = clamped(progress.gaz, 1.0) * configuration.number("control:control_vz_max") / 1000
     return Attitude(roll, pitch, climb, yaw_rate)
-
-
-def _turned(right: float, ahead: float, by_rad: float) -> tuple[float, float]:
-    """Turn shares meant for a heading that is ``by_rad`` less far clockwise than the drone's into the drone's own."""
-    sin, cos = math.sin(by_rad), math.cos(by_rad)
-    return cos * right - sin * ahead, sin * right + cos * ahead
 
 
 def _clockwise_from_north(yaw_rad: float) -> float:
     return math.pi / 2 - yaw_rad
 
 
-def _share(value: float) -> float:
-    return max(-1.0, min(1.0, value))
-
-
 def _possible(name: str, value: float) -> float:
-    low, high = LIMIT_RANGES[name]
-    return max(low, min(high, value))
+    return within(value, *LIMIT_RANGES[name])

@@ -44,8 +44,8 @@ from skyloop.emulators.mavlink.setpoints import (
     target_of,
 )
 from skyloop.emulators.vehicle import Vehicle
-from skyloop.messages.geometry import wrap_angle
-from skyloop.wire.mavlink.axes import turned, yaw_between
+from skyloop.messages.geometry import turned, wrap_angle
+from skyloop.wire.mavlink.axes import yaw_between
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import COPTER_MODES, COPTER_NUMBERS

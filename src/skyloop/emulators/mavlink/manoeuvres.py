@@ -10,7 +10,7 @@ from typing import Final
 
 from skyloop.emulators.flight import USUAL, YAW_GAIN_PER_S, FlightControl, Speeds
 from skyloop.emulators.mavlink.setpoints import AttitudeTarget, Target
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import clamped, wrap_angle
 from skyloop.wire.mavlink.axes import Vector
 
 _THERE_M: Final = 0.3
@@ -51,7 +51,7 @@ class Turn:
         """Return the yaw rate now [rad/s]. Called at every tick."""
         self._left -= wrap_angle(self._flyer.yaw - self._yaw)
         self._yaw = self._flyer.yaw
-        return max(-self._fastest, min(self._fastest, YAW_GAIN_PER_S * self._left))
+        return clamped(YAW_GAIN_PER_S * self._left, self._fastest)
 
 
 class Manoeuvres:

@@ -9,7 +9,7 @@ from typing import ClassVar, Final, Protocol
 from skyloop.emulators.flight import FlightControl
 from skyloop.emulators.mavlink.places import ORIGIN, geodetic
 from skyloop.messages import FlightState
-from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.messages.geometry import in_16_bits, quaternion_from_euler
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.wire.mavlink.axes import Vector, flip, swap, to_wire, yaw_between
@@ -155,14 +155,9 @@ def _imu(a: AutopilotState) -> Message:
     return m.MAVLink_highres_imu_message(a.boot_ms * 1000, *force, *rates, 0.2, 0.0, 0.4, 955.0, 0.0, 488.0, 20.0, 63)
 
 
-def _in_16_bits(value: float) -> int:
-    """Return it as a sensor does, whose range ends."""
-    return max(-0x8000, min(0x7FFF, round(value)))
-
-
 def _raw_imu(a: AutopilotState) -> Message:
-    force = (_in_16_bits(each / GRAVITY_M_S2 * 1000) for each in flip(*a.report.believed.acceleration_m_s2))
-    rates = (_in_16_bits(each * 1000) for each in flip(*a.report.believed.angular_velocity_rad_s))
+    force = (in_16_bits(each / GRAVITY_M_S2 * 1000) for each in flip(*a.report.believed.acceleration_m_s2))
+    rates = (in_16_bits(each * 1000) for each in flip(*a.report.believed.angular_velocity_rad_s))
     return m.MAVLink_raw_imu_message(a.boot_ms * 1000, *force, *rates, 200, 0, 400)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Final, Protocol
 
 from skyloop.messages import AnyAction, FlightState, Hover, Land, Takeoff, Velocity
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import clamped, turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.world import Vec3
 
@@ -94,7 +94,7 @@ class Turning:
         self._yaw_rad = report.truth.yaw_rad
         if abs(self._left_rad) < _NEAR_RAD:
             return Hover(), OK
-        return Velocity(yaw_rate=max(-TURN_RAD_S, min(TURN_RAD_S, 2.5 * self._left_rad))), None
+        return Velocity(yaw_rate=clamped(2.5 * self._left_rad, TURN_RAD_S)), None
 
 
 class Going:
@@ -126,5 +126,4 @@ class Going:
             return None, None
         share = min(self._speed_m_s, 1.6 * distance_m) / max(distance_m, 1e-6)
         east, north, up = (part * share for part in offset)
-        cos, sin = math.cos(truth.yaw_rad), math.sin(truth.yaw_rad)
-        return Velocity(forward=cos * east + sin * north, left=cos * north - sin * east, up=up), None
+        return Velocity(*turned(east, north, -truth.yaw_rad), up), None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.emulators.tello.pads import Sighting
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.wire.tello.commands import Sdk
@@ -34,8 +34,7 @@ def fields(snapshot: Snapshot) -> dict[str, str]:
     believed = snapshot.report.believed
     yaw_rad = wrap_angle(believed.yaw_rad - snapshot.start_yaw_rad)
     forward, left, up = believed.velocity_m_s
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    ahead, aside = cos * forward - sin * left, sin * forward + cos * left  # along the heading at the start
+    ahead, aside = turned(forward, left, yaw_rad)  # along the heading at the start
     ax, ay, az = (part / GRAVITY_M_S2 * 1000 for part in believed.acceleration_m_s2)
     altitude_cm = believed.altitude_m * 100
     steep = math.cos(believed.roll_rad) * math.cos(believed.pitch_rad)

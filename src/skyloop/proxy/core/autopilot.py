@@ -18,7 +18,7 @@ from typing import Final
 
 from skyloop.clock import seconds
 from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import clamped, wrap_angle
 from skyloop.proxy.core.flight import STALE_NS, Flight
 
 PERIOD_S: Final = 0.02  #: the pace that it is made for
@@ -196,7 +196,7 @@ class Autopilot:
         if altitude is not None:
             if self._hold_altitude is None:
                 self._hold_altitude = altitude
-            up = _bound((self._hold_altitude - altitude) * ALTITUDE_GAIN, self.settings.climb)
+            up = clamped((self._hold_altitude - altitude) * ALTITUDE_GAIN, self.settings.climb)
         if known.position_m is None or known.yaw_rad is None:
             return Velocity(up=up)
         x, y, _ = known.position_m
@@ -226,7 +226,7 @@ class Autopilot:
             forward=share * (cos * east + sin * north),
             left=share * (cos * north - sin * east),
             up=share * up,
-            yaw_rate=_bound(TURN_GAIN * turn, TURN_RATE if target.turn_rate is None else target.turn_rate),
+            yaw_rate=clamped(TURN_GAIN * turn, TURN_RATE if target.turn_rate is None else target.turn_rate),
         )
 
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
@@ -256,10 +256,6 @@ _MODES: Final = {
     Velocity: Mode.VELOCITY,
     Position: Mode.POSITION,
 }
-
-
-def _bound(value: float, most: float) -> float:
-    return max(-most, min(most, value))
 
 
 def _shorten(x: float, y: float, most: float) -> tuple[float, float]:

@@ -61,9 +61,3 @@ def angles_of(q: Quaternion) -> Vector:
         math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
         math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
     )
-
-
-def turned(forward: float, left: float, yaw: float) -> tuple[float, float]:
-    """Levelled body axes to east and north, for a yaw of ours; by ``-yaw`` the other way."""
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return cos * forward - sin * left, sin * forward + cos * left

@@ -14,6 +14,7 @@ from enum import IntEnum
 from typing import Final, Self
 
 from skyloop.errors import DecodeError
+from skyloop.messages.geometry import in_16_bits
 
 
 class Function(IntEnum):
@@ -225,7 +226,7 @@ class Altitude:
 
     def encode(self) -> bytes:
         """Return the payload."""
-        return _ALTITUDE.pack(round(self.height_m * 100), _short(self.climb_m_s * 100))
+        return _ALTITUDE.pack(round(self.height_m * 100), in_16_bits(self.climb_m_s * 100))
 
 
 _ALTITUDE: Final = struct.Struct("<ih")
@@ -270,12 +271,12 @@ class Battery:
     def state(self) -> bytes:
         """Return the payload of ``BATTERY_STATE``."""
         tenths = min(255, round(self.voltage_v * 10))
-        made = _BATTERY.pack(self.cells, 0, tenths, 0, _short(self.current_a * 100), 0)
+        made = _BATTERY.pack(self.cells, 0, tenths, 0, in_16_bits(self.current_a * 100), 0)
         return made + struct.pack("<H", round(self.voltage_v * 100))
 
     def analog(self) -> bytes:
         """Return the payload of ``ANALOG``."""
-        made = _ANALOG.pack(min(255, round(self.voltage_v * 10)), 0, 0, _short(self.current_a * 100))
+        made = _ANALOG.pack(min(255, round(self.voltage_v * 10)), 0, 0, in_16_bits(self.current_a * 100))
         return made + struct.pack("<H", round(self.voltage_v * 100))
 
 
@@ -346,10 +347,6 @@ class Imu:
 
 
 _IMU: Final = struct.Struct("<9h")
-
-
-def _short(value: float) -> int:
-    return max(-0x8000, min(0x7FFF, round(value)))
 
 
 # Sticks --------------------------------------------------------------------------------------------------------------
