@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skyloop.clock import nanoseconds
-from skyloop.control.turning import TurningTargetFilter
+from skyloop.control.kalman import TurningTargetFilter
 from skyloop.errors import UsageError
 
 Path = Callable[[float], tuple[float, float]]

@@ -21,6 +21,7 @@ from skyloop.control.detour import Point, Wall, detour
 from skyloop.control.gate_law import Axis, GatePhase
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
+from skyloop.estimation import corrected
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import turned, wrap_angle
 
@@ -386,7 +387,7 @@ class CourseLaw(VelocityLaw):
 
 class _Sighting(NamedTuple):
     miss: Array  #: of where a pole is believed, (2,) [m]
-    spread: Array  #: covariance of that, (2, 2) [m²]
+    noise: Array  #: covariance of the sighting, (2, 2) [m²]
     deviations: float  #: how far off that is
 
 
@@ -416,13 +417,12 @@ class _Spot:
         noise = np.outer(ahead, ahead) * along_m**2 + np.outer(aside, aside) * (0.03 + 0.02 * distance) ** 2
         miss, spread = own[:2] + distance * ahead - self.place, self._covariance + noise
         off = float(miss @ np.linalg.solve(spread, miss)) ** 0.5
-        return _Sighting(miss, self._covariance + noise * _REPEATED**2, off)
+        return _Sighting(miss, noise * _REPEATED**2, off)
 
     def update(self, sighting: _Sighting) -> None:
-        gain = self._covariance @ np.linalg.inv(sighting.spread)
-        self.place = self.place + gain @ sighting.miss
+        self.place, known = corrected(self.place, self._covariance, sighting.miss, np.eye(2), sighting.noise)
         # The odometry drifts: nothing is known better than to some centimetres.
-        self._covariance = (np.eye(2) - gain) @ self._covariance + np.eye(2) * 1e-5
+        self._covariance = known + np.eye(2) * 1e-5
 
 
 def _room(place: Array, walls: Sequence[Wall]) -> float:

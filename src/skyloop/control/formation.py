@@ -7,14 +7,14 @@ A shape is an array of positions, shape (n, 3), float64, in metres: x ahead, y l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skyloop.control.limiting import within
-from skyloop.errors import MissingExtraError, UsageError
+from skyloop.errors import UsageError
+from skyloop.estimation import assignment
 from skyloop.messages.geometry import rotation_from_euler
 
 #: Positions of n drones, shape (n, 3), float64 [m].
@@ -172,7 +172,7 @@ def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
     if len(b) > MOST:
         raise UsageError(f"{len(b)} places are more than the {MOST} that can be assigned")
     costs = ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=2)
-    _, columns = solver()(costs)
+    _, columns = assignment("a formation", "control")(costs)
     return [int(column) for column in columns]
 
 
@@ -250,17 +250,3 @@ def _check(n: int, *, spacing_m: float) -> None:
         raise UsageError(f"a formation has at least one place, not {n!r}")
     if not (math.isfinite(spacing_m) and spacing_m > 0.0):
         raise UsageError(f"spacing_m is {spacing_m!r} and must be more than 0 m")
-
-
-def solver() -> Callable[[NDArray[np.float64]], tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return SciPy's solver of the assignment problem.
-
-    Raises:
-        MissingExtraError: SciPy is not installed.
-    """
-    try:
-        from scipy.optimize import linear_sum_assignment
-    except ImportError as error:
-        raise MissingExtraError("a formation", "control", cause=str(error)) from error
-    found: Callable[[NDArray[np.float64]], tuple[NDArray[np.intp], NDArray[np.intp]]] = linear_sum_assignment
-    return found

@@ -13,10 +13,11 @@ from msgspec.structs import replace as replace_fields
 from numpy.typing import ArrayLike, NDArray
 
 from skyloop.control.airframe import STALE_S, Airframe, Part
-from skyloop.control.formation import Places, assign, closest_approach, kept_apart, places, solver
+from skyloop.control.formation import Places, assign, closest_approach, kept_apart, places
 from skyloop.control.limiting import within
 from skyloop.control.waypoint import Waypoint, WaypointSettings, lacking, reached, velocity_to
 from skyloop.errors import NoAnswerError, SkyloopError, UnknownNameError, UsageError
+from skyloop.estimation import assignment
 from skyloop.messages import AnyAction, Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler, turned
 
@@ -70,7 +71,7 @@ class Formation:
         """
         if not (math.isfinite(apart_m) and apart_m >= 0.0):
             raise UsageError(f"apart_m is {apart_m!r} and must be 0 m or more")
-        solver()  # loaded, or refused, here and not while the drones fly to their places
+        assignment("a formation", "control")  # loaded, or refused, here and not while the drones fly to their places
         self.drones = drones
         self.apart_m = apart_m
         self._rate_hz = rate_hz

@@ -1,26 +1,37 @@
-"""A constant-velocity Kalman filter for points that are seen now and then, in any number of dimensions. Pure.
+"""Kalman filters of points that are seen now and then. Pure. Times are nanoseconds on one clock.
 
-Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley 2001: the model with
-continuous white-noise acceleration (section 6.2.2), whose predictions over two steps are those over one; the gate by
-the normalised innovation squared (section 5.4); the update in Joseph's form (section 5.2.6), which keeps the covariance
-positive whatever the rounding.
+:class:`ConstantVelocityFilter` goes straight on, in any number of dimensions. :class:`TurningTargetFilter` also turns
+and speeds up, as a platform on wheels does: its horizontal state is (x, y, vx, vy, ω, ax, ay), a coordinated turn with
+an unknown turn rate (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley
+2001, section 11.7) and an acceleration that fades (Singer, "Estimating Optimal Tracking Filter Performance for Manned
+Maneuvering Targets", IEEE T-AES 6(4), 1970). What is fast and turns is explained by the turn, which is predicted to go
+on; what is slow, by the acceleration. Its height has a filter of its own.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.clock import seconds
+from skyloop.clock import nanoseconds, seconds
 from skyloop.control.limiting import within
 from skyloop.errors import UsageError
+from skyloop.estimation import corrected, drift
 
 Array = NDArray[np.float64]
 #: Added to the spread of an innovation, so that what is known all but exactly can be divided by.
 _EXACT_M2, _ROUNDING = 1e-18, 1e-12
+
+_SEEN = np.eye(2, 7)  # what of the state is measured
+_STEP_S = 0.1  # longest step of a prediction: within it the acceleration keeps its direction
+_STRAIGHT_RAD = 1e-4  # below this angle the transition is computed by its series
+_HEIGHT_INTENSITY_M2_S3 = 0.01
+_CLIMB_M_S = 0.3  # standard deviation of the vertical velocity at first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,8 +50,163 @@ class Estimate:
         return math.sqrt(float(np.trace(self.covariance[:n, :n])))
 
 
-class ConstantVelocityFilter:
-    """A Kalman filter of a point with constant velocity and random accelerations. Times are nanoseconds on one clock.
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnEstimate:
+    """Motion of a point at one time.
+
+    Attributes:
+        at_ns: The time.
+        position: (3,) [m].
+        velocity: (3,) [m/s].
+        turn_rate: Of the horizontal velocity, counter-clockwise from above [rad/s].
+        extra: Horizontal acceleration beside that of the turn, (2,) [m/s²].
+        covariance: Of x, y, their velocities, the turn rate and the extra acceleration, (7, 7).
+    """
+
+    at_ns: int
+    position: Array
+    velocity: Array
+    turn_rate: float
+    extra: Array
+    covariance: Array
+
+    @property
+    def acceleration(self) -> Array:
+        """Horizontal acceleration, (2,) [m/s²]."""
+        return self.extra + self.turn_rate * np.array([-self.velocity[1], self.velocity[0]])
+
+    @property
+    def turning_rad_s(self) -> float:
+        """How fast the horizontal velocity turns, by both accelerations, either way; 0 for what stands."""
+        (vx, vy), (ax, ay) = self.velocity[:2].tolist(), self.acceleration.tolist()
+        squared = vx * vx + vy * vy
+        return abs(vx * ay - vy * ax) / squared if squared > 0.0 else 0.0
+
+    @property
+    def deviation_m(self) -> float:
+        """Standard deviation of the horizontal position."""
+        return math.sqrt(float(self.covariance[0, 0] + self.covariance[1, 1]))
+
+    @property
+    def speed_deviation_m_s(self) -> float:
+        """Standard deviation of the horizontal velocity."""
+        return math.sqrt(float(self.covariance[2, 2] + self.covariance[3, 3]))
+
+
+_E = TypeVar("_E", Estimate, TurnEstimate)
+
+
+class _Filter(ABC, Generic[_E]):
+    """What both have in common.
+
+    Attributes:
+        refused: Measurements outside of the gate since the last one within it.
+    """
+
+    def __init__(self, dimensions: int, gate: float, **finite: float) -> None:
+        for name, value in finite.items():
+            if not 0.0 <= value < math.inf:
+                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
+        if not gate > 0.0:
+            raise UsageError(f"gate is {gate!r} and must be above 0")
+        self._n, self._gate = dimensions, gate
+        self._estimate: _E | None = None
+        self.refused = 0  #: measurements outside of the gate since the last one within it
+
+    @property
+    def newest(self) -> _E | None:
+        """The estimate as of the last measurement; None before the first."""
+        return self._estimate
+
+    def start(self, position: Array, deviation_m: float | Array, at_ns: int) -> _E:
+        """Restart at a measured position, with velocity 0.
+
+        Args:
+            position: As in :meth:`update`.
+            deviation_m: As in :meth:`update`.
+            at_ns: When it was measured.
+
+        Raises:
+            UsageError: A shape is wrong, or a number is not finite.
+        """
+        self._estimate = self._started(*self._checked(position, deviation_m), at_ns)
+        self.refused = 0
+        return self._estimate
+
+    def update(self, position: Array, deviation_m: float | Array, at_ns: int) -> bool:
+        """Update with a measured position.
+
+        Args:
+            position: Shape (n,) [m].
+            deviation_m: Its standard deviation [m], one for all axes, or its covariance (n, n) [m²].
+            at_ns: When it was measured.
+
+        Returns:
+            Whether it was used; False outside of the gate (counted in :attr:`refused`), or if older than the last one.
+
+        Raises:
+            UsageError: A shape is wrong, a number is not finite, or both estimate and measurement are exact.
+        """
+        if self._estimate is None:
+            self.start(position, deviation_m, at_ns)
+            return True
+        if at_ns < self._estimate.at_ns:
+            return False
+        after = self._corrected(self.at(at_ns), *self._checked(position, deviation_m), at_ns)
+        if after is None:
+            self.refused += 1
+            return False
+        self._estimate, self.refused = after, 0
+        return True
+
+    def at(self, at_ns: int, *, longest_s: float = math.inf) -> _E:
+        """Predict the estimate for a time; before the last measurement it is the estimate as of that measurement.
+
+        Args:
+            at_ns: The time to predict for.
+            longest_s: How far the last measurement is extrapolated at most.
+
+        Raises:
+            UsageError: There was no measurement.
+        """
+        if self._estimate is None:
+            raise UsageError("the target was never seen")
+        return self.predicted(self._estimate, at_ns, longest_s=longest_s)
+
+    def predicted(self, last: _E, at_ns: int, *, longest_s: float = math.inf) -> _E:
+        """Predict from any estimate of this filter; see :meth:`at`."""
+        return self._moved(last, within(seconds(at_ns - last.at_ns), 0.0, longest_s))
+
+    @abstractmethod
+    def _started(self, measured: Array, noise: Array, at_ns: int) -> _E: ...
+
+    @abstractmethod
+    def _corrected(self, before: _E, measured: Array, noise: Array, at_ns: int) -> _E | None:
+        """Return the estimate after a measurement; None if that is outside of the gate."""
+
+    @abstractmethod
+    def _moved(self, last: _E, dt: float) -> _E: ...
+
+    def _checked(self, position: Array, deviation: float | Array) -> tuple[Array, Array]:
+        """Return position (n,) and covariance (n, n) of a measurement."""
+        n = self._n
+        measured = np.asarray(position, dtype=np.float64)
+        noise = np.asarray(deviation, dtype=np.float64)
+        if noise.ndim == 0:
+            if noise < 0.0:
+                raise UsageError(f"deviation_m is {deviation!r} and must be 0 or more")
+            noise = np.eye(n) * noise**2
+        if measured.shape != (n,) or noise.shape != (n, n):
+            raise UsageError(
+                f"a position has shape ({n},) and a covariance ({n}, {n}), not {measured.shape} and {noise.shape}"
+            )
+        if not (np.isfinite(measured).all() and np.isfinite(noise).all()):
+            raise UsageError("a measured position and its deviation must be finite")
+        return measured, noise
+
+
+class ConstantVelocityFilter(_Filter[Estimate]):
+    """A Kalman filter of a point with constant velocity and random accelerations.
 
     Attributes:
         refused: Measurements outside of the gate since the last one within it.
@@ -68,118 +234,162 @@ class ConstantVelocityFilter:
         """
         if isinstance(dimensions, bool) or not isinstance(dimensions, int) or dimensions < 1:
             raise UsageError(f"dimensions is {dimensions!r} and must be a whole number of at least 1")
-        for name, value in (("intensity_m2_s3", intensity_m2_s3), ("speed_m_s", speed_m_s)):
-            if not 0.0 <= value < math.inf:
-                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
-        if not gate > 0.0:
-            raise UsageError(f"gate is {gate!r} and must be above 0")
-        self._n = dimensions
-        self._intensity = intensity_m2_s3
-        self._speed = speed_m_s
-        self._gate = gate
-        self._estimate: Estimate | None = None
-        self.refused = 0  #: measurements outside of the gate since the last one within it
+        super().__init__(dimensions, gate, intensity_m2_s3=intensity_m2_s3, speed_m_s=speed_m_s)
+        self._intensity, self._speed = intensity_m2_s3, speed_m_s
 
-    @property
-    def newest(self) -> Estimate | None:
-        """The estimate as of the last measurement; None before the first."""
-        return self._estimate
-
-    def start(self, position: Array, deviation_m: float | Array, at_ns: int) -> Estimate:
-        """Restart at a measured position, with velocity 0.
-
-        Args:
-            position: As in :meth:`update`.
-            deviation_m: As in :meth:`update`.
-            at_ns: When it was measured.
-
-        Raises:
-            UsageError: A shape is wrong, or a number is not finite.
-        """
-        measured, noise = self._checked(position, deviation_m)
+    def _started(self, measured: Array, noise: Array, at_ns: int) -> Estimate:
         n = self._n
         covariance = np.zeros((2 * n, 2 * n))
         covariance[:n, :n] = noise
         covariance[n:, n:] = np.eye(n) * self._speed**2
-        self.refused = 0
-        self._estimate = Estimate(at_ns, measured, np.zeros(n), covariance)
-        return self._estimate
+        return Estimate(at_ns, measured, np.zeros(n), covariance)
 
-    def update(self, position: Array, deviation_m: float | Array, at_ns: int) -> bool:
-        """Update with a measured position.
-
-        Args:
-            position: Shape (n,) [m].
-            deviation_m: Its standard deviation [m], one for all axes, or its covariance (n, n) [m²].
-            at_ns: When it was measured.
-
-        Returns:
-            Whether it was used; False outside of the gate (counted in :attr:`refused`), or if older than the last one.
-
-        Raises:
-            UsageError: A shape is wrong, a number is not finite, or both estimate and measurement are exact.
-        """
-        if self._estimate is None:
-            self.start(position, deviation_m, at_ns)
-            return True
-        if at_ns < self._estimate.at_ns:
-            return False
-        measured, noise = self._checked(position, deviation_m)
-        n, before = self._n, self.at(at_ns)
-        innovation = measured - before.position
+    def _corrected(self, before: Estimate, measured: Array, noise: Array, at_ns: int) -> Estimate | None:
+        n, off = self._n, measured - before.position
         spread = before.covariance[:n, :n] + noise
         if not spread.any():
             raise UsageError("a measurement without deviation, of a point that is known exactly, adds no information")
         spread = (spread + spread.T) / 2 + np.eye(n) * max(_EXACT_M2, _ROUNDING * float(np.abs(spread).max()))
-        distance = math.sqrt(max(0.0, float(innovation @ np.linalg.solve(spread, innovation))))
-        if distance > self._gate:
-            self.refused += 1
-            return False
-        self.refused = 0
-        share = np.linalg.solve(spread, before.covariance[:n]).T  # the gain, (2n, n)
-        state = np.concatenate([before.position, before.velocity]) + share @ innovation
-        keep = np.eye(2 * n)
-        keep[:, :n] -= share
-        covariance = keep @ before.covariance @ keep.T + share @ noise @ share.T
-        self._estimate = Estimate(at_ns, state[:n], state[n:], (covariance + covariance.T) / 2)
-        return True
+        if math.sqrt(max(0.0, float(off @ np.linalg.solve(spread, off)))) > self._gate:
+            return None
+        state = np.concatenate([before.position, before.velocity])
+        state, covariance = corrected(state, before.covariance, off, np.eye(n, 2 * n), noise, spread)
+        return Estimate(at_ns, state[:n], state[n:], (covariance + covariance.T) / 2)
 
-    def at(self, at_ns: int, *, longest_s: float = math.inf) -> Estimate:
-        """Predict the estimate for a time; before the last measurement it is the estimate as of that measurement.
-
-        Args:
-            at_ns: The time to predict for.
-            longest_s: How far the last measurement is extrapolated at most.
-
-        Raises:
-            UsageError: There was no measurement.
-        """
-        last = self._estimate
-        if last is None:
-            raise UsageError("the target was never seen")
-        dt = within(seconds(at_ns - last.at_ns), 0.0, longest_s)
+    def _moved(self, last: Estimate, dt: float) -> Estimate:
         if dt == 0.0:
             return last
-        n = self._n
-        move = np.eye(2 * n)
-        move[:n, n:] = np.eye(n) * dt
-        wander = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * self._intensity, np.eye(n))
+        move, wander = drift(dt, self._intensity, self._n)
         covariance = move @ last.covariance @ move.T + wander
         return Estimate(last.at_ns + round(dt * 1e9), last.position + last.velocity * dt, last.velocity, covariance)
 
+
+class TurningTargetFilter(_Filter[TurnEstimate]):
+    """Estimates the motion of a point in levelled axes from measured positions (3,) with one deviation, above 0.
+
+    Attributes:
+        refused: Measurements outside of the gate since the last one within it.
+    """
+
+    def __init__(
+        self,
+        *,
+        intensity_m2_s3: float = 0.01,
+        speed_m_s: float = 2.0,
+        turn_rad_s: float = 0.3,
+        turn_wander_rad_s: float = 0.06,
+        extra_m_s2: float = 0.3,
+        extra_s: float = 2.0,
+        gate: float = 8.0,
+    ) -> None:
+        """Initialise the filter.
+
+        Args:
+            intensity_m2_s3: Of the acceleration's white noise, beside the other two.
+            speed_m_s: Standard deviation of each component of the velocity at first.
+            turn_rad_s: Standard deviation of the turn rate at first.
+            turn_wander_rad_s: By how much the turn rate wanders within a second.
+            extra_m_s2: Standard deviation of each component of the acceleration beside the turn.
+            extra_s: Within this time that acceleration fades to a third; above 0.
+            gate: Positions farther off than so many standard deviations (Mahalanobis distance) are refused.
+
+        Raises:
+            UsageError: An argument is out of its range.
+        """
+        super().__init__(
+            3,
+            gate,
+            intensity_m2_s3=intensity_m2_s3,
+            speed_m_s=speed_m_s,
+            turn_rad_s=turn_rad_s,
+            turn_wander_rad_s=turn_wander_rad_s,
+            extra_m_s2=extra_m_s2,
+        )
+        if not 0.0 < extra_s < math.inf:
+            raise UsageError(f"extra_s is {extra_s!r} and must be a finite number above 0")
+        self._intensity = intensity_m2_s3
+        first = [0.0, 0.0, speed_m_s, speed_m_s, turn_rad_s, extra_m_s2, extra_m_s2]
+        self._first = np.diag(np.square(first))
+        self._again = turn_rad_s**2 / 9
+        self._wander = turn_wander_rad_s**2
+        self._extra, self._fade_s = extra_m_s2**2, extra_s
+        self._height = ConstantVelocityFilter(1, intensity_m2_s3=_HEIGHT_INTENSITY_M2_S3, speed_m_s=_CLIMB_M_S)
+
+    def _started(self, measured: Array, noise: Array, at_ns: int) -> TurnEstimate:
+        covariance = self._first + _SEEN.T @ noise[:2, :2] @ _SEEN
+        rate = 0.0
+        if self._estimate is not None:  # what turned may well go on turning
+            rate, known = self._estimate.turn_rate, float(self._estimate.covariance[4, 4])
+            covariance[4, 4] = min(covariance[4, 4], known + self._again)
+        height = self._height.start(measured[2:], noise[2:, 2:], at_ns)
+        return _combined(at_ns, np.array([*measured[:2], 0.0, 0.0, rate, 0.0, 0.0]), covariance, height)
+
+    def _corrected(self, before: TurnEstimate, measured: Array, noise: Array, at_ns: int) -> TurnEstimate | None:
+        seen, off = noise[:2, :2], measured[:2] - before.position[:2]
+        if off @ np.linalg.solve(before.covariance[:2, :2] + seen, off) > self._gate**2:
+            return None
+        state = np.array([*before.position[:2], *before.velocity[:2], before.turn_rate, *before.extra])
+        state, covariance = corrected(state, before.covariance, off, _SEEN, seen)
+        if not self._height.update(measured[2:], noise[2:, 2:], at_ns):
+            self._height.start(measured[2:], noise[2:, 2:], at_ns)
+        return _combined(at_ns, state, covariance, self._height.at(at_ns))
+
+    def _moved(self, last: TurnEstimate, dt: float) -> TurnEstimate:
+        steps = math.ceil(dt / _STEP_S)
+        for _ in range(steps):
+            last = self._stepped(last, dt / steps)
+        return last
+
+    def _stepped(self, last: TurnEstimate, dt: float) -> TurnEstimate:
+        """Predict one step [s]."""
+        (x, y, z), (vx, vy, climb), rate, (ax, ay) = last.position, last.velocity, last.turn_rate, last.extra
+        along, aside, by_along, by_aside = _turn(rate, dt)
+        c, s, fade = math.cos(rate * dt), math.sin(rate * dt), math.exp(-dt / self._fade_s)
+        half = dt * dt / 2
+        move = np.eye(7)
+        move[:4, 2:4] = [[along, -aside], [aside, along], [c, -s], [s, c]]
+        move[:4, 4] = [
+            by_along * vx - by_aside * vy,
+            by_aside * vx + by_along * vy,
+            -dt * (s * vx + c * vy),
+            dt * (c * vx - s * vy),
+        ]
+        move[0, 5] = move[1, 6] = half
+        move[2, 5] = move[3, 6] = dt
+        move[5, 5] = move[6, 6] = fade
+        wander = np.zeros((7, 7))
+        wander[:4, :4] = drift(dt, self._intensity, axes=2)[1]
+        wander[4, 4] = self._wander * dt
+        wander[5, 5] = wander[6, 6] = self._extra * (1.0 - fade * fade)
+        return TurnEstimate(
+            last.at_ns + nanoseconds(dt),
+            np.array(
+                [x + along * vx - aside * vy + half * ax, y + aside * vx + along * vy + half * ay, z + climb * dt]
+            ),
+            np.array([c * vx - s * vy + dt * ax, s * vx + c * vy + dt * ay, climb]),
+            rate,
+            last.extra * fade,
+            move @ last.covariance @ move.T + wander,
+        )
+
     def _checked(self, position: Array, deviation: float | Array) -> tuple[Array, Array]:
-        """Return position (n,) and covariance (n, n) of a measurement."""
-        n = self._n
-        measured = np.asarray(position, dtype=np.float64)
-        noise = np.asarray(deviation, dtype=np.float64)
-        if noise.ndim == 0:
-            if noise < 0.0:
-                raise UsageError(f"deviation_m is {deviation!r} and must be 0 or more")
-            noise = np.eye(n) * noise**2
-        if measured.shape != (n,) or noise.shape != (n, n):
-            raise UsageError(
-                f"a position has shape ({n},) and a covariance ({n}, {n}), not {measured.shape} and {noise.shape}"
-            )
-        if not (np.isfinite(measured).all() and np.isfinite(noise).all()):
-            raise UsageError("a measured position and its deviation must be finite")
-        return measured, noise
+        if not np.isfinite(position).all():
+            raise UsageError(f"a measured position must be three finite numbers, got {position!r}")
+        if isinstance(deviation, np.ndarray) or not 0.0 < deviation < math.inf:
+            raise UsageError(f"deviation_m is {deviation!r} and must be a finite number above 0")
+        return super()._checked(position, deviation)
+
+
+def _turn(rate: float, dt: float) -> tuple[float, float, float, float]:
+    """Return sin(ωt)/ω and (1 - cos(ωt))/ω [s], and their derivatives by ω [s²]."""
+    angle = rate * dt
+    if abs(angle) < _STRAIGHT_RAD:
+        return dt, angle * dt / 2, -angle * dt * dt / 3, dt * dt / 2
+    along, aside = math.sin(angle) / rate, (1.0 - math.cos(angle)) / rate
+    return along, aside, (dt * math.cos(angle) - along) / rate, (dt * math.sin(angle) - aside) / rate
+
+
+def _combined(at_ns: int, state: Array, covariance: Array, height: Estimate) -> TurnEstimate:
+    position = np.array([*state[:2], height.position[0]])
+    velocity = np.array([*state[2:4], height.velocity[0]])
+    return TurnEstimate(at_ns, position, velocity, float(state[4]), state[5:].copy(), covariance)

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import AirframeLaw, Motion, Part
+from skyloop.control.kalman import TurnEstimate, TurningTargetFilter
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.control.response import Predicted, VelocityResponse
 from skyloop.control.spiral import SpiralSearch
-from skyloop.control.turning import TurnEstimate, TurningTargetFilter
 from skyloop.messages import Feedback, Velocity
 from skyloop.messages.geometry import rotation_from_euler
 

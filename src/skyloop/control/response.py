@@ -23,6 +23,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.control.filters import gain
 from skyloop.control.limiting import GRAVITY_M_S2, shortened, within
 from skyloop.errors import UsageError
+from skyloop.estimation import corrected, drift
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler
 
@@ -170,12 +171,9 @@ class VelocityResponse:
     def _correct(self, lean: Array, measured: Array, dt: float) -> None:
         """One step of the Kalman filter of velocity and push."""
         s = self.settings
-        move = np.array([[1.0, dt], [0.0, 1.0]])
-        wander = s.push_m_s3**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        covariance = move @ self._covariance @ move.T + wander
+        move, wander = drift(dt, s.push_m_s3**2)
         velocity = self._velocity + (lean + self._push) * dt
-        share = covariance[:, 0] / (covariance[0, 0] + s.velocity_noise_m_s**2)
-        innovation = measured - velocity
-        self._velocity = velocity + share[0] * innovation
-        self._push = shortened(self._push + share[1] * innovation, s.most_m_s2)
-        self._covariance = covariance - np.outer(share, covariance[0])
+        state, covariance = np.array([velocity, self._push]), move @ self._covariance @ move.T + wander
+        noise = np.array([[s.velocity_noise_m_s**2]])
+        state, self._covariance = corrected(state, covariance, measured[None] - velocity, np.eye(1, 2), noise)
+        self._velocity, self._push = state[0], shortened(state[1], s.most_m_s2)

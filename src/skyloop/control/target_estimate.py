@@ -24,6 +24,7 @@ from skyloop.clock import seconds
 from skyloop.control.limiting import within
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
+from skyloop.estimation import corrected, drift
 
 Array = NDArray[np.float64]
 
@@ -259,10 +260,8 @@ class TargetEstimator:
         off, jacobian, noise = off[used], jacobian[used], noise[np.ix_(used, used)]
         fit = float(off @ np.linalg.solve(spread[np.ix_(used, used)], off)) / len(off)
         self._surprise += _ADAPTING * (min(_MOST_SURPRISE, fit) - self._surprise)
-        gain = np.linalg.solve(spread[np.ix_(used, used)], jacobian @ covariance).T
-        keep = np.eye(6) - gain @ jacobian
-        self._state = _moved(state + gain @ off, late_s)
-        self._covariance = keep @ covariance @ keep.T + gain @ noise @ gain.T  # Joseph's form
+        state, self._covariance = corrected(state, covariance, off, jacobian, noise)
+        self._state = _moved(state, late_s)
         self._remember(max(at_ns, self._at_ns))
         self._at_ns = self.seen_ns = max(at_ns, self._at_ns)
         if late_s == 0.0:
@@ -312,15 +311,10 @@ class TargetEstimator:
             dt = seconds(at_ns - from_ns)
         else:
             from_state, from_covariance = self._state, self._covariance
-        move = np.eye(6)
-        move[0, 2] = move[1, 3] = dt
-        wander = np.zeros((6, 6))
+        move, wander = np.eye(6), np.zeros((6, 6))
         # A thing that turns surprises the filter again and again: it is believed to turn harder then.
-        q = self._intensity * max(1.0, self._surprise / _USUAL) ** 2
-        for axis in (0, 1):
-            wander[axis, axis] = q * dt**3 / 3
-            wander[axis, axis + 2] = wander[axis + 2, axis] = q * dt**2 / 2
-            wander[axis + 2, axis + 2] = q * dt
+        harder = max(1.0, self._surprise / _USUAL) ** 2
+        move[:4, :4], wander[:4, :4] = drift(dt, self._intensity * harder, axes=2)
         wander[4, 4] = 0.02**2 * dt
         wander[5, 5] = 0.01**2 * dt
         return _moved(from_state, min(dt, _STRAIGHT_S)), move @ from_covariance @ move.T + wander

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from skyloop.clock import seconds
 from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, Traits
 from skyloop.control.target_view import BoxView, Camera
+from skyloop.estimation import assignment
 from skyloop.vision.detection import Detection
-from skyloop.vision.object_tracks import assignment
 
 Floats = NDArray[np.float32]
 
@@ -195,7 +195,7 @@ class Scene:
         self.traits = TRAITS | (traits or {})
         self._met: dict[frozenset[int], tuple[int, int, NDArray[np.float64]]] = {}
         self._numbers = itertools.count(1)
-        self._assign = assignment()
+        self._assign = assignment("matching detections", "detect")
 
     def update(
         self, detections: Sequence[Detection], looks: Sequence[Floats], camera: Camera, at_ns: int, *, ground: bool

@@ -12,11 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from skyloop.errors import MissingExtraError, UsageError
+from skyloop.errors import UsageError
+from skyloop.estimation import assignment, corrected, drift
 from skyloop.vision.detection import Detection, Floats, overlaps
 from skyloop.vision.tracking import Box
 
@@ -43,8 +44,8 @@ class TrackedObject:
 class _Object:
     number: int
     detection: Detection
-    state: Floats  # (4, 2): centre x, centre y, width, height, each with its velocity
-    covariance: Floats  # (4, 2, 2)
+    state: Floats  # (2, 4): of centre x, centre y, width and height, position and velocity
+    covariance: Floats  # (2, 2), of each of the four
     first_s: float
     last_s: float
     hits: int = 1
@@ -84,7 +85,7 @@ class ObjectTracks:
             raise UsageError(f"confirm is {confirm!r} and must be a whole number of at least 1")
         if isinstance(keep_s, bool) or not isinstance(keep_s, int | float) or not 0.0 <= keep_s < math.inf:
             raise UsageError(f"keep_s is {keep_s!r} and must be a finite number of seconds, 0 or more")
-        self._assign = assignment()
+        self._assign = assignment("matching detections", "detect")
         self._sure, self._confirm, self._keep_s = float(sure), confirm, float(keep_s)
         self._overlap, self._overlap_unsure = float(overlap), float(overlap_unsure)
         self._objects: list[_Object] = []
@@ -147,19 +148,6 @@ class ObjectTracks:
         )
 
 
-def assignment() -> Any:
-    """Return SciPy's ``linear_sum_assignment``.
-
-    Raises:
-        MissingExtraError: SciPy is not installed.
-    """
-    try:
-        from scipy.optimize import linear_sum_assignment
-    except ImportError as error:
-        raise MissingExtraError("matching detections", "detect", cause=str(error)) from error
-    return linear_sum_assignment
-
-
 def _is_usable(detection: Detection) -> bool:
     numbers = (*detection.box, detection.score)
     return all(math.isfinite(each) and abs(each) < 1e6 for each in numbers) and min(detection.box[2:]) > 0
@@ -177,48 +165,38 @@ def _measured(detection: Detection) -> Floats:
 
 def _started(number: int, detection: Detection, time_s: float) -> _Object:
     height = detection.box[3]
-    state = np.stack([_measured(detection), np.zeros(4)], axis=1)
-    covariance = np.tile(np.diag([(2 * _POSITION * height) ** 2, (_SPEED * height) ** 2]), (4, 1, 1))
+    state = np.stack([_measured(detection), np.zeros(4)])
+    covariance = np.diag([(2 * _POSITION * height) ** 2, (_SPEED * height) ** 2])
     return _Object(number, detection, state, covariance, time_s, time_s, corners=_corners(detection.box))
 
 
 def _predict(each: _Object, elapsed_s: float) -> None:
-    step = np.array([[1.0, elapsed_s], [0.0, 1.0]])
-    intensity = (_WANDERING * max(each.state[3, 0], 1.0)) ** 2
-    t = elapsed_s
-    noise = intensity * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
-    each.state = each.state @ step.T
-    each.covariance = step @ each.covariance @ step.T + noise
-    each.state[2:, 0] = np.maximum(each.state[2:, 0], 1.0)  # a box that shrinks does not vanish
+    move, wander = drift(elapsed_s, (_WANDERING * max(each.state[0, 3], 1.0)) ** 2)
+    each.state, each.covariance = move @ each.state, move @ each.covariance @ move.T + wander
     _place(each)
 
 
 def _correct(each: _Object, detection: Detection, time_s: float) -> None:
-    variance = (_POSITION * detection.box[3]) ** 2
-    gain = each.covariance[:, :, 0] / (each.covariance[:, 0, 0] + variance)[:, None]
-    off = _measured(detection) - each.state[:, 0]
-    each.state = each.state + gain * off[:, None]
-    keep = np.tile(np.eye(2), (4, 1, 1))
-    keep[:, :, 0] -= gain
-    own = variance * gain[:, :, None] * gain[:, None, :]
-    each.covariance = keep @ each.covariance @ keep.transpose(0, 2, 1) + own  # in Joseph's form
+    noise = np.array([[(_POSITION * detection.box[3]) ** 2]])
+    off = _measured(detection)[None] - each.state[0]
+    each.state, each.covariance = corrected(each.state, each.covariance, off, np.eye(1, 2), noise)
     each.detection, each.last_s, each.hits = detection, time_s, each.hits + 1
-    each.state[2:, 0] = np.maximum(each.state[2:, 0], 1.0)
     _place(each)
 
 
 def _place(each: _Object) -> None:
-    centre, size = each.state[:2, 0], each.state[2:, 0]
+    each.state[0, 2:] = np.maximum(each.state[0, 2:], 1.0)  # a box that shrinks does not vanish
+    centre, size = each.state[0, :2], each.state[0, 2:]
     each.corners = np.concatenate([centre - size / 2, centre + size / 2])
 
 
 def _tracked(each: _Object, time_s: float) -> TrackedObject:
-    x, y, width, height = (float(v) for v in (*each.corners[:2], *each.state[2:, 0]))
+    x, y, width, height = (float(v) for v in (*each.corners[:2], *each.state[0, 2:]))
     return TrackedObject(
         id=each.number,
         detection=each.detection,
         box=(x, y, width, height),
-        velocity=(float(each.state[0, 1]), float(each.state[1, 1])),
+        velocity=(float(each.state[1, 0]), float(each.state[1, 1])),
         seen=each.last_s == time_s,
         age_s=time_s - each.first_s,
         unseen_s=time_s - each.last_s,
