@@ -5,7 +5,6 @@ ViTTrack (``cv2.TrackerVit``) is one ONNX file, NanoTrack (``cv2.TrackerNano``) 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +13,6 @@ from skyloop.messages.geometry import within
 from skyloop.vision import onnx
 from skyloop.vision.opencv import opencv
 from skyloop.vision.tracking import Box, Image, Tracker, TrackResult
-
-
-def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
-    """Return OpenCV's tracker of a name with its weights: one file of ViTTrack, two of NanoTrack."""
-    settings = getattr(cv, f"{name}_Params")()
-    if len(files) == 1:
-        (settings.net,) = files
-    else:
-        settings.backbone, settings.neckhead = files
-    return getattr(cv, f"{name}_create")(settings)
 
 
 class LearnedTracker(Tracker):
@@ -59,10 +48,10 @@ class LearnedTracker(Tracker):
         self._given = ", ".join(files)
         onnx.try_alone(*files, tracker=name)
         try:
-            self._tracker: Any = load_tracker(self._cv, name, files)
+            self._tracker: Any = onnx.load_tracker(self._cv, name, files)
         except self._cv.error as error:
             raise FileFormatError(
-                f"{self._given} can't be loaded as the weights of {name}: {_reason(error)}"
+                f"{self._given} can't be loaded as the weights of {name}: {onnx.reason(error)}"
             ) from error
 
     def _start(self, image: Image, box: Box) -> None:
@@ -82,7 +71,7 @@ class LearnedTracker(Tracker):
             return getattr(self._tracker, method)(*arguments)
         except self._cv.error as error:
             raise FileFormatError(
-                f"{self._given} does not work as the weights of {self._name}: {_reason(error)}"
+                f"{self._given} does not work as the weights of {self._name}: {onnx.reason(error)}"
             ) from error
 
     def _coloured(self, image: Image) -> Any:
@@ -93,7 +82,3 @@ def _existing(path: Path | str) -> str:
     if not Path(path).is_file():
         raise UsageError(f"there is no file {path}: give the ONNX file with the tracker's weights")
     return str(path)
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]  # its attribute `err` is the class's: of OpenCV's last error anywhere

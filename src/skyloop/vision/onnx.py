@@ -132,13 +132,22 @@ def _tracker(name: str, files: Sequence[str]) -> Callable[[], object]:
     """Load a tracker's weights, and return what tracks with them in a black image."""
     import numpy as np
 
-    from skyloop.vision.learned import load_tracker
     from skyloop.vision.opencv import opencv
 
     tracker, image = load_tracker(opencv("tracking"), name, files), np.zeros((240, 320, 3), np.uint8)
     return lambda: (tracker.init(image, (140, 100, 40, 40)), tracker.update(image))
 
 
+def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
+    """Return OpenCV's tracker of a name with its weights: one file of ViTTrack, two of NanoTrack."""
+    settings = getattr(cv, f"{name}_Params")()
+    if len(files) == 1:
+        (settings.net,) = files
+    else:
+        settings.backbone, settings.neckhead = files
+    return getattr(cv, f"{name}_create")(settings)
+
+
 def reason(error: Exception) -> str:
     """Return the text of an exception on one line, shortened."""
-    return " ".join(str(error).split())[:300]
+    return " ".join(str(error).split())[:300]  # OpenCV's attribute `err` is the class's: of its last error anywhere
