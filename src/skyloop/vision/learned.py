@@ -51,7 +51,7 @@ class LearnedTracker(Tracker):
             self._tracker: Any = onnx.load_tracker(self._cv, name, files)
         except self._cv.error as error:
             raise FileFormatError(
-                f"{self._given} can't be loaded as the weights of {name}: {_reason(error)}"
+                f"{self._given} can't be loaded as the weights of {name}: {onnx.reason(error)}"
             ) from error
 
     def _start(self, image: Image, box: Box) -> None:
@@ -71,7 +71,7 @@ class LearnedTracker(Tracker):
             return getattr(self._tracker, method)(*arguments)
         except self._cv.error as error:
             raise FileFormatError(
-                f"{self._given} does not work as the weights of {self._name}: {_reason(error)}"
+                f"{self._given} does not work as the weights of {self._name}: {onnx.reason(error)}"
             ) from error
 
     def _coloured(self, image: Image) -> Any:
@@ -82,7 +82,3 @@ def _existing(path: Path | str) -> str:
     if not Path(path).is_file():
         raise UsageError(f"there is no file {path}: give the ONNX file with the tracker's weights")
     return str(path)
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]  # its attribute `err` is the class's: of OpenCV's last error anywhere

@@ -150,4 +150,4 @@ def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
 
 def reason(error: Exception) -> str:
     """Return the text of an exception on one line, shortened."""
-    return " ".join(str(error).split())[:300]
+    return " ".join(str(error).split())[:300]  # OpenCV's attribute `err` is the class's: of its last error anywhere
