@@ -261,6 +261,8 @@ def test_a_hand_over_that_both_want_ends_in_no_refusal(client: TestClient, node:
         giver.say("answer", id=asked["id"], grant=True)
         told = giver.wait("authority", mine=False)
         assert told["given"]
+        if told["holder"] is None:  # for a moment nobody has it
+            told = giver.wait("authority", holder=asked["by"])
         assert told["why"] == f"{asked['by']} has control now"
         giver.say("ping", n=6)
         giver.wait("pong", n=6)
@@ -347,6 +349,24 @@ def test_a_tracker_that_is_stuck_flies_nothing(client: TestClient, node: Node, s
         until(lambda: node.flyer.state is FlightState.HOVERING)
         stand_ins.last.waits.set()
         pilot.wait("follow", state="flying")
+
+
+def test_what_was_pressed_too_long_ago_sets_off_no_more(
+    client: TestClient, node: Node, stand_ins: StandIns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skyloop.cockpit.follow_session.SET_OFF_S", 0.2)
+    with marker(client) as pilot:
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.mark()
+            pilot.wait("follow", state="tracking", phase="")
+            stand_ins.last.waits = threading.Event()
+            pilot.say("follow_mode", mode="follow")
+            pilot.wait("follow", mode="follow")
+            time.sleep(0.3)
+            stand_ins.last.waits.set()
+            assert "mark the target again" in pilot.wait("follow", state="ended")["problem"]
+            assert not count(node, FORWARD)
 
 
 def test_it_ends_hovering_when_it_gives_up_or_fails(client: TestClient, node: Node, stand_ins: StandIns) -> None:

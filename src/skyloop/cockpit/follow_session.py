@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 STOPPED_S: Final = 0.5  #: without a new frame for so long it hovers
 OLD_S: Final = 1.0  #: frames that are older when they are tracked are not flown by either
 OLD_FEEDBACK_S: Final = 1.0
+#: What was pressed longer ago sets off no more: the tracker was stuck, or caught up for longer than anybody remembers.
+SET_OFF_S: Final = 10.0
 WATCH_S: Final = 0.1  #: between looks whether the tracker still reports
 TELL_S: Final = 0.2  #: between two messages of which only numbers differ
 JOIN_S: Final = 2.0
@@ -94,6 +96,7 @@ class FollowSession:
         self._action: AnyAction | None = None  # the last set-point
         self._report: TrackReport | None = None
         self._reported_ns = 0
+        self._asked_ns = 0  # when to fly was asked for
         self._told: tuple[Any, ...] = ()
         self._told_ns = 0
         self._watch: asyncio.TimerHandle | None = None
@@ -165,6 +168,7 @@ class FollowSession:
             call_soon(loop, self._on_report, tracker, made)
 
         self._report, self._reported_ns = None, self._clock()
+        self._asked_ns = self._reported_ns
         tracker = self._tracker = TargetTracker(self._drone, keeper, first, make, report, self._clock)
         tracker.steers = pilot is not None
         tracker.start()
@@ -187,7 +191,7 @@ class FollowSession:
             tracker.settings = _settings(command.distance_m).within(self._limits)
             self._distance_m = command.distance_m
         self._mode = tracker.mode = command.mode
-        self._pilot = pilot  # who sets off with the next report, at the latest when the tracker has caught up
+        self._pilot, self._asked_ns = pilot, self._clock()  # sets off with the next report, once that has caught up
         tracker.steers = True
         self._tell()
 
@@ -238,10 +242,13 @@ class FollowSession:
             self.end(report.problem or (report.status and report.status.problem) or "the target was lost")
             return
         if report.action is not None and self._pilot is not None:
-            if not self._flying:
-                self._set_off()
-            else:
+            if self._flying:
                 self._steer(report.action)
+            elif self._clock() - self._asked_ns > nanoseconds(SET_OFF_S):
+                self.end(f"the tracker needed more than {SET_OFF_S:g} s: mark the target again", hover=False)
+                return
+            else:
+                self._set_off()
         self._tell()
 
     def _set_off(self) -> None:
