@@ -202,6 +202,15 @@ def test_there_are_no_files(kind: Kind, asked: str, answer: int, error: int) -> 
 
 
 @BOTH
+def test_the_root_is_an_empty_folder(kind: Kind) -> None:
+    it = ready(kind)
+    payload = bytearray(251)
+    payload[3], payload[4], payload[12:14] = FILE_SYSTEM["list"], 2, b"/\0"  # MAVSDK ends a name with a zero
+    came = answered(it, m.MAVLink_file_transfer_protocol_message(0, 1, 1, payload), "FILE_TRANSFER_PROTOCOL").payload
+    assert (came[3], came[4], came[12]) == (129, 1, 6), "the end of the list"
+
+
+@BOTH
 def test_what_it_can_not_tell_or_do_is_said(kind: Kind) -> None:
     it = ready(kind)
     assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_DISTANCE_SENSOR) == (

@@ -25,9 +25,11 @@ _END_SESSION: Final = 1
 _END_SESSIONS: Final = 2
 _NAMING: Final = (3, 4, 6, 8, 9, 10, 11, 12, 13, 14)  #: list, open, create, remove, ...: requests that name a file
 _IN_SESSION: Final = (5, 7, 15)  #: read, write, read in a burst; nothing was opened
+_LIST: Final = 3
 _ACK: Final = 128
 _NAK: Final = 129
 _INVALID_SESSION: Final = 4
+_END_OF_FILE: Final = 6
 _UNKNOWN_COMMAND: Final = 7
 _FILE_NOT_FOUND: Final = 10
 _SEQUENCE: Final = slice(0, 2)
@@ -150,7 +152,8 @@ def _of_files(message: Message) -> Message:
         answer[_OPCODE] = _ACK
     else:
         answer[_OPCODE], answer[_SIZE] = _NAK, 1
-        answer[_DATA] = _error(opcode)
+        named = asked[_DATA : _DATA + min(asked[_SIZE], _PAYLOAD - _DATA)].rstrip(b"\0")
+        answer[_DATA] = _END_OF_FILE if opcode == _LIST and named == b"/" else _error(opcode)  # nothing is in the root
     return m.MAVLink_file_transfer_protocol_message(0, message.get_srcSystem(), message.get_srcComponent(), answer)
 
 
