@@ -57,12 +57,12 @@ export function bytes(count: Known): string {
   return `${value.toFixed(unit === 0 || value >= 99.5 ? 0 : 1)} ${units[unit]}`;
 }
 
-/** A number whose size is not known beforehand: four digits that matter. */
-export function short(value: Known): string {
+/** A number whose size is not known beforehand: four digits that matter. `coarse`: what is less than half of 0.0001 is 0. */
+export function short(value: Known, coarse = false): string {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  if (value === 0) return "0";
   const size = Math.abs(value);
-  if (size >= 1e5 || size < 5e-5) return value.toExponential(2).replace("-", "−");
+  if (size === 0 || (coarse && size < 5e-5)) return "0";
+  if (size >= 1e9 || size < 5e-5) return value.toExponential(2).replaceAll("-", "−").replace("+", "");
   return figure(value, Math.max(0, Math.min(4, 3 - Math.floor(Math.log10(size)))));
 }
 

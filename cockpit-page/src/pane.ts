@@ -12,7 +12,6 @@ import { h, memory, setAttribute, setHidden, setText, setTone, type Tone } from 
 import { Events } from "./events.js";
 import { corners, FlightHud } from "./flightmode.js";
 import type { FollowHost } from "./followtool.js";
-import { words } from "./format.js";
 import { Freshness } from "./freshness.js";
 import { History, KEPT_S, Trail } from "./history.js";
 import type { Countdown } from "./hold.js";
@@ -288,7 +287,7 @@ export class Pane {
         if (command === "set" && [this.writes, this.parameters, this.controls.parameters].some((list) => list.refused(why))) return;
         if (command === "fly" && this.fresh.isOld) return; // the whole pane shows that
         if (this.stage.followRefused(command, why)) return;
-        this.notify(command ? `${words(command)}: ${why}` : why, "warn");
+        this.notify(command ? t.commands.refused(named(t.commands.names, command), why) : why, "warn");
       },
       route: (progress) => (progress ? this.map.route.update(progress) : this.map.route.forget()),
       follow: (message) => (message ? this.stage.followed(message) : this.stage.forgetTarget()),

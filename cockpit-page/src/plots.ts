@@ -10,6 +10,8 @@ const COLOURS = 8;
 const FIRST = ["altitude", "velocity.forward", "velocity.left"];
 const SPANS_S = [10, 30, 60, 120];
 const PERIOD_MS = 120;
+/** Numbers of programs and drivers, which may be small and mean something. */
+const OF_ANY_SIZE = /^(log|native)\./;
 
 /** Names by what stands before their first dot, in the order of a picker. */
 export function grouped(names: Iterable<string>): Map<string, string[]> {
@@ -61,7 +63,7 @@ export class Plots {
     });
     this.chosen.forEach((name, place) => {
       const value = this.legend.children[place]?.querySelector("output");
-      if (value) setText(value, short(this.history.newest(name)));
+      if (value) setText(value, short(this.history.newest(name), !OF_ANY_SIZE.test(name)));
     });
   }
 

@@ -29,13 +29,13 @@ export const boundsOf = (world: World | null): Bounds => ({ box: world?.box ?? n
 
 const cm = (value: number): number => Math.round(value * 100) / 100;
 
-export function zoneText(zone: Zone): string {
+export function zoneText(zone: Zone, rounded = cm): string {
   const numbers = zone.kind === "box" ? [...zone.low, ...zone.high] : [...zone.centre, zone.radius, zone.low, zone.high];
-  return `${zone.name ? `${zone.name}: ` : ""}${zone.kind} ${numbers.map(cm).join(" ")}`;
+  return `${zone.name ? `${zone.name}: ` : ""}${zone.kind} ${numbers.map(rounded).join(" ")}`;
 }
 
-/** What a zone is called: by its name, or as a refusal calls one that has none. */
-export const zoneName = (zone: Zone): string => zone.name || zoneText(zone);
+/** What a zone is called: by its name, or as a refusal calls one that has none, to six digits. */
+export const zoneName = (zone: Zone): string => zone.name || zoneText(zone, (value) => Number(value.toPrecision(6)));
 
 /** The first name that none of them has. */
 export function freeName(zones: readonly Zone[]): string {
@@ -44,7 +44,7 @@ export function freeName(zones: readonly Zone[]): string {
   return `Z${number}`;
 }
 
-export const zonesText = (zones: readonly Zone[]): string => zones.map(zoneText).join("; ");
+export const zonesText = (zones: readonly Zone[]): string => zones.map((zone) => zoneText(zone)).join("; ");
 
 /** What has to be written, in this order, to get from one state to the other: a wall never passes the opposite one. */
 export function writes(from: Bounds, to: Bounds): { name: string; value: string | number }[] {

@@ -9,6 +9,8 @@ import { GamepadReader, type Pad } from "../src/gamepad.js";
 import { History, Trail } from "../src/history.js";
 import { Hold, HOLD_MS } from "../src/hold.js";
 import { type Press, Keys, stopKeys } from "../src/keys.js";
+import { named } from "../src/language/index.js";
+import { en } from "../src/language/en.js";
 import type { Authority, DroneRow, QueuePosition, Question, Sticks } from "../src/model.js";
 import { grouped } from "../src/plots.js";
 import { explained, pending, wins } from "../src/question.js";
@@ -22,8 +24,18 @@ import { around, gridStep, toMetres, toPixels, zoomed } from "../src/view.js";
 import { arrow, nearest } from "../src/maptool.js";
 import { leg } from "../src/waypoint.js";
 
+/** What the cockpit may refuse: skyloop/cockpit/commands.py. */
+const COMMANDS = "take release answer takeoff hover land return stop fly goto route route_pause route_resume route_skip route_stop follow_select follow follow_mode follow_stop set".split(" ");
 const near = (value: number, wanted: number): void => assert.ok(Math.abs(value - wanted) < 1e-9, `${value} is not ${wanted}`);
 const push = (sticks: Partial<Sticks>): Sticks => ({ ...CENTRED, ...sticks });
+
+test("a refusal calls its command as the button does", () => {
+  const { names } = en.commands;
+  for (const tag of COMMANDS) assert.match(named(names, tag), /^[A-Z][a-z ]+$/, tag);
+  assert.equal(named(names, "goto"), en.waypoint.fly);
+  assert.equal(named(names, "takeoff"), en.strip.takeOff);
+  assert.equal(named(names, "route"), en.route.fly);
+});
 
 test("a double tap, or a key that is held, does something once", () => {
   const presses = new Presses();
@@ -232,6 +244,9 @@ test("figures for people", () => {
   assert.equal(bytes(12), "12 B");
   assert.equal(short(0.012345), "0.0123");
   assert.equal(short(-1234.5), "−1235");
+  assert.equal(short(123456.7), "123457", "a time in milliseconds is no power of ten");
+  assert.equal(short(2.82e-5), "2.82e−5");
+  assert.equal(short(2.82e-5, true), "0", "a height");
   assert.equal(plain(0.1), "0.1");
 });
 

@@ -6,7 +6,7 @@ import { corners, hull, rayEnd, turned } from "../src/geometry.js";
 import type { Zone } from "../src/surroundings.js";
 import { type Finding, TakeOffQuestion } from "../src/preflight.js";
 import { Writes } from "../src/writes.js";
-import { type Bounds, fields, handles, rectangle, round, writes, zoneAt, zonesText } from "../src/zones.js";
+import { type Bounds, fields, handles, rectangle, round, writes, zoneAt, zoneName, zonesText } from "../src/zones.js";
 
 const near = (is: readonly number[], should: readonly number[]): void => should.forEach((value, place) => assert.ok(Math.abs((is[place] as number) - value) < 1e-9, `${is} is not ${should}`));
 const box: Zone = { kind: "box", low: [0, 0, 0], high: [2, 1, 3] };
@@ -30,6 +30,8 @@ test("zones as the drone reads them", () => {
   assert.equal(zonesText([box, pillar]), "box 0 0 0 2 1 3; cylinder 1 0.5 0.2 0 3");
   assert.equal(zonesText([{ ...pillar, name: "tree" }]), "tree: cylinder 1 0.5 0.2 0 3");
   assert.equal(zonesText([]), "");
+  assert.equal(zoneName({ kind: "box", low: [1.075, -1.87, 0], high: [2, 1 / 3, 3] }), "box 1.075 -1.87 0 2 0.333333 3", "as str() of the proxy's Box has it in a refusal");
+  assert.equal(zoneName({ ...pillar, name: "tree" }), "tree");
   assert.deepEqual(rectangle([2, 1], [0, 3], 0, 1), { kind: "box", low: [0, 1, 0], high: [2, 3, 1] });
   const thin = rectangle([1, 1], [1, 1], 0, 1);
   assert.ok(thin.kind === "box" && thin.high[0] > thin.low[0] && thin.high[1] > thin.low[1]);

@@ -116,6 +116,14 @@ def test_ctrl_c_ends_with_what_shells_expect(run: Run, monkeypatch: pytest.Monke
     assert run("list").code == 130
 
 
+def test_ctrl_c_while_the_commands_are_imported_is_no_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(names: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("skyloop.cli.app.build", interrupted)
+    assert run("list") == (130, "", "")
+
+
 def test_a_command_imports_nothing_that_it_does_not_need() -> None:
     """What a private proxy, or a list, would only pay for at its start."""
     code = (

@@ -130,6 +130,16 @@ def test_watching_in_a_terminal_is_a_picture(alpha: Process) -> None:
         assert words in text
 
 
+@pytest.mark.parametrize("width", [48, 80])
+def test_what_is_watched_in_a_narrow_terminal_keeps_its_words_and_figures_whole(alpha: Process, width: int) -> None:
+    text = in_terminal("watch", "alpha", "--seconds", "0.5", columns=width)
+    lines = [line for line in text.splitlines() if "velocity" in line]
+    assert lines
+    assert all("m/s" in line for line in lines)
+    for words in ("feedback", "link to vehicle", "roll, pitch, yaw"):
+        assert words in text
+
+
 def test_a_watched_reader_that_goes_away_is_no_error(alpha: Process) -> None:
     watching = f"{sys.executable} -m skyloop watch alpha --seconds 3 | head -n 1"
     done = subprocess.run(["sh", "-c", watching], capture_output=True, text=True, timeout=20, check=True)

@@ -94,6 +94,8 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
         page.wait_for_text(".follow-figures", "%")
         assert distance_m(walker, drone) > 2.0
         picture(page, "follow-flying")
+        width = page.page.evaluate("document.querySelector('.follow-panel').offsetWidth")
+        assert width <= 420, "the panel leaves the picture and the map beside it free"
         panel.get_by_role("button", name="Stop").click()
         page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers")
         page.until(lambda: not panel.is_visible(), "the panel is closed")

@@ -87,7 +87,7 @@ def tap_until(page: DronePage, name: str, state: str) -> None:
 def check_arrangement(page: DronePage, size: tuple[int, int]) -> None:
     """Both sticks on the picture, all on one screen, and nothing of it under something else."""
     screen = {"left": 0.0, "top": 0.0, "right": float(size[0]), "bottom": float(size[1])}
-    video, stop = box(page, ".video"), box(page, ".strip .stop")
+    video, stop, holder = box(page, ".video"), box(page, ".strip .stop"), box(page, ".holder")
     sticks = [box(page, ".thumb", place) for place in (0, 1)]
     assert within(screen, video), "the picture has the whole screen"
     assert within(stop, screen)
@@ -103,6 +103,7 @@ def check_arrangement(page: DronePage, size: tuple[int, int]) -> None:
             edges |= {"right": found["x"] + found["width"], "bottom": found["y"] + found["height"]}
             assert apart(stick, edges), button.text_content()
             assert within(edges, screen), button.text_content()
+            assert apart(holder, edges), f"who has control is written below {button.text_content()}"
     assert sticks[0]["left"] < 0.05 * size[0] + 12
     assert sticks[1]["right"] > 0.95 * size[0] - 12
     for shown in (".pill", ".battery", ".hud", ".holder", ".chip.age"):

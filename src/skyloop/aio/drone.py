@@ -217,6 +217,7 @@ class Drone:
         """
         return self.sync.velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
+    @by_name
     async def go_to(
         self,
         *,

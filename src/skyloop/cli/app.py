@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 import typer
 import typer.main
 
-from skyloop.cli import wording
+from skyloop.cli import INTERRUPTED, wording
 from skyloop.cli.commands import COMMANDS, Entry
 from skyloop.cli.naming import with_place
 from skyloop.cli.plain_help import Command, Group, WithBehaviours, width
@@ -22,7 +22,6 @@ _log = logging.getLogger(__name__)
 VERBOSE: Final = "--verbose"  #: works before and behind any command
 FAILED: Final = 1
 USAGE_ERROR: Final = 2
-INTERRUPTED: Final = 130  #: 128 + SIGINT, as shells count
 
 
 class ByTask(Group):

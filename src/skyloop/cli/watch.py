@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
 
 REFRESH_HZ: Final = 8
+WIDE_COLUMNS: Final = 60  #: for two facts side by side
+ROOMY_COLUMNS: Final = 90  #: for space between them
 LINE_EVERY_S: Final = 1.0
 EVENTS_SHOWN: Final = 8
 COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ERROR: "red"}
@@ -149,36 +152,59 @@ def events(drone: Drone, count: int) -> list[Text]:
 
 def _state(drone: Drone) -> Table:
     feedback, link = drone.feedback(), drone.link
-    table = Table.grid(padding=(0, 3))
-    table.add_row("state", Text(feedback.state.value, "bold"), "pilot", Text(feedback.owner or "nobody"))
-    table.add_row("battery", _share(feedback.battery), "failsafe", feedback.failsafe.value)
-    table.add_row("roll, pitch, yaw", _angles(feedback), "link to proxy", link.application.value)
-    table.add_row("altitude", _metres(feedback.altitude_m), "link to vehicle", link.vehicle.value)
-    table.add_row("velocity", _vector(feedback.velocity_m_s, "m/s"), "position", _vector(feedback.position_m, "m"))
+    table = Table.grid(padding=(0, 3 if _width() > ROOMY_COLUMNS else 1))
+    pairs: list[tuple[str, str | Text]] = [
+        ("state", Text(feedback.state.value, "bold")),
+        ("pilot", Text(feedback.owner or "nobody")),
+        ("battery", _share(feedback.battery)),
+        ("failsafe", feedback.failsafe.value),
+        ("roll, pitch, yaw", _angles(feedback)),
+        ("link to proxy", link.application.value),
+        ("altitude", _metres(feedback.altitude_m)),
+        ("link to vehicle", link.vehicle.value),
+        ("velocity", _vector(feedback.velocity_m_s, "m/s")),
+        ("position", _vector(feedback.position_m, "m")),
+    ]
+    if _is_narrow():
+        for pair in pairs:
+            table.add_row(*pair)
+    else:
+        for left, right in zip(pairs[::2], pairs[1::2], strict=True):
+            table.add_row(*left, *right)
     return table
 
 
 def channels(drone: Drone) -> Table:
-    """Return rates, delays and ages, a line for each channel."""
-    table = Table(named("channel"), "rate", "delay median", "p99", "age", "lost", "dropped", box=None)
+    """Return rates, delays and ages, a line for each channel; where it is narrow the most important ones."""
+    titles = ("rate", "delay median", "age", "p99", "lost", "dropped")
+    table = Table(named("channel"), *((*titles[:1], "delay", "age") if _is_narrow() else titles), box=None)
     for name, channel in drone.stats.items():
         delay = channel.delay_s
-        table.add_row(
-            name,
+        cells = (
             f"{channel.rate_hz:.1f} Hz",
             "–" if delay is None else f"{delay.median * 1e3:.2f} ms",
-            "–" if delay is None else f"{delay.p99 * 1e3:.2f} ms",
             "–" if channel.age_s is None else f"{channel.age_s * 1e3:.0f} ms",
+            "–" if delay is None else f"{delay.p99 * 1e3:.2f} ms",
             str(channel.lost),
             str(channel.dropped),
         )
+        table.add_row(name, *cells[: len(table.columns) - 1])
     return table
+
+
+def _is_narrow() -> bool:
+    """Return whether the terminal has no room for two facts side by side."""
+    return _width() < WIDE_COLUMNS
+
+
+def _width() -> int:
+    return shutil.get_terminal_size().columns
 
 
 def _angles(feedback: Feedback) -> str:
     if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
         return "unknown"
-    return " ".join(f"{math.degrees(a):6.1f}°" for a in (feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad))
+    return " ".join(f"{math.degrees(a):5.1f}°" for a in (feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad))
 
 
 def _share(value: float | None) -> str:
@@ -190,4 +216,4 @@ def _metres(value: float | None) -> str:
 
 
 def _vector(value: tuple[float, float, float] | None, unit: str) -> str:
-    return "unknown" if value is None else " ".join(f"{v:6.2f}" for v in value) + f" {unit}"
+    return "unknown" if value is None else " ".join(f"{v:5.2f}" for v in value) + f" {unit}"

@@ -383,6 +383,7 @@ class Drone:
             climb, yaw_rate = number("climb", climb), number("yaw_rate", yaw_rate)
         return self._core.command(Attitude(roll, pitch, climb, yaw_rate))
 
+    @by_name
     def go_to(
         self,
         *,
