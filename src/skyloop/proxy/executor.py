@@ -59,6 +59,7 @@ class ActionExecutor:
         self.guarded = False
         self._driver = driver
         self._left_to = ""  # as the driver said last
+        self.unsaid: Exception | None = None  #: why it did not say; the tick clears and raises it
         self._vehicle = publisher
         self.gave_up = ""  #: why the vehicle refused to go on with a software take-off; the reader clears it
 
@@ -77,8 +78,8 @@ class ActionExecutor:
         vehicle = self._vehicle
         try:
             self._left_to = shortened(self._driver.left_to(), MAX_LINK_TEXT // 2)
-        except Exception as error:  # noqa: BLE001  the failsafe comes after this, whatever the driver's code does
-            vehicle.driver_failed("left_to", error)
+        except Exception as error:  # noqa: BLE001  the failsafe comes first, whatever the driver's code does
+            self.unsaid = error
         return self.flight.observe(vehicle.reported_state, self._left_to, now_ns, self._shown(now_ns))
 
     def _shown(self, now_ns: int) -> Feedback | None:

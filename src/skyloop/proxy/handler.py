@@ -266,7 +266,11 @@ class CommandHandler:
             return holder is not None and holder.app_id == session.app_id and lease == self.authority.lease
 
     def tick(self, now_ns: int) -> None:
-        """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace."""
+        """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace.
+
+        Raises:
+            Exception: What the driver raised when it was asked who flies the vehicle, when all else is done.
+        """
         with self._lock:
             if self._left:
                 return
@@ -291,6 +295,9 @@ class CommandHandler:
             if why and session is not None:
                 session.intents.newest.end(Fate.REFUSED, why, Refusal.WRONG_STATE)
                 self._tell(session, session.intents.newest)
+            error, self._executor.unsaid = self._executor.unsaid, None
+            if error is not None:
+                raise error
 
     def order_landing(self, now_ns: int) -> bool:
         """Land because the proxy is about to end; from now on only landing and emergency stop are accepted.
