@@ -19,7 +19,7 @@ class Process:
     """A child that is ended by its own number."""
 
     def __init__(self, *command: str, log: Path, environment: dict[str, str]) -> None:
-        self._said = ""
+        self._said, self._log = "", log
         with log.open("ab") as errors:
             self._popen = subprocess.Popen(
                 command,
@@ -49,7 +49,8 @@ class Process:
             ready, _, _ = select.select([stream], [], [], max(0.0, deadline - time.monotonic()))
             more = os.read(stream.fileno(), 4096) if ready else b""
             if not more:
-                raise RuntimeError(f"{self._popen.args!r} did not say {word!r} but {self._said!r}")
+                why = self._log.read_text(errors="replace")[-2000:]
+                raise RuntimeError(f"{self._popen.args!r} did not say {word!r} but {self._said!r}; its log: {why}")
             self._said += more.decode()
         return self._said
 
