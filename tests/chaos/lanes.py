@@ -99,6 +99,7 @@ class Lane:
         return self.run("vehicle", self.name, str(self.folder), *([self.network] if self.network else []))
 
     def _start_pilot(self) -> Process:
+        self.proxy.until("ready")  # who looks for a name that nobody has yet is told so at once
         arguments = ["--network", self.network] if self.network else []
         return self.run("pilot", self.name, str(self.folder), *arguments, remote=True)
 
