@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Final
@@ -18,7 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from skyloop.cli.app import run
-from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
+from skyloop.cli.demo_parts import PagePort, drone_and_page, land
 from skyloop.cli.fly_follow import status_line
 from skyloop.errors import MissingExtraError, UsageError, install_command
 
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
 
 ENOUGH_IN_VIEW: Final = 0.9
 DETECTOR, LOOKS = "detector", "looks"
-_FIRST_PICTURE_S = 10.0
 _REFRESH_HZ = 4
 _LINE_EVERY_S = 5.0  # where there is no terminal
 _TURN_RAD_S = 0.6
@@ -51,12 +49,7 @@ def follow_anything(
     looks: Annotated[bool, typer.Option("--looks", help="By looks alone, also where a detector is installed")] = False,
     distance: Annotated[float, typer.Option(metavar="M", help="To keep, in metres; above 2")] = 4.0,
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Decides the noise and the wind")] = 0,
-    port: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=65535, metavar="N", help="Of the page; 0 takes a free one [8420, or the next free one]"
-        ),
-    ] = None,
+    port: PagePort = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
     name: Annotated[str, typer.Option(help="Who flies, for those who watch")] = "demo",
     json: Annotated[
@@ -116,8 +109,6 @@ class _Demo:
         """``port`` None: the default one of pages. Raises the errors of connecting and of take-off."""
         from follow_truth import FollowReport, TargetTruth
 
-        from skyloop.client import connect
-        from skyloop.cockpit.child import CockpitProcess
         from skyloop.sim import load_world
 
         detector = None if looks else packaged_detector()
@@ -126,15 +117,12 @@ class _Demo:
         truth = TargetTruth(load_world(self.world, self.seed))
         report = FollowReport(LOOKS if detector is None else DETECTOR, distance_m)
         uri = "sim://?" + urlencode({"world": self.world, "seed": self.seed, "cameras": "front", "fps": 15})
-        with ExitStack() as stack:
-            drone = stack.enter_context(connect(uri, name=self.name))
-            stack.enter_context(interrupted_by_signals(self._stop))
-            self.console.print(f"[bold]{uri}[/] is up as [bold]{drone.name}[/]")
-            page = stack.enter_context(CockpitProcess(drone.name, port)) if page_shown else None
-            drone.next_frame(timeout_s=_FIRST_PICTURE_S)
-            report.first_picture_s = time.monotonic() - self.started_s
-            if page is not None:
-                show_page(page, self.console, browser)
+        with drone_and_page(uri, self.console, self.name, self._stop, port, page_shown=page_shown, browser=browser) as (
+            drone,
+            _,
+            pictured_s,
+        ):
+            report.first_picture_s = pictured_s - self.started_s
             self.console.print("taking off")
             drone.takeoff()
             if not self._stopped:

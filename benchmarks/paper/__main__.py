@@ -19,7 +19,7 @@ from rich.table import Table
 
 from benchmarks.one_command import one_command
 from skyloop.cli.app import run
-from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
+from skyloop.cli.demo_parts import PagePort, drone_and_page, land
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ VEHICLE: Final = {
     "position": 1,
     "truth": 1,
 }
-_FIRST_PICTURE_S = 10.0
 _PRINT_EVERY_S = 30.0  # where there is no terminal
 
 
@@ -56,12 +55,7 @@ def paper(
     ] = None,
     headless: Annotated[bool, typer.Option("--headless", help="No page to watch and to fly from")] = False,
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Decides noise and wind")] = 0,
-    port: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=65535, metavar="N", help="Of the page; 0 takes a free one [8420, or the next free one]"
-        ),
-    ] = None,
+    port: PagePort = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
 ) -> None:
     """Fly the paper's test flight on a simulated AR.Drone, record it, and make the paper's table and figures from it.
@@ -139,19 +133,13 @@ class _Flight:
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> None:
         """``port`` None: the default one of pages. Raises the errors of connecting, of recording and of take-off."""
         from benchmarks.paper.flight import DelayLog, PaperFlight
-        from skyloop.client import connect
-        from skyloop.cockpit.child import CockpitProcess
         from skyloop.motion_capture import mocap
         from skyloop.recording import record
 
         with ExitStack() as stack:
-            drone = stack.enter_context(connect(uri, name="paper"))
-            stack.enter_context(interrupted_by_signals(self._stop))
-            self.console.print(f"[bold]{uri}[/] is up as [bold]{drone.name}[/]")
-            page = stack.enter_context(CockpitProcess(drone.name, port)) if page_shown else None
-            drone.next_frame(timeout_s=_FIRST_PICTURE_S)
-            if page is not None:
-                show_page(page, self.console, browser)
+            drone, _, _ = stack.enter_context(
+                drone_and_page(uri, self.console, "paper", self._stop, port, page_shown=page_shown, browser=browser)
+            )
             capture = stack.enter_context(mocap("sim://", {drone.name: drone.name}))
             found = capture.calibrate(drone)
             self.console.print(f"motion capture: {found.poses} poses at rest, spread {found.spread_m * 1e3:.1f} mm")

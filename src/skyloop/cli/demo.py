@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlencode
@@ -15,7 +14,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
+from skyloop.cli.demo_parts import PagePort, drone_and_page, land
 from skyloop.cli.demo_report import DemoReport, TruthMeter
 from skyloop.errors import LinkError
 
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
 MARKER_ID = 7  #: on the board that is carried about the room
 ENOUGH_IN_VIEW = 0.9
-_FIRST_PICTURE_S = 10.0
 _REFRESH_HZ = 4
 
 
@@ -39,9 +37,7 @@ def demo(
     ] = False,
     world: Annotated[str, typer.Option(help="A world's name or file")] = "room",
     seed: Annotated[int, typer.Option(min=0, help="Decides the marker's walk, the noise and the wind")] = 0,
-    port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Of the page; 0 takes a free one [8420, or the next free one]")
-    ] = None,
+    port: PagePort = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
     name: Annotated[str, typer.Option(help="Who flies, for those who watch")] = "demo",
     json: Annotated[
@@ -77,20 +73,15 @@ class _Demo:
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> DemoReport:
         """``port`` None: the default one of pages. Raises the errors of connecting and of take-off."""
-        from skyloop.client import connect
-        from skyloop.cockpit.child import CockpitProcess
         from skyloop.control.follow import FollowMarker
 
         report = DemoReport()
-        with ExitStack() as stack:
-            drone = stack.enter_context(connect(uri, name=self.name))
-            stack.enter_context(interrupted_by_signals(self._stop))
-            self.console.print(f"[bold]{uri}[/] is up as [bold]{drone.name}[/]")
-            page = stack.enter_context(CockpitProcess(drone.name, port)) if page_shown else None
-            drone.next_frame(timeout_s=_FIRST_PICTURE_S)
-            report.first_picture_s = time.monotonic() - self.started_s
-            if page is not None:
-                show_page(page, self.console, browser)
+        with drone_and_page(uri, self.console, self.name, self._stop, port, page_shown=page_shown, browser=browser) as (
+            drone,
+            page,
+            pictured_s,
+        ):
+            report.first_picture_s = pictured_s - self.started_s
             follower = FollowMarker(drone, MARKER_ID)
             with TruthMeter(drone, follower) as truth:
                 self._follow(drone, follower)
