@@ -49,13 +49,17 @@ def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exc
     errors: tuple[type[Exception], ...] = (*own, RuntimeError, ValueError, TypeError)
     if path.parent != _OWN:
         try_alone(path)
+    try:
+        return errors, _session(onnxruntime, path, threads)
+    except errors as error:
+        raise FileFormatError(f"{path} can't be loaded as an ONNX file: {reason(error)}") from error
+
+
+def _session(onnxruntime: Any, path: Path | str, threads: int) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 4  # what is wrong is in the exception
-    try:
-        return errors, onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except errors as error:
-        raise FileFormatError(f"{path} can't be loaded as an ONNX file: {reason(error)}") from error
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
 def try_alone(*files: Path | str, tracker: str = "") -> None:
@@ -113,10 +117,7 @@ def _network(path: str) -> Callable[[], object]:
     import numpy as np
     import onnxruntime
 
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    session = _session(onnxruntime, path, 1)
     kinds = {"tensor(float16)": np.float16, "tensor(uint8)": np.uint8, "tensor(int64)": np.int64}
     feed = {
         each.name: np.zeros(
