@@ -54,8 +54,8 @@ OTHER: Final = 0.15  #: share by which the throttle that was learnt may differ f
 GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: without headway a descent met something
 HEADWAY: Final = 0.4  #: of the descent that is asked for
 STILL: Final = {True: 0.1, False: 0.4}  #: what moves faster up or down [m/s] does not stand, precise or not
-#: Time constant of the climb that shows a touch-down [s]. It leaves 0.03 m/s of 0.2 m/s of noise (UWB), which never
-#: was STILL for GROUND_NS otherwise, and what sinks at 0.15 m/s is told from what stands.
+#: Time constant of the climb and height that show a lift-off or a touch-down [s]. It leaves 0.03 m/s of 0.2 m/s of
+#: noise (UWB), which never was STILL for GROUND_NS otherwise, and what sinks at 0.15 m/s is told from what stands.
 SMOOTH_S: Final = 0.4
 SINK_PER_S: Final = 0.5  #: how fast the throttle is taken away then
 OFF_BELOW: Final = 0.6  #: of the throttle that carries it: it stands
@@ -422,10 +422,8 @@ class SetpointController:
     def _lifted(self, climb: float, height: float, step_s: float) -> bool:
         """Return whether it has left the ground: by poses once noise can't be what shows it."""
         if self._motion.precise:
-            share = 1 - math.exp(-step_s / SMOOTH_S)
-            self._smooth_climb += share * (climb - self._smooth_climb)
-            self._smooth_height += share * (height - self._smooth_height)
-            climb, height = self._smooth_climb, self._smooth_height
+            self._smooth_climb = climb = _smoothed(self._smooth_climb, climb, step_s)
+            self._smooth_height = height = _smoothed(self._smooth_height, height, step_s)
         high, fast = LIFTED[self._motion.precise]
         return climb > fast or height > high
 
@@ -459,10 +457,10 @@ class SetpointController:
 
     def _stands(self, climb: float, step_s: float, now_ns: int) -> bool:
         """Return whether a descent meets the ground; takes the throttle away while it seems to."""
-        still, share = STILL[self._motion.precise], 1 - math.exp(-step_s / SMOOTH_S)
-        self._smooth_climb += share * (climb - self._smooth_climb)
-        self._smooth_wanted += share * (self._wanted.climb - self._smooth_wanted)
-        climb, wanted = self._smooth_climb, max(self._wanted.climb, self._smooth_wanted)
+        still = STILL[self._motion.precise]
+        self._smooth_climb = climb = _smoothed(self._smooth_climb, climb, step_s)
+        self._smooth_wanted = _smoothed(self._smooth_wanted, self._wanted.climb, step_s)
+        wanted = max(self._wanted.climb, self._smooth_wanted)
         if wanted >= -0.05 or climb > still or climb < max(HEADWAY * wanted, -still):
             self._still_ns = None
             self._sink = min(1.0, self._sink + 2 * SINK_PER_S * step_s)
@@ -483,3 +481,7 @@ class SetpointController:
             self._enter(Phase.STANDING, now_ns)
             return
         self.throttle = min(self.limits.throttle, BLIND * hover)
+
+
+def _smoothed(before: float, measured: float, step_s: float) -> float:
+    return before + (1 - math.exp(-step_s / SMOOTH_S)) * (measured - before)
