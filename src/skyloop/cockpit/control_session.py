@@ -245,13 +245,10 @@ class ControlSession:
 
     @contextmanager
     def _in_place_of(self, pilot: PilotConnection, why: str) -> Iterator[None]:
-        """End what the page flew before; hover if what takes its place is refused: nobody watches the former then."""
+        """End what the page flew before, and hover if what takes its place is refused."""
         self._end_flight(why)
-        try:
+        with _else_hovering(pilot, "what was to take its place was refused"):
             yield
-        except SkyloopError:
-            pilot.let_go("what was to take its place was refused")
-            raise
 
     def _hover_here(self, command: HoverHere) -> None:
         """Hover: as the person decided, or because the page finds that nothing is held any more."""
@@ -305,11 +302,8 @@ class ControlSession:
             raise RefusedError("no route is flown from this page")
         if isinstance(command, ResumeRoute):
             self._end_flight()
-        try:
+        with _else_hovering(pilot, "its route can't be steered"):
             act(route)
-        except SkyloopError:  # where it was sent before nobody watches it any more
-            pilot.let_go("its route can't be steered")
-            raise
         self._acknowledge(command)
         self._restart_silence_timer()
 
@@ -602,6 +596,16 @@ class ControlSession:
                 await work(command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
+
+
+@contextmanager
+def _else_hovering(pilot: PilotConnection, why: str) -> Iterator[None]:
+    """Hover if what is commanded here is refused: nobody watches any more what flew before."""
+    try:
+        yield
+    except SkyloopError:
+        pilot.let_go(why)
+        raise
 
 
 def _is_deaf(command: AnyCommand, now_ns: int) -> bool:
