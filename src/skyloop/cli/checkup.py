@@ -53,20 +53,20 @@ def examine_vehicle(address: str) -> Iterator[Finding]:
         for event in sink.events:
             if event.kind is EventKind.DRIVER_ERROR or event.severity is Severity.ERROR:
                 yield Finding("vehicle", Health.MISSING, event.text)
-        for diagnostic in _settled(driver, sink):
+        for diagnostic in _settled(driver):
             health = Health.GOOD if diagnostic.good else Health.MISSING
             yield Finding(diagnostic.what, health, diagnostic.detail, diagnostic.advice)
     finally:
         driver.close()
 
 
-def _settled(driver: Driver, sink: RecordingSink) -> list[Diagnostic]:
+def _settled(driver: Driver) -> list[Diagnostic]:
     end = time.monotonic() + SETTLE_S
     while True:
         found = driver.checkup()
         if time.monotonic() >= end or all(each.good or not each.severe for each in found):
             return found
-        sink.wait(lambda: False, LOOK_S)
+        time.sleep(LOOK_S)
 
 
 def _unreachable(sink: RecordingSink) -> Finding:
