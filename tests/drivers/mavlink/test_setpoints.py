@@ -123,9 +123,8 @@ def test_a_px4_that_ends_its_take_off_below_its_height_is_still_flown_from_here(
     assert [text for text in bench.texts if "not from here" in text] == []
 
 
-@AUTOPILOTS
-def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(autopilot: int) -> None:
-    """It was told "disarmed itself" 2.5 s later: what was heard before a request proves nothing about it."""
+def just_landed(autopilot: int) -> Bench:
+    """It stands after a landing of ours, and is still armed."""
     bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
     vehicle = bench.vehicle
     bench.apply(Hover())
@@ -133,6 +132,14 @@ def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(a
     bench.apply(Land())
     vehicle.mode, vehicle.landed, vehicle.place = LAND[autopilot][0], Landed.ON_GROUND, (0.0, 0.0, 0.0)
     bench.go_on(0.3)
+    return bench
+
+
+@AUTOPILOTS
+def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(autopilot: int) -> None:
+    """It was told "disarmed itself" 2.5 s later: what was heard before a request proves nothing about it."""
+    bench = just_landed(autopilot)
+    vehicle = bench.vehicle
     assert bench.state() is FlightState.LANDED
     bench.apply(Takeoff())
     bench.go_on(0.3)
@@ -149,13 +156,8 @@ def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(a
 @AUTOPILOTS
 def test_the_answer_to_disarming_after_a_landing_is_not_taken_for_one_to_arming(autopilot: int) -> None:
     """Both commands have one number. A real PX4 was never told to arm, and "disarmed itself" 2.5 s later."""
-    bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
+    bench = just_landed(autopilot)
     vehicle = bench.vehicle
-    bench.apply(Hover())
-    bench.go_on(1.2)
-    bench.apply(Land())
-    vehicle.mode, vehicle.landed, vehicle.place = LAND[autopilot][0], Landed.ON_GROUND, (0.0, 0.0, 0.0)
-    bench.go_on(0.3)
     bench.apply(Takeoff())
     bench.answer(ARM)  # to the command to disarm, on its way since before
     bench.go_on(0.2)
@@ -169,13 +171,8 @@ def test_the_answer_to_disarming_after_a_landing_is_not_taken_for_one_to_arming(
 @AUTOPILOTS
 def test_a_vehicle_killed_in_a_take_off_right_after_a_landing_is_not_armed_again(autopilot: int) -> None:
     """The landing before it is over by then: it was another's switch, and somebody may walk up to it."""
-    bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
+    bench = just_landed(autopilot)
     vehicle = bench.vehicle
-    bench.apply(Hover())
-    bench.go_on(1.2)
-    bench.apply(Land())
-    vehicle.mode, vehicle.landed, vehicle.place = LAND[autopilot][0], Landed.ON_GROUND, (0.0, 0.0, 0.0)
-    bench.go_on(0.3)
     bench.apply(Takeoff())
     bench.go_on(0.2)
     vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.TAKEOFF"}[autopilot]
