@@ -19,17 +19,17 @@ from benchmarks.measuring.schedule import SMALL
 from benchmarks.measuring.workers import STARTS_WITHIN_S, Workers
 from benchmarks.one_core import codecs_on_one_core
 from skyloop.bench import Flight, Machine, Spread, rounds, spread
-from skyloop.drivers.ardrone.video import PaveVideo
 from skyloop.drivers.backlog import Coded
-from skyloop.emulators.ardrone.uvlc import encode as encode_uvlc
-from skyloop.emulators.ardrone.video import H264_360P
 from skyloop.emulators.encoders import GROUP, Encoder
 from skyloop.errors import MissingExtraError
 from skyloop.sim.camera import FRONT_CAMERA
-from skyloop.wire.ardrone import navdata
-from skyloop.wire.ardrone.options import LAYOUTS
-from skyloop.wire.ardrone.pave import FrameType, PaveFrame
-from skyloop.wire.ardrone.uvlc import UvlcDecoder
+from skyloop.vehicles.ardrone.emulator.uvlc import encode as encode_uvlc
+from skyloop.vehicles.ardrone.emulator.video import H264_360P
+from skyloop.vehicles.ardrone.video import PaveVideo
+from skyloop.vehicles.ardrone.wire import navdata
+from skyloop.vehicles.ardrone.wire.options import LAYOUTS
+from skyloop.vehicles.ardrone.wire.pave import FrameType, PaveFrame
+from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
 
 UVLC_PER_S: Final = 15.0  #: what an AR.Drone 1 sends: the target
 PICTURES: Final = 2 * GROUP  #: two groups of H.264 pictures, each with a key frame

@@ -23,14 +23,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.drivers.ardrone.video import PaveAssembly, PaveVideo
 from skyloop.drivers.backlog import Coded
 from skyloop.drivers.live_container import LiveDecoder, Piece
-from skyloop.drivers.pave_decoder import av
 from skyloop.drivers.tello.video import TelloVideo
 from skyloop.emulators.tello.emulator import TelloPacker, automatic_kbps
 from skyloop.emulators.video import OneCamera
-from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
+from skyloop.vehicles.ardrone.pave_decoder import av
+from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo
+from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from skyloop.wire.h264 import Inspector
 from skyloop.wire.tello.video import Assembly, pieces
 from tests.recordings import FIXTURES

@@ -19,7 +19,6 @@ from benchmarks.measuring.tables import Table
 from skyloop.bench import Flight, Machine
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.replay.source import ReplaySource
-from skyloop.emulators.ardrone.video import H264_360P
 from skyloop.emulators.encoders import Encoded, Encoder
 from skyloop.logfile.layout import VERSION, Channel, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.logfile.reader import Recording
@@ -43,6 +42,7 @@ from skyloop.recording.review.summary import summarise
 from skyloop.recording.review.video import export_mp4
 from skyloop.recording.translation import Picture, Translator
 from skyloop.sim.camera import FRONT_CAMERA
+from skyloop.vehicles.ardrone.emulator.video import H264_360P
 
 FPS: Final = 30
 FEEDBACK_HZ: Final = 50

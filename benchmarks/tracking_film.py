@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError
 from skyloop.files import read_bytes, read_json
+from skyloop.vehicles.ardrone.wire.pave import PaveParser
 from skyloop.vision.tracking import Box
-from skyloop.wire.ardrone.pave import PaveParser
 
 _MOST_BYTES = 200_000_000
 LABELS = Path(__file__).parents[1] / "tests" / "data" / "tracking" / "ardrone2-desk.json"
@@ -48,7 +48,7 @@ def read_film(path: Path, most: int | None = None) -> NDArray[np.uint8]:
         FileFormatError: Nothing in it can be decoded.
         MissingExtraError: PyAV is not installed.
     """
-    from skyloop.drivers.pave_decoder import PaveDecoder
+    from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder
 
     decoder = PaveDecoder()
     frames = []

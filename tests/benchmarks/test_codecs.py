@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 from benchmarks import codecs, tables
 from benchmarks.command import build
-from skyloop.drivers.ardrone.video import PaveVideo
 from skyloop.drivers.backlog import Coded
-from skyloop.wire.ardrone import navdata
-from skyloop.wire.ardrone.options import LAYOUTS
+from skyloop.vehicles.ardrone.video import PaveVideo
+from skyloop.vehicles.ardrone.wire import navdata
+from skyloop.vehicles.ardrone.wire.options import LAYOUTS
 
 SHORT_S = 0.5
 

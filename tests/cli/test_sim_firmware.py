@@ -11,8 +11,8 @@ from collections.abc import Callable
 import pytest
 
 from skyloop.cli.firmware import address_from, ports_from
-from skyloop.emulators.ardrone import Ports
 from skyloop.errors import UsageError
+from skyloop.vehicles.ardrone.emulator import Ports
 from tests.cli.conftest import Run
 from tests.emulators.pilot import HERE, Pilot
 from tests.processes.conftest import Process

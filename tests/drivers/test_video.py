@@ -24,7 +24,7 @@ from skyloop.drivers.video.devices import cameras, described
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Hover, LinkState
 from skyloop.pyav import new_decoder
-from skyloop.wire.ardrone.pave import PaveParser
+from skyloop.vehicles.ardrone.wire.pave import PaveParser
 from tests.recordings import recorded
 
 LONG, TORN = "ardrone2/video-8s.pave", "ardrone2/video-64-byte-headers.pave"
@@ -317,7 +317,7 @@ def test_without_pyav_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
     for name in [
         name
         for name in sys.modules
-        if name.startswith(("skyloop.drivers.video", "skyloop.drivers.pave_decoder", "av."))
+        if name.startswith(("skyloop.drivers.video", "skyloop.vehicles.ardrone.pave_decoder", "av."))
     ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "av", None)

@@ -7,11 +7,11 @@ import socket
 import time
 from collections.abc import Callable
 
-from skyloop.emulators.ardrone import Ports
 from skyloop.errors import DecodeError
-from skyloop.wire.ardrone.at import Argument, format_command
-from skyloop.wire.ardrone.configuration import END_OF_DUMP, parse_dump
-from skyloop.wire.ardrone.navdata import Navdata, State, decode
+from skyloop.vehicles.ardrone.emulator import Ports
+from skyloop.vehicles.ardrone.wire.at import Argument, format_command
+from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, parse_dump
+from skyloop.vehicles.ardrone.wire.navdata import Navdata, State, decode
 
 HERE = "127.0.0.1"
 PERIOD_S = 0.03

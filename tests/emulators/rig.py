@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from skyloop.clock import ManualClock
-from skyloop.emulators.ardrone.logic import ArdroneLogic
 from skyloop.messages import (
     AnyAction,
     Attitude,
@@ -19,8 +18,9 @@ from skyloop.messages import (
 )
 from skyloop.sim.parameters import Limits
 from skyloop.sim.reports import VehicleFeedback
-from skyloop.wire.ardrone.at import Argument, format_command
-from skyloop.wire.ardrone.navdata import State
+from skyloop.vehicles.ardrone.emulator.logic import ArdroneLogic
+from skyloop.vehicles.ardrone.wire.at import Argument, format_command
+from skyloop.vehicles.ardrone.wire.navdata import State
 
 RESTING = VehicleFeedback(
     time_s=0.0,

@@ -11,16 +11,16 @@ from dataclasses import astuple
 
 import pytest
 
-from skyloop.emulators.ardrone import ArdroneFirmware, Faults, Ports, with_ardrones
 from skyloop.errors import LinkError, UsageError
 from skyloop.messages import FlightState
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
-from skyloop.wire.ardrone import options as o
-from skyloop.wire.ardrone.navdata import Navdata, State
-from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
-from skyloop.wire.ardrone.uvlc import UvlcDecoder
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Faults, Ports, with_ardrones
+from skyloop.vehicles.ardrone.wire import options as o
+from skyloop.vehicles.ardrone.wire.navdata import Navdata, State
+from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
+from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
 from tests.emulators.pilot import EMERGENCY, HERE, LAND, TAKE_OFF, Pilot
 
 av = pytest.importorskip("av")

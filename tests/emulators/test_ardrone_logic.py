@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.emulators.ardrone.logic import LedAnimation, VideoSettings
 from skyloop.messages import FlightState
-from skyloop.wire.ardrone.at import to_bits
-from skyloop.wire.ardrone.configuration import parse_dump
-from skyloop.wire.ardrone.keys import VideoChannel, VideoCodec
-from skyloop.wire.ardrone.navdata import State
+from skyloop.vehicles.ardrone.emulator.logic import LedAnimation, VideoSettings
+from skyloop.vehicles.ardrone.wire.at import to_bits
+from skyloop.vehicles.ardrone.wire.configuration import parse_dump
+from skyloop.vehicles.ardrone.wire.keys import VideoChannel, VideoCodec
+from skyloop.vehicles.ardrone.wire.navdata import State
 from tests.emulators.rig import Bench
 
 ALIVE = 0x0F800090  # of a drone that is well: altitude control, camera ready, its threads

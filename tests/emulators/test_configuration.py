@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.emulators.ardrone.configuration import MOST_CUSTOM, Configuration, Ids
-from skyloop.wire.ardrone.configuration import END_OF_DUMP, parse_dump
-from skyloop.wire.ardrone.keys import KEYS, Value, VideoCodec, keys_of
+from skyloop.vehicles.ardrone.emulator.configuration import MOST_CUSTOM, Configuration, Ids
+from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, parse_dump
+from skyloop.vehicles.ardrone.wire.keys import KEYS, Value, VideoCodec, keys_of
 
 MINE: Ids = ("0a0b0c0d", "11111111", "22222222")
 

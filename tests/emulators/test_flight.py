@@ -9,9 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.emulators.ardrone.configuration import Configuration
-from skyloop.emulators.ardrone.flight import CALIBRATION_RATE_RAD_S
-from skyloop.emulators.ardrone.setpoints import Progress, limits_of, set_point
 from skyloop.messages import (
     AnyAction,
     Attitude,
@@ -23,8 +20,11 @@ from skyloop.messages import (
     Takeoff,
 )
 from skyloop.sim.reports import VehicleFeedback
-from skyloop.wire.ardrone.at import Pcmd, Ref
-from skyloop.wire.ardrone.navdata import State
+from skyloop.vehicles.ardrone.emulator.configuration import Configuration
+from skyloop.vehicles.ardrone.emulator.flight import CALIBRATION_RATE_RAD_S
+from skyloop.vehicles.ardrone.emulator.setpoints import Progress, limits_of, set_point
+from skyloop.vehicles.ardrone.wire.at import Pcmd, Ref
+from skyloop.vehicles.ardrone.wire.navdata import State
 from tests.emulators.rig import RESTING, Bench
 
 S = FlightState

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.emulators.ardrone.sequence import CommandSequence
+from skyloop.vehicles.ardrone.emulator.sequence import CommandSequence
 
 
 @pytest.mark.parametrize(

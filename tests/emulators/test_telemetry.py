@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from skyloop.emulators.ardrone.clock import DroneClock
-from skyloop.emulators.ardrone.listeners import MOST, Listeners
-from skyloop.emulators.ardrone.setpoints import Progress
-from skyloop.emulators.ardrone.telemetry import Snapshot, options_of, tags_of
 from skyloop.emulators.video import VideoStatus
 from skyloop.messages import FlightState
-from skyloop.wire.ardrone import options as o
-from skyloop.wire.ardrone.navdata import ControlState, Navdata, decode, encode
+from skyloop.vehicles.ardrone.emulator.clock import DroneClock
+from skyloop.vehicles.ardrone.emulator.listeners import MOST, Listeners
+from skyloop.vehicles.ardrone.emulator.setpoints import Progress
+from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, tags_of
+from skyloop.vehicles.ardrone.wire import options as o
+from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, decode, encode
 from tests.emulators.rig import RESTING
 
 EVERY = list(range(28))

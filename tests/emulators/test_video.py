@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from skyloop.drivers.ardrone.video import cameras_of
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.ardrone.clock import DroneClock
-from skyloop.emulators.ardrone.logic import VideoSettings
-from skyloop.emulators.ardrone.video import (
+from skyloop.emulators.encoders import GROUP, Encoder, as_the_drone_does, require_encoder
+from skyloop.emulators.video import Piece, VideoEncoding, with_inset
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.transport.testing import wait_until
+from skyloop.vehicles.ardrone.emulator.clock import DroneClock
+from skyloop.vehicles.ardrone.emulator.logic import VideoSettings
+from skyloop.vehicles.ardrone.emulator.video import (
     BOTTOM_1,
     BOTTOM_2,
     BOTTOM_2_SENT,
@@ -25,13 +28,10 @@ from skyloop.emulators.ardrone.video import (
     PavePacker,
     UvlcPacker,
 )
-from skyloop.emulators.encoders import GROUP, Encoder, as_the_drone_does, require_encoder
-from skyloop.emulators.video import Piece, VideoEncoding, with_inset
-from skyloop.errors import MissingExtraError, UsageError
-from skyloop.transport.testing import wait_until
-from skyloop.wire.ardrone import uvlc
-from skyloop.wire.ardrone.keys import VideoChannel, VideoCodec
-from skyloop.wire.ardrone.pave import Codec, FrameType, PaveFrame, PaveParser
+from skyloop.vehicles.ardrone.video import cameras_of
+from skyloop.vehicles.ardrone.wire import uvlc
+from skyloop.vehicles.ardrone.wire.keys import VideoChannel, VideoCodec
+from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame, PaveParser
 
 av = pytest.importorskip("av")
 

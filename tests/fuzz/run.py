@@ -12,7 +12,7 @@ PACKAGES = {
     "samples": ["skyloop.messages"],
     "packets": ["skyloop.messages", "skyloop.transport.local.packets", "skyloop.transport.fabric.packets"],
     "proxy": ["skyloop.messages", "skyloop.proxy"],
-    "ardrone": ["skyloop.wire.ardrone"],
+    "ardrone": ["skyloop.vehicles.ardrone.wire"],
     "tello": ["skyloop.wire.tello"],
     "mavlink": ["skyloop.wire.mavlink"],
     "msp": ["skyloop.wire.msp"],

@@ -60,9 +60,9 @@ def proxy(data: bytes) -> None:
 
 def ardrone(data: bytes) -> None:
     """What an AR.Drone, or whoever pretends to be one, sends and gets."""
-    from skyloop.wire.ardrone import at, configuration, navdata
-    from skyloop.wire.ardrone.pave import PaveParser
-    from skyloop.wire.ardrone.uvlc import UvlcDecoder
+    from skyloop.vehicles.ardrone.wire import at, configuration, navdata
+    from skyloop.vehicles.ardrone.wire.pave import PaveParser
+    from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
 
     kind, data = data[:1], data[1:]
     if kind == b"n":

@@ -5,9 +5,9 @@ from __future__ import annotations
 import signal
 import sys
 
-from skyloop.emulators.ardrone import ArdroneFirmware, Ports
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
 
 at, navdata, video, control = map(int, sys.argv[1:])
 host = SimHost(SimOptions(rate_hz=125.0, cameras=()))

@@ -11,8 +11,8 @@ import pytest
 
 import skyloop
 from skyloop.control.follow import FollowMarker
-from skyloop.emulators.ardrone.video import FRONT_1
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
+from skyloop.vehicles.ardrone.emulator.video import FRONT_1
 from tests.processes.conftest import Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]

@@ -17,7 +17,7 @@ from skyloop.messages.encoded import H264
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.output import RecordingFile
 from skyloop.recording.translation import Picture, Translator
-from skyloop.wire.ardrone.pave import Codec
+from skyloop.vehicles.ardrone.wire.pave import Codec
 
 MS = 1_000_000
 BEGIN_NS = 5_000_000_000

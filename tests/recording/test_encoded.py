@@ -19,10 +19,7 @@ from numpy.typing import NDArray
 import skyloop
 from skyloop.client.drone import open_drone
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.pave_decoder import PaveDecoder
 from skyloop.drivers.registry import make_driver
-from skyloop.emulators.ardrone import ArdroneFirmware, Ports
-from skyloop.emulators.ardrone.settings import with_ardrones
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.logfile import layout
 from skyloop.logfile.h264 import Group, Groups
@@ -38,7 +35,10 @@ from skyloop.recording.review.video import export_mp4
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
-from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
+from skyloop.vehicles.ardrone.emulator.settings import with_ardrones
+from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder
+from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from tests.integration.fake_vehicle import FakeVehicle
 from tests.recording import files
 from tests.recordings import recorded

@@ -14,11 +14,11 @@ from typing import Any, NoReturn
 
 import pytest
 
-from skyloop.emulators.ardrone import ArdroneFirmware
-from skyloop.emulators.ardrone.settings import with_ardrones
 from skyloop.errors import LinkError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware
+from skyloop.vehicles.ardrone.emulator.settings import with_ardrones
 
 HERE = Path(__file__).parent
 INSTALLED = HERE.parents[1] / ".third-party"

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
-    from skyloop.emulators.ardrone import ArdroneFirmware, Ports
     from skyloop.emulators.mavlink import MavlinkFirmware
     from skyloop.emulators.msp import BetaflightFirmware
     from skyloop.emulators.tello import TelloFirmware
     from skyloop.faults import Faults
     from skyloop.sim.options import SimOptions
+    from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
 
     Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | MavlinkFirmware | TelloFirmware
 
@@ -75,8 +75,8 @@ def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving
 
 
 def _ardrones(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> list[ArdroneFirmware]:
-    from skyloop.emulators.ardrone import ArdroneFirmware, with_ardrones
     from skyloop.sim.host import SimHost
+    from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, with_ardrones
 
     host = SimHost(with_ardrones(options), drones)
     base = PORT_BASE if serving.port_base is None else serving.port_base
@@ -179,7 +179,7 @@ def ports_from(base: int, drone: int) -> Ports:
     Raises:
         UsageError: There are no such ports.
     """
-    from skyloop.emulators.ardrone import Ports
+    from skyloop.vehicles.ardrone.emulator import Ports
 
     if base == 0:
         return Ports.free()
@@ -208,8 +208,8 @@ def _run(firmwares: Sequence[Emulated]) -> None:
 
 def describe(firmware: Emulated) -> str:
     """Return one line with the ports of a drone."""
-    from skyloop.emulators.ardrone import ArdroneFirmware
     from skyloop.emulators.tello import TelloFirmware
+    from skyloop.vehicles.ardrone.emulator import ArdroneFirmware
 
     if isinstance(firmware, TelloFirmware):
         tello = firmware.settings

@@ -150,7 +150,7 @@ def sim(
     if options.autopilot is not None:
         raise UsageError("--autopilot is real firmware and --firmware an emulation of it: give one of them")
     _refuse_for_firmware(name, uri)
-    from skyloop.emulators.ardrone import Faults
+    from skyloop.vehicles.ardrone.emulator import Faults
 
     settle(options)
     faults = Faults(seed=fault_seed or 0, drop=lose or 0.0, duplicate=repeat or 0.0, reorder=reorder or 0.0)

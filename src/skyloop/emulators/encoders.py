@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import MissingExtraError
-from skyloop.wire.ardrone.pave import Codec
+from skyloop.vehicles.ardrone.wire.pave import Codec
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext

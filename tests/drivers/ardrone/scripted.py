@@ -6,15 +6,15 @@ from collections.abc import Callable
 from typing import Final
 
 from skyloop.clock import NS_PER_S, ManualClock, nanoseconds
-from skyloop.drivers.ardrone.configuration import own_ids
-from skyloop.drivers.ardrone.options import ArdroneOptions
-from skyloop.drivers.ardrone.protocol import ArdroneSession
 from skyloop.drivers.recording_sink import RecordingSink
-from skyloop.wire.ardrone.at import AtCommand, Ctrl, Ref, parse_commands
-from skyloop.wire.ardrone.configuration import DEFAULT_ID, format_dump, parse_value
-from skyloop.wire.ardrone.keys import Value, keys_of
-from skyloop.wire.ardrone.navdata import ControlState, State, encode
-from skyloop.wire.ardrone.options import Demo, Option
+from skyloop.vehicles.ardrone.configuration import own_ids
+from skyloop.vehicles.ardrone.options import ArdroneOptions
+from skyloop.vehicles.ardrone.protocol import ArdroneSession
+from skyloop.vehicles.ardrone.wire.at import AtCommand, Ctrl, Ref, parse_commands
+from skyloop.vehicles.ardrone.wire.configuration import DEFAULT_ID, format_dump, parse_value
+from skyloop.vehicles.ardrone.wire.keys import Value, keys_of
+from skyloop.vehicles.ardrone.wire.navdata import ControlState, State, encode
+from skyloop.vehicles.ardrone.wire.options import Demo, Option
 
 STEP_S: Final = 0.01
 NAVDATA_STEPS: Final = 2

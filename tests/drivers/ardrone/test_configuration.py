@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.drivers.ardrone.configuration import (
+from skyloop.vehicles.ardrone.configuration import (
     MAX_DUMP,
     Configurator,
     Exchange,
@@ -16,7 +16,7 @@ from skyloop.drivers.ardrone.configuration import (
     own_ids,
     version_of,
 )
-from skyloop.wire.ardrone.at import AtMessage
+from skyloop.vehicles.ardrone.wire.at import AtMessage
 from tests.drivers.ardrone.scripted import ns
 
 CLEAR: AtMessage = ("CTRL", (5, 0))

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import pytest
 
 from skyloop.clock import NS_PER_S
-from skyloop.drivers.ardrone.configuration import Configurator, Exchange, Read
-from skyloop.drivers.ardrone.link import RETRY_NS, DumpClient
+from skyloop.vehicles.ardrone.configuration import Configurator, Exchange, Read
+from skyloop.vehicles.ardrone.link import RETRY_NS, DumpClient
 
 DUMP = b"control:outdoor = TRUE\n\0"
 

@@ -12,7 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
-from skyloop.drivers.ardrone.telemetry import (
+from skyloop.drivers.recording_sink import implausible
+from skyloop.messages import Feedback, FlightState
+from skyloop.messages.codec import decode as decode_packet
+from skyloop.messages.codec import encode as encode_packet
+from skyloop.vehicles.ardrone.telemetry import (
     OPTION_TAGS,
     ClimbMeter,
     DroneClock,
@@ -22,12 +26,8 @@ from skyloop.drivers.ardrone.telemetry import (
     flight_state,
     native_of,
 )
-from skyloop.drivers.recording_sink import implausible
-from skyloop.messages import Feedback, FlightState
-from skyloop.messages.codec import decode as decode_packet
-from skyloop.messages.codec import encode as encode_packet
-from skyloop.wire.ardrone.navdata import ControlState, Navdata, State, decode, encode
-from skyloop.wire.ardrone.options import Demo, Gps, PhysMeasures, RawMeasures, Time, VisionDetect, Wifi
+from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, State, decode, encode
+from skyloop.vehicles.ardrone.wire.options import Demo, Gps, PhysMeasures, RawMeasures, Time, VisionDetect, Wifi
 from tests.drivers.ardrone.scripted import ns
 from tests.recordings import recorded
 

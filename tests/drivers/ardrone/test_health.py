@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.drivers.ardrone.telemetry import Health, emergency_reason
 from skyloop.messages import EventKind, Severity
-from skyloop.wire.ardrone.navdata import State
+from skyloop.vehicles.ardrone.telemetry import Health, emergency_reason
+from skyloop.vehicles.ardrone.wire.navdata import State
 
 BITS = st.integers(0, 2**32 - 1).map(State)
 EVERY = State(0xFFFFFFFF)

@@ -9,11 +9,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from skyloop.drivers.ardrone.protocol import ArdroneSession
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
-from skyloop.emulators.ardrone import ArdroneFirmware, Faults, Ports
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import (
     Attitude,
@@ -29,6 +27,8 @@ from skyloop.messages import (
 )
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Faults, Ports
+from skyloop.vehicles.ardrone.protocol import ArdroneSession
 
 NO_FAULTS = Faults()
 PATIENCE_S = 15.0

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.drivers.ardrone import ArdroneDriver
-from skyloop.drivers.ardrone.driver import ACTIONS
-from skyloop.drivers.ardrone.options import ArdroneOptions, options_of
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, ParameterError, UsageError
 from skyloop.messages import Hover
-from skyloop.wire.ardrone.ports import Ports
+from skyloop.vehicles.ardrone import ArdroneDriver
+from skyloop.vehicles.ardrone.driver import ACTIONS
+from skyloop.vehicles.ardrone.options import ArdroneOptions, options_of
+from skyloop.vehicles.ardrone.wire.ports import Ports
 
 
 def test_the_usual_address() -> None:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import re
 
-from skyloop.drivers.ardrone import options
-from skyloop.drivers.ardrone.parameters import PREFIX, Commands, entries_of
-from skyloop.drivers.ardrone.setpoints import SetpointController
-from skyloop.drivers.ardrone.telemetry import _REASONS
-from skyloop.drivers.ardrone.video import cameras_of
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.ardrone.video import BOTTOM_2_SENT, FRONT_2
-from skyloop.wire.ardrone.configuration import format_value
-from skyloop.wire.ardrone.keys import keys_of
+from skyloop.vehicles.ardrone import options
+from skyloop.vehicles.ardrone.emulator.video import BOTTOM_2_SENT, FRONT_2
+from skyloop.vehicles.ardrone.parameters import PREFIX, Commands, entries_of
+from skyloop.vehicles.ardrone.setpoints import SetpointController
+from skyloop.vehicles.ardrone.telemetry import _REASONS
+from skyloop.vehicles.ardrone.video import cameras_of
+from skyloop.vehicles.ardrone.wire.configuration import format_value
+from skyloop.vehicles.ardrone.wire.keys import keys_of
 from tests.docs.pages import rows, section
 
 DRIVER = section("docs/ardrone.md", "## The driver")

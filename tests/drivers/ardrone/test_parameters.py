@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.drivers.ardrone.parameters import Commands, active_camera, entries_of, taken, written
-from skyloop.drivers.ardrone.setpoints import Condition, SetpointController
 from skyloop.drivers.suite_parameters import mismatch
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.proxy.parameters import check
-from skyloop.wire.ardrone.animations import FLIGHT_ANIMATIONS, LED_ANIMATIONS
-from skyloop.wire.ardrone.at import AtMessage
-from skyloop.wire.ardrone.configuration import format_value
-from skyloop.wire.ardrone.keys import keys_of
-from skyloop.wire.ardrone.navdata import ControlState, State
+from skyloop.vehicles.ardrone.parameters import Commands, active_camera, entries_of, taken, written
+from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController
+from skyloop.vehicles.ardrone.wire.animations import FLIGHT_ANIMATIONS, LED_ANIMATIONS
+from skyloop.vehicles.ardrone.wire.at import AtMessage
+from skyloop.vehicles.ardrone.wire.configuration import format_value
+from skyloop.vehicles.ardrone.wire.keys import keys_of
+from skyloop.vehicles.ardrone.wire.navdata import ControlState, State
 
 DRONES = {version: {name: format_value(key.default) for name, key in keys_of(version).items()} for version in (1, 2)}
 GROUND = Condition(State(0), ControlState.LANDED)

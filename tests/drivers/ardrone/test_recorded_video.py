@@ -12,13 +12,13 @@ from contextlib import contextmanager, suppress
 
 import pytest
 
-from skyloop.drivers.ardrone.driver import ArdroneDriver
 from skyloop.drivers.live_video import VideoCounters
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
 from skyloop.messages import LinkState
-from skyloop.wire.ardrone.navdata import Navdata, decode
-from skyloop.wire.ardrone.options import Demo, Time
+from skyloop.vehicles.ardrone.driver import ArdroneDriver
+from skyloop.vehicles.ardrone.wire.navdata import Navdata, decode
+from skyloop.vehicles.ardrone.wire.options import Demo, Time
 from tests.drivers.ardrone.scripted import ScriptedDrone
 from tests.drivers.ardrone.video_ports import HOST, LONG, SHORT, TcpPort, digest, frames, pieces, true_pictures
 from tests.recordings import recorded

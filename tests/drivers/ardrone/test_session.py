@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyloop.drivers.ardrone.configuration import Exchange, Read, Write
-from skyloop.drivers.ardrone.options import ArdroneOptions
 from skyloop.errors import DriverError
 from skyloop.messages import (
     Attitude,
@@ -22,9 +20,11 @@ from skyloop.messages import (
     Severity,
     Takeoff,
 )
-from skyloop.wire.ardrone.at import Ref
-from skyloop.wire.ardrone.navdata import State, encode
-from skyloop.wire.ardrone.options import Demo, Time
+from skyloop.vehicles.ardrone.configuration import Exchange, Read, Write
+from skyloop.vehicles.ardrone.options import ArdroneOptions
+from skyloop.vehicles.ardrone.wire.at import Ref
+from skyloop.vehicles.ardrone.wire.navdata import State, encode
+from skyloop.vehicles.ardrone.wire.options import Demo, Time
 from tests.drivers.ardrone.scripted import IDS, Rig, ScriptedDrone, ns
 from tests.recordings import content, needs_recordings
 

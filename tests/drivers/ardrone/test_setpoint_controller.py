@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from skyloop.drivers.ardrone.setpoints import Condition, SetpointController, StickLimits
 from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,
@@ -19,8 +18,9 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.wire.ardrone.at import Ref
-from skyloop.wire.ardrone.navdata import ControlState, State
+from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController, StickLimits
+from skyloop.vehicles.ardrone.wire.at import Ref
+from skyloop.vehicles.ardrone.wire.navdata import ControlState, State
 from tests.drivers.ardrone.scripted import ns
 
 GROUND = Condition(State(0), ControlState.LANDED)

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.drivers.ardrone.setpoints import HEADING_ACCURACY, Stick, StickLimits, limits_of, motion, stick_of
 from skyloop.messages import Attitude
-from skyloop.wire.ardrone.at import Pcmd, format_command
+from skyloop.vehicles.ardrone.setpoints import HEADING_ACCURACY, Stick, StickLimits, limits_of, motion, stick_of
+from skyloop.vehicles.ardrone.wire.at import Pcmd, format_command
 
 LIMITS = StickLimits(tilt_rad=0.2, climb_m_s=0.7, yaw_rate_rad_s=1.75)
 ANGLES = st.floats(-10.0, 10.0)

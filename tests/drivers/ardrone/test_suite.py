@@ -9,9 +9,9 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import VehicleUri, parse_uri
-from skyloop.emulators.ardrone import ArdroneFirmware, Ports
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
 
 
 class TestArdrone2(DriverSuite):

@@ -7,8 +7,8 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.drivers.ardrone.video import DroneStamps
 from skyloop.drivers.backlog import LATE_NS, MAX_FRAMES, Backlog, Coded
+from skyloop.vehicles.ardrone.video import DroneStamps
 
 MS = 1_000_000
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyloop.drivers.ardrone.video import PaveAssembly, PaveVideo
 from skyloop.drivers.backlog import Coded
-from skyloop.emulators.ardrone.video import MP4_360P
 from skyloop.emulators.encoders import Encoder
 from skyloop.errors import UnsupportedError
-from skyloop.wire.ardrone.pave import Codec, FrameType, PaveFrame
+from skyloop.vehicles.ardrone.emulator.video import MP4_360P
+from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo
+from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame
 from tests.drivers.ardrone.video_ports import LONG, SHORT, Digest, digest, frames, pieces, recording, true_pictures
 
 NAMES = st.sampled_from((LONG, SHORT))

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from skyloop.clock import seconds
-from skyloop.drivers.ardrone.video import VideoReceiver
 from skyloop.drivers.live_video import VideoEvent
-from skyloop.emulators.ardrone import ArdroneFirmware, Ports
-from skyloop.emulators.ardrone.settings import with_ardrones
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
+from skyloop.vehicles.ardrone.emulator.settings import with_ardrones
+from skyloop.vehicles.ardrone.video import VideoReceiver
 from tests.drivers.ardrone.video_ports import HOST, Viewer
 
 

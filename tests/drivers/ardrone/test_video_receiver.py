@@ -11,10 +11,10 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.video import VideoReceiver
 from skyloop.drivers.backlog import LATE_NS
 from skyloop.drivers.live_video import VideoCounters, VideoEvent
 from skyloop.errors import MissingExtraError, UsageError
+from skyloop.vehicles.ardrone.video import VideoReceiver
 from tests.drivers.ardrone.video_ports import (
     HOST,
     LONG,
@@ -280,7 +280,7 @@ def test_without_pyav_it_names_what_to_install(monkeypatch: pytest.MonkeyPatch) 
     for name in [
         name
         for name in sys.modules
-        if name == "av" or name.startswith(("av.", "skyloop.drivers.pave_decoder", "skyloop.drivers.video"))
+        if name == "av" or name.startswith(("av.", "skyloop.vehicles.ardrone.pave_decoder", "skyloop.drivers.video"))
     ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "av", None)

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.video import WAKE, UvlcVideo
 from skyloop.drivers.backlog import Coded
 from skyloop.drivers.live_video import VideoEvent
-from skyloop.emulators.ardrone.uvlc import encode
-from skyloop.wire.ardrone.uvlc import UvlcDecoder, is_intra, is_p264
+from skyloop.vehicles.ardrone.emulator.uvlc import encode
+from skyloop.vehicles.ardrone.video import WAKE, UvlcVideo
+from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, is_intra, is_p264
 from tests.drivers.ardrone.video_ports import HOST, PATIENCE_S, Viewer, digest, receiver_of
 
 P264 = bytes.fromhex("00020100") + bytes(60)  # 15 zeros, then 1000000

@@ -12,9 +12,9 @@ from contextlib import suppress
 import av
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.video import VideoReceiver
 from skyloop.drivers.live_video import Picture, VideoEvent
-from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
+from skyloop.vehicles.ardrone.video import VideoReceiver
+from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from tests.recordings import recorded
 
 HOST = "127.0.0.1"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.emulators.encoders import Encoded, Encoder, Format
-from skyloop.wire.ardrone.pave import Codec
+from skyloop.vehicles.ardrone.wire.pave import Codec
 
 BITS, STRIPE, HEIGHT = 12, 16, 64
 WIDTH = BITS * STRIPE

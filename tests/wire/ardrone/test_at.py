@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
-from skyloop.wire.ardrone.at import (
+from skyloop.vehicles.ardrone.wire.at import (
     MAX_LINE,
     AtCommand,
     Ctrl,

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.wire.ardrone.configuration import END_OF_DUMP, format_dump, format_value, parse_dump, parse_value
-from skyloop.wire.ardrone.keys import KEYS, Value
+from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, format_dump, format_value, parse_dump, parse_value
+from skyloop.vehicles.ardrone.wire.keys import KEYS, Value
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False, width=32)
 

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.wire.ardrone.configuration import format_value, parse_value
-from skyloop.wire.ardrone.keys import KEYS, NAVDATA_OPTIONS_USUAL, Category, Key, VideoChannel, VideoCodec, keys_of
-from skyloop.wire.ardrone.options import LAYOUTS, Demo, VisionDetect
+from skyloop.vehicles.ardrone.wire.configuration import format_value, parse_value
+from skyloop.vehicles.ardrone.wire.keys import (
+    KEYS,
+    NAVDATA_OPTIONS_USUAL,
+    Category,
+    Key,
+    VideoChannel,
+    VideoCodec,
+    keys_of,
+)
+from skyloop.vehicles.ardrone.wire.options import LAYOUTS, Demo, VisionDetect
 
 
 @pytest.mark.parametrize("key", KEYS.values(), ids=lambda key: key.name)

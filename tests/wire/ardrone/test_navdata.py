@@ -10,9 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.wire.ardrone import options
-from skyloop.wire.ardrone.navdata import MAX_DATAGRAM, ControlState, State, decode, encode
-from skyloop.wire.ardrone.options import BY_TAG_AND_SIZE, LAYOUTS, Demo, Gps, Time, VisionDetect, Wifi, Zimmu3000
+from skyloop.vehicles.ardrone.wire import options
+from skyloop.vehicles.ardrone.wire.navdata import MAX_DATAGRAM, ControlState, State, decode, encode
+from skyloop.vehicles.ardrone.wire.options import (
+    BY_TAG_AND_SIZE,
+    LAYOUTS,
+    Demo,
+    Gps,
+    Time,
+    VisionDetect,
+    Wifi,
+    Zimmu3000,
+)
 from tests.recordings import content, needs_recordings
 
 RECORDED = content("ardrone2/navdata-full-landed.bin")

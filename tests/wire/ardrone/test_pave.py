@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyloop.wire.ardrone.pave import DEFAULT_MAX_PAYLOAD, FrameType, PaveFrame, PaveParser
+from skyloop.vehicles.ardrone.wire.pave import DEFAULT_MAX_PAYLOAD, FrameType, PaveFrame, PaveParser
 from tests.recordings import content, needs_recordings
 
 pytestmark = needs_recordings

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
-from skyloop.wire.ardrone.pave import Codec, FrameType, PaveParser, build_header
+from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveParser, build_header
 from tests.recordings import recorded
 
 

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from skyloop.errors import DecodeError
-from skyloop.wire.ardrone.uvlc import MAX_PACKET, UvlcDecoder, UvlcPicture, is_p264
-from skyloop.wire.ardrone.uvlc_tables import SIZES, PictureType
+from skyloop.vehicles.ardrone.wire.uvlc import MAX_PACKET, UvlcDecoder, UvlcPicture, is_p264
+from skyloop.vehicles.ardrone.wire.uvlc_tables import SIZES, PictureType
 from tests.wire.ardrone.uvlc_bits import (
     END,
     GREY,

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from skyloop.emulators.ardrone.uvlc import MAX_DATAGRAM, encode
 from skyloop.errors import UsageError
-from skyloop.wire.ardrone.uvlc import UvlcDecoder, UvlcPicture
-from skyloop.wire.ardrone.uvlc_tables import SIZES
+from skyloop.vehicles.ardrone.emulator.uvlc import MAX_DATAGRAM, encode
+from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture
+from skyloop.vehicles.ardrone.wire.uvlc_tables import SIZES
 from tests.wire.ardrone.uvlc_bits import GREY, header, level, macroblock, packet, picture, run
 
 Picture = NDArray[np.uint8]

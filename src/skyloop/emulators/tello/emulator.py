@@ -21,7 +21,7 @@ from skyloop.emulators.video import OneCamera, Piece, VideoEncoding
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.host import Report, SimHost
-from skyloop.wire.ardrone.pave import Codec
+from skyloop.vehicles.ardrone.wire.pave import Codec
 from skyloop.wire.tello.commands import PORT, Sdk
 from skyloop.wire.tello.video import pieces
 

@@ -1,5 +1,0 @@
-"""``ardrone://HOST``: the Parrot AR.Drone, 1 and 2."""
-
-from skyloop.drivers.ardrone.driver import ArdroneDriver
-
-__all__ = ["ArdroneDriver"]

@@ -1,0 +1,198 @@
+"""The drone's configuration: values of each session, user and application, and the texts that it sends. Pure."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from skyloop.errors import DecodeError
+from skyloop.vehicles.ardrone.wire.configuration import DEFAULT_ID, END_OF_DUMP, format_dump, parse_value
+from skyloop.vehicles.ardrone.wire.keys import Category, Key, Value, VideoChannel, VideoCodec, keys_of
+
+MOST_CUSTOM: Final = 16  #: sessions, users and applications each; the drone's own number is not known
+
+Ids = tuple[str, str, str]  #: of session, user and application, as ``CONFIG_IDS`` has them
+
+_ID: Final = re.compile(r"[0-9a-f]{8}")
+_ID_KEYS: Final = {
+    "custom:session_id": Category.SESSION,
+    "custom:profile_id": Category.USER,
+    "custom:application_id": Category.APPLICATION,
+}
+_DESCRIPTIONS: Final = {
+    Category.APPLICATION: ("[applis]", "custom:application_desc"),
+    Category.USER: ("[profiles]", "custom:profile_desc"),
+    Category.SESSION: ("[sessions]", "custom:session_desc"),
+}
+#: The limits that exist thrice: those in force, for indoors and for outdoors.
+TWOFOLD: Final = ("euler_angle_max", "control_vz_max", "control_yaw")
+#: What differs from the usual defaults in the firmware that is emulated: 2.4.8 and 1.7.4.
+_FACTORY: Final[dict[int, dict[str, Value]]] = {
+    1: {
+        "general:num_version_soft": "1.7.4",
+        "general:num_version_mb": 17,
+        "network:ssid_single_player": "ardrone",
+        "network:ssid_multi_player": "ardrone",
+        "video:camif_fps": 15,
+        "video:video_codec": VideoCodec.UVLC.value,
+    },
+    2: {"general:num_version_soft": "2.4.8"},
+}
+_CODECS: Final = {1: (VideoCodec.UVLC,), 2: tuple(codec for codec in VideoCodec if codec >= VideoCodec.MP4_360P)}
+_CHANNELS: Final = {1: 4, 2: 2}  # of the camera, or pairs of cameras
+
+
+class Configuration:
+    """All keys of an AR.Drone 1 or 2. Never raises for what it is sent: what makes no sense is ignored.
+
+    A number out of range is brought into it, which no source reports of the drone. A key of the category session, user
+    or application has a value for each id; new ids begin with the factory's values.
+    """
+
+    def __init__(self, version: int) -> None:
+        self._version = version
+        self._keys = keys_of(version)
+        self._factory = {name: key.default for name, key in self._keys.items()} | _FACTORY[version]
+        self._values: dict[Category, dict[str, dict[str, Value]]] = {
+            category: {DEFAULT_ID: self._fresh(category)} for category in Category
+        }
+        self._ids = dict.fromkeys(Category, DEFAULT_ID)
+
+    def __getitem__(self, name: str) -> Value:
+        """Return the value in force of a key."""
+        category = self._keys[name].category
+        return self._values[category][self._ids[category]][name]
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether this version of the drone has the key."""
+        return name in self._keys
+
+    def number(self, name: str) -> float:
+        """Return the value in force of a key that holds a number."""
+        value = self[name]
+        assert isinstance(value, int | float)
+        return value
+
+    @property
+    def ids(self) -> Ids:
+        """The ids of the session, user and application in force."""
+        return self._ids[Category.SESSION], self._ids[Category.USER], self._ids[Category.APPLICATION]
+
+    def write(self, name: str, text: str, ids: Ids | None = None) -> bool:
+        """Handle a ``CONFIG``.
+
+        Once a session, user or application of its own is in force, only what comes with its ids is obeyed, except for
+        ``custom:…_id``, or nobody else could ever begin one.
+
+        Args:
+            name: The key.
+            text: Its value.
+            ids: What came in the command right before it, if anything did.
+
+        Returns:
+            Whether it was obeyed.
+        """
+        name = name.strip().lower()
+        key = self._keys.get(name)
+        if key is None or key.read_only:
+            return False
+        if name in _ID_KEYS:
+            return self._choose(_ID_KEYS[name], text.strip().lower())
+        expected = None if self.ids == (DEFAULT_ID,) * 3 and ids is None else self.ids
+        if ids != expected:
+            return False
+        value = self._understood(key, text)
+        if value is None:
+            return False
+        self._store(name, value)
+        return True
+
+    def forget_client(self) -> None:
+        """Put the default session, user and application in force again: the link was lost."""
+        self._ids = dict.fromkeys(Category, DEFAULT_ID)
+        self._show_ids()
+
+    def dump(self) -> bytes:
+        """Return what the control port sends on ``CTRL 4``."""
+        return format_dump({name: self[name] for name in self._keys})
+
+    def custom_ids(self) -> bytes:
+        """Return what the control port sends on ``CTRL 6``."""
+        parts = []
+        for category, (title, description) in _DESCRIPTIONS.items():
+            parts.append(title)
+            parts += [
+                f"{one_id},{values[description]}"
+                for one_id, values in self._values[category].items()
+                if one_id != DEFAULT_ID
+            ]
+        return "".join(part + "\r" for part in parts).encode("latin-1", "replace") + END_OF_DUMP
+
+    def _fresh(self, category: Category) -> dict[str, Value]:
+        return {name: self._factory[name] for name, key in self._keys.items() if key.category is category}
+
+    def _store(self, name: str, value: Value) -> None:
+        category = self._keys[name].category
+        self._values[category][self._ids[category]][name] = value
+        section, _, word = name.partition(":")
+        place = "outdoor" if self["control:outdoor"] else "indoor"
+        if name == "control:outdoor":
+            for limit in TWOFOLD:
+                self._store(f"control:{limit}", self[f"control:{place}_{limit}"])
+        elif section == "control" and word in TWOFOLD:
+            self._values[category][self._ids[category]][f"control:{place}_{word}"] = value
+        elif section == "control" and word.removeprefix(f"{place}_") in TWOFOLD:
+            self._store(f"control:{word.removeprefix(f'{place}_')}", value)
+
+    def _choose(self, category: Category, text: str) -> bool:
+        """Begin, switch to or delete (``-id``, ``-all``) a session, user or application."""
+        known = self._values[category]
+        if text == "-all":
+            for gone in [one_id for one_id in known if one_id != DEFAULT_ID]:
+                del known[gone]
+        elif text.startswith("-") and text[1:] != DEFAULT_ID:
+            known.pop(text[1:], None)
+        elif not _ID.fullmatch(text) or (text not in known and len(known) > MOST_CUSTOM):
+            return False
+        else:
+            known.setdefault(text, self._fresh(category))
+            self._ids[category] = text
+        if self._ids[category] not in known:
+            self._ids[category] = DEFAULT_ID
+        self._show_ids()
+        return True
+
+    def _show_ids(self) -> None:
+        """Show the ids in force in the keys that have them, which belong to the session."""
+        session = self._values[Category.SESSION][self._ids[Category.SESSION]]
+        session.update({name: self._ids[category] for name, category in _ID_KEYS.items()})
+
+    def _understood(self, key: Key, text: str) -> Value | None:
+        """Return the value that a text stands for, or None."""
+        try:
+            value = parse_value(text, _as_number(key.default))
+        except DecodeError:
+            return None
+        if isinstance(value, float) and isinstance(key.default, int):
+            value = int(value)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            if key.low is not None and key.high is not None:
+                value = type(value)(min(max(value, key.low), key.high))
+            if key.choices and value not in key.choices:
+                return None
+        if key.name == "video:video_codec":
+            return value if value in _CODECS[self._version] else None
+        if key.name == "video:video_channel":
+            return self._channel(value)
+        return value
+
+    def _channel(self, value: Value) -> Value | None:
+        most = _CHANNELS[self._version]
+        if value == VideoChannel.NEXT:
+            return (int(self.number("video:video_channel")) + 1) % most
+        return value if isinstance(value, int) and value < most else None
+
+
+def _as_number(default: Value) -> Value:
+    """Whole numbers may be sent with a point, which the firmware's C reads as well."""
+    return float(default) if isinstance(default, int) and not isinstance(default, bool) else default

@@ -1,0 +1,204 @@
+"""The firmware's flight logic: from AT commands, silence and the battery to what the vehicle does. Pure: no clock.
+
+Follows the Developer Guide where it says how the drone decides. Not modelled: flight animations. They are noted, and a
+flip shows in navdata for as long as it is asked for, but the vehicle goes on with its last command.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.messages import (
+    Attitude,
+    EmergencyStop,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Takeoff,
+)
+from skyloop.sim.autopilot import LOW_BATTERY
+from skyloop.sim.reports import VehicleFeedback
+from skyloop.vehicles.ardrone.emulator.configuration import Configuration
+from skyloop.vehicles.ardrone.emulator.setpoints import NO_PROGRESS, Progress, set_point
+from skyloop.vehicles.ardrone.wire.at import Ref
+from skyloop.vehicles.ardrone.wire.navdata import State
+
+HOVER_AFTER_S: Final = 0.25  #: of silence: Developer Guide, general:com_watchdog (recalled, not read again)
+LOST_AFTER_S: Final = 2.0  #: of silence the link counts as lost
+CUT_OUT_TILT_RAD: Final = math.radians(60)  #: estimate: no source gives the angle
+BATTERY_RECOVERY_MV: Final = 500  #: estimate; so far above vbat_min a battery does not count as low any more
+CALIBRATION_RATE_RAD_S: Final = 1.5  #: estimate: a turn of the calibration takes about 4 s
+FIRST_FLIP: Final = 16
+LAST_ANIMATION: Final = 19
+
+_FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
+
+
+@dataclass(frozen=True, slots=True)
+class Animation:
+    """A flight animation that was asked for: only this note comes of it."""
+
+    number: int
+    until_ns: int
+
+
+class FlightControl:
+    """Flies one drone. Times are of the caller's clock [ns].
+
+    Args:
+        vehicle: What is commanded.
+        configuration: Has the limits and thresholds.
+        version: Of the drone, 1 or 2.
+    """
+
+    def __init__(self, vehicle: Vehicle, configuration: Configuration, *, version: int) -> None:
+        self._vehicle = vehicle
+        self._configuration = configuration
+        self._version = version
+        self._toggle_ready = True  # the emergency bit was 0 since it last did something
+        self._emergency = State(0)  # why, beside EMERGENCY
+        self._calibrating_until_ns = 0
+        self._believed: VehicleFeedback | None = None
+        self.start = False  #: the take-off bit of the last REF
+        self.battery_low = False
+        self.trim_rad = (0.0, 0.0)  #: roll and pitch that FTRIM found, which navdata is relative to
+        self.progress = NO_PROGRESS  #: the last one that made sense
+        self.animation: Animation | None = None
+        self.calibrations = 0  #: of the magnetometer, begun so far
+
+    # Commands --------------------------------------------------------------------------------------------------
+
+    def ref(self, bits: int) -> None:
+        """Handle ``REF``: take off, land, toggle the emergency.
+
+        The fixed bits are ignored: some programs leave them out.
+        """
+        self.start = bool(bits & Ref.TAKEOFF)
+        if bits & Ref.EMERGENCY:
+            if self._toggle_ready:
+                self._toggle_emergency()
+        else:
+            self._toggle_ready = True
+        state = self._vehicle.state
+        if self.start and state in (FlightState.LANDED, FlightState.LANDING) and not self.battery_low:
+            self._vehicle.command(Takeoff())
+        elif not self.start and state in (FlightState.TAKING_OFF, *_FLYING):
+            self._vehicle.command(Land())
+
+    def follow(self, progress: Progress, now_ns: int) -> None:
+        """Handle ``PCMD`` or ``PCMD_MAG``.
+
+        Ignored where a number is not finite. While the magnetometer is calibrated it is only noted.
+        """
+        if not progress.makes_sense:
+            return
+        self.progress = progress
+        if self._vehicle.state not in _FLYING or self.calibrating(now_ns):
+            return
+        believed = self._believed
+        self._vehicle.command(
+            set_point(
+                progress,
+                self._configuration,
+                yaw_rad=believed.yaw_rad if believed else 0.0,
+                forward_m_s=believed.velocity_m_s[0] if believed else 0.0,
+            )
+        )
+
+    def flat_trim(self) -> None:
+        """Handle ``FTRIM``: what is measured now is level. Refused in the air."""
+        if self._vehicle.state is FlightState.LANDED and self._believed is not None:
+            self.trim_rad = self._believed.roll_rad, self._believed.pitch_rad
+
+    def calibrate(self, device: int, now_ns: int) -> None:
+        """Handle ``CALIB``: the drone turns on the spot once. Refused on the ground, and by an AR.Drone 1."""
+        if self._version == 1 or device != 0 or self._vehicle.state not in _FLYING or self.calibrating(now_ns):
+            return
+        self.calibrations += 1
+        self._calibrating_until_ns = now_ns + nanoseconds(2 * math.pi / CALIBRATION_RATE_RAD_S)
+        self._vehicle.command(Attitude(0.0, 0.0, 0.0, -CALIBRATION_RATE_RAD_S))
+
+    def animate(self, number: int, duration_ms: int, now_ns: int) -> None:
+        """Handle ``ANIM``, or the key ``control:flight_anim``. In flight only."""
+        if 0 <= number <= LAST_ANIMATION and 0 <= duration_ms <= 60_000 and self._vehicle.state in _FLYING:
+            self.animation = Animation(number, now_ns + duration_ms * 1_000_000)
+
+    def calibrating(self, now_ns: int) -> bool:
+        """Return whether the drone turns to calibrate its magnetometer."""
+        return now_ns < self._calibrating_until_ns
+
+    def flipping(self, now_ns: int) -> bool:
+        """Return whether a flip was asked for and its time is not over."""
+        return self.animation is not None and self.animation.number >= FIRST_FLIP and now_ns < self.animation.until_ns
+
+    # Supervision -----------------------------------------------------------------------------------------------
+
+    def supervise(self, believed: VehicleFeedback, silence_s: float, now_ns: int) -> None:
+        """Watch the battery, the angles and the link. Called regularly.
+
+        Args:
+            believed: What the vehicle believes now.
+            silence_s: For how long no command has come.
+            now_ns: The present time.
+        """
+        self._believed = believed
+        self._watch_battery(believed)
+        if believed.state is FlightState.EMERGENCY:
+            self._calibrating_until_ns = 0
+        elif self._vehicle.state is not FlightState.EMERGENCY:
+            self._emergency = State(0)
+            self._watch_angles(believed)
+        self._watch_link(silence_s)
+        if self._calibrating_until_ns and not self.calibrating(now_ns):
+            self._calibrating_until_ns = 0
+            self._in_flight(lambda: self._vehicle.command(Hover()))
+
+    def emergency_bits(self, state: FlightState) -> State:
+        """Return the bits of navdata for an emergency and its reason."""
+        if state is not FlightState.EMERGENCY:
+            return State(0)
+        return State.EMERGENCY | (self._emergency or State.CUTOUT)
+
+    def _toggle_emergency(self) -> None:
+        if self._vehicle.state is not FlightState.EMERGENCY:
+            self._emergency = State.USER_EMERGENCY
+            self._vehicle.command(EmergencyStop())
+            self._toggle_ready = False
+        elif not isinstance(self._vehicle.command(ResetEmergency()), Idle):
+            self._emergency = State(0)
+            self._toggle_ready = False
+        # A reset while it still falls is ignored, and works as soon as it lies if the bit is still set then.
+
+    def _watch_battery(self, believed: VehicleFeedback) -> None:
+        least_mv = self._configuration.number("general:vbat_min")
+        voltage_mv = believed.battery_v * 1000
+        if believed.battery <= LOW_BATTERY or voltage_mv < least_mv:
+            self.battery_low = True
+        elif voltage_mv > least_mv + BATTERY_RECOVERY_MV:
+            self.battery_low = False
+        if self.battery_low:
+            self._in_flight(lambda: self._vehicle.command(Land()))
+
+    def _watch_angles(self, believed: VehicleFeedback) -> None:
+        if max(abs(believed.roll_rad), abs(believed.pitch_rad)) > CUT_OUT_TILT_RAD and believed.state.airborne:
+            self._emergency = State.ANGLES_OUT_OF_RANGE
+            self._vehicle.command(EmergencyStop())
+
+    def _watch_link(self, silence_s: float) -> None:
+        if silence_s < HOVER_AFTER_S:
+            return
+        if silence_s >= max(LOST_AFTER_S, self._configuration.number("general:com_watchdog")):
+            self._in_flight(lambda: self._vehicle.command(Land()))
+        elif self._vehicle.state is FlightState.FLYING:
+            self._vehicle.command(Hover())
+
+    def _in_flight(self, act: Callable[[], object]) -> None:
+        if self._vehicle.state in (FlightState.TAKING_OFF, *_FLYING):
+            act()

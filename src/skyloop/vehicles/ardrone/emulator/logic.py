@@ -1,0 +1,276 @@
+"""The drone's logic: handles AT commands, keeps the link, the configuration and the state bits.
+
+Pure: the clock is an argument, and what it sends is given to a function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+from skyloop.clock import Clock, seconds
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.sim.reports import VehicleFeedback
+from skyloop.vehicles.ardrone.emulator.configuration import Configuration, Ids
+from skyloop.vehicles.ardrone.emulator.flight import LOST_AFTER_S, FlightControl
+from skyloop.vehicles.ardrone.emulator.sequence import CommandSequence
+from skyloop.vehicles.ardrone.emulator.setpoints import Progress, limits_of
+from skyloop.vehicles.ardrone.wire.at import AtCommand, Ctrl, parse_commands, to_float
+from skyloop.vehicles.ardrone.wire.keys import VideoChannel, VideoCodec
+from skyloop.vehicles.ardrone.wire.navdata import State
+
+WATCHDOG_S: Final = 0.05  #: of silence: Developer Guide, 7.1.2
+
+_ALWAYS: Final = (
+    State.ALTITUDE_CONTROL
+    | State.CAMERA_READY
+    | State.PIC_VERSION_OK
+    | State.AT_THREAD
+    | State.NAVDATA_THREAD
+    | State.VIDEO_THREAD
+    | State.ACQUISITION_THREAD
+)
+_NOTHING_DETECTED: Final = 3  # detect:detect_type
+_CAMERAS: Final = {
+    VideoChannel.FRONT: ("front",),
+    VideoChannel.BOTTOM: ("bottom",),
+    VideoChannel.FRONT_WITH_BOTTOM: ("front", "bottom"),
+    VideoChannel.BOTTOM_WITH_FRONT: ("bottom", "front"),
+}
+_INSETS: Final = {VideoChannel.FRONT_WITH_BOTTOM: (88, 72), VideoChannel.BOTTOM_WITH_FRONT: (58, 42)}
+#: Commands that a real drone accepts and that have no effect here: legacy, and the factory's.
+_WITHOUT_EFFECT: Final = (*("PMODE", "MISC", "GAIN", "VISP", "VISO", "CAP", "MTRIM", "POL", "PWM", "AFLIGHT", "VICON"),)
+
+
+@dataclass(frozen=True, slots=True)
+class VideoSettings:
+    """The video as it is configured."""
+
+    channel: VideoChannel
+    codec: VideoCodec
+    fps: float
+    bitrate_kbps: int
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """See :class:`skyloop.emulators.video.VideoSettings`."""
+        return _CAMERAS[self.channel]
+
+    @property
+    def inset(self) -> tuple[int, int]:
+        """See :class:`skyloop.emulators.video.VideoSettings`."""
+        return _INSETS.get(self.channel, (0, 0))
+
+
+@dataclass(frozen=True, slots=True)
+class LedAnimation:
+    """The last one asked for; a simulated drone has no lights."""
+
+    number: int
+    frequency_hz: float
+    duration_s: int
+
+
+class ArdroneLogic:
+    """The logic of one drone. Not thread-safe.
+
+    Args:
+        vehicle: What is commanded.
+        send_text: Sends bytes to every client of the control port.
+        clock: Monotonic, ns.
+        version: Of the drone, 1 or 2.
+    """
+
+    def __init__(self, vehicle: Vehicle, send_text: Callable[[bytes], None], clock: Clock, *, version: int) -> None:
+        self._vehicle = vehicle
+        self._send_text = send_text
+        self._clock = clock
+        self._sequence = CommandSequence()
+        self._received_ns = clock()  # what came last; until something does, the start
+        self._linked = False  # something came since the start, or since the link was lost
+        self._watchdog = True
+        self._ack = False
+        self.lost = False  #: nothing was received for so long that the link counts as lost
+        self._ids: Ids | None = None  # from the command right before
+        self.configuration = Configuration(version)
+        self.flight = FlightControl(vehicle, self.configuration, version=version)
+        self.bootstrap = True  #: no options are sent before the mode is configured
+        self.leds: LedAnimation | None = None
+        self.malformed = 0  #: lines that made no sense, commands that no drone has, and wrong arguments
+        self.stale = 0  #: commands whose sequence number was not new
+        self._handlers: dict[str, Callable[..., None]] = {
+            "REF": self._ref,
+            "PCMD": self._pcmd,
+            "PCMD_MAG": partial(self._pcmd_mag, version),
+            "FTRIM": lambda *_: self.flight.flat_trim(),
+            "CALIB": self._calib,
+            "CONFIG": self._config,
+            "CONFIG_IDS": self._config_ids,
+            "COMWDG": self._comwdg,
+            "CTRL": self._ctrl,
+            "LED": self._led,
+            "ANIM": self._anim,
+            "ZAP": lambda channel: self._set("video:video_channel", str(channel)),
+            "CAD": lambda kind, _: self._set("detect:detect_type", str(kind)),
+        }
+        self._apply_limits()
+
+    # Hearing ---------------------------------------------------------------------------------------------------
+
+    def receive(self, datagram: bytes) -> None:
+        """Execute the commands of a datagram. Never raises, whatever is in it."""
+        commands, malformed = parse_commands(datagram)
+        self.malformed += malformed
+        for command in commands:
+            now_ns = self._clock()
+            if not self._sequence.takes(command.sequence, now_ns):
+                self.stale += 1
+                continue
+            self._received_ns, self._linked, self.lost = now_ns, True, False
+            ids, self._ids = self._ids, None
+            self._execute(command, ids)
+
+    def supervise(self, believed: VehicleFeedback) -> None:
+        """Run the watchdogs and watch the battery and the angles. Called regularly, with what the vehicle believes."""
+        silence_s = self.silence_s
+        if silence_s > WATCHDOG_S:
+            self._watchdog = True
+        if silence_s > LOST_AFTER_S and self._linked:
+            self._lose_link()
+        self.flight.supervise(believed, silence_s, self._clock())
+
+    @property
+    def silence_s(self) -> float:
+        """Time since the last command that was accepted, or since the start [s]."""
+        return seconds(self._clock() - self._received_ns)
+
+    def _lose_link(self) -> None:
+        """Reset the link.
+
+        The next client begins with the bootstrap, and with the default session, user and application.
+        """
+        self.lost, self._linked = True, False
+        self.bootstrap = True
+        self._ack = False
+        self.configuration.forget_client()
+        self._apply_limits()
+
+    # Telling ---------------------------------------------------------------------------------------------------
+
+    def state(self, *, video: bool) -> State:
+        """Return the state bits.
+
+        Args:
+            video: Whether anybody receives pictures.
+        """
+        flight_state = self._vehicle.state
+        bits = {
+            State.FLYING: flight_state.airborne,
+            State.VIDEO: video,
+            State.VISION: flight_state.airborne or self.configuration.number("detect:detect_type") != _NOTHING_DETECTED,
+            State.START_BUTTON: self.flight.start,
+            State.COMMAND_ACK: self._ack,
+            State.DEMO: self.demo,
+            State.BOOTSTRAP: self.bootstrap,
+            State.COMMUNICATION_LOST: self.lost,
+            State.BATTERY_LOW: self.flight.battery_low,
+            State.COMMUNICATION_WATCHDOG: self._watchdog,
+        }
+        state = _ALWAYS | self.flight.emergency_bits(flight_state)
+        for bit, is_set in bits.items():
+            if is_set:
+                state |= bit
+        return state
+
+    @property
+    def demo(self) -> bool:
+        """Whether navdata comes 15 times a second, with few options."""
+        return bool(self.configuration["general:navdata_demo"])
+
+    @property
+    def video(self) -> VideoSettings:
+        """The video as it is configured now."""
+        number, keys = self.configuration.number, self.configuration
+        most = number("video:max_bitrate") if "video:max_bitrate" in keys else float("inf")
+        return VideoSettings(
+            channel=VideoChannel(int(number("video:video_channel"))),
+            codec=VideoCodec(int(number("video:video_codec"))),
+            fps=number("video:codec_fps" if "video:codec_fps" in keys else "video:camif_fps"),
+            bitrate_kbps=int(min(number("video:bitrate"), most)),
+        )
+
+    # Commands --------------------------------------------------------------------------------------------------
+
+    def _execute(self, command: AtCommand, ids: Ids | None) -> None:
+        handler = self._handlers.get(command.name)
+        if handler is None:
+            self.malformed += command.name not in _WITHOUT_EFFECT
+            return
+        if command.name == "CONFIG":
+            handler = partial(handler, ids)
+        try:
+            handler(*command.arguments)
+        except (TypeError, ValueError, OverflowError):  # too few or many arguments, or a text for a number
+            self.malformed += 1
+
+    def _ref(self, bits: int) -> None:
+        self.flight.ref(int(bits))
+
+    def _pcmd(self, flags: int, *values: int) -> None:
+        roll, pitch, gaz, yaw = map(to_float, values)
+        self.flight.follow(Progress(int(flags), roll, pitch, gaz, yaw), self._clock())
+
+    def _pcmd_mag(self, version: int, flags: int, *values: int) -> None:
+        roll, pitch, gaz, yaw, heading, _accuracy = map(to_float, values)
+        if version > 1:
+            self.flight.follow(Progress(int(flags), roll, pitch, gaz, yaw, heading), self._clock())
+
+    def _calib(self, device: int) -> None:
+        self.flight.calibrate(device, self._clock())
+
+    def _comwdg(self, *_: int | str) -> None:
+        self._watchdog = False
+
+    def _ctrl(self, mode: int, _unused: int = 0) -> None:
+        if mode in (Ctrl.NONE, Ctrl.CLEAR_ACK):  # the guide says 0 and the SDK sends 5
+            self._ack = False
+        elif mode == Ctrl.GET_CONFIGURATION:
+            self._answer(self.configuration.dump())
+        elif mode == Ctrl.GET_CUSTOM_IDS:
+            self._answer(self.configuration.custom_ids())
+
+    def _answer(self, text: bytes) -> None:
+        self._ack = True
+        self._send_text(text)
+
+    def _led(self, number: int, frequency: int, duration_s: int) -> None:
+        self.leds = LedAnimation(number, to_float(frequency), duration_s)
+
+    def _anim(self, number: int, duration_ms: int) -> None:
+        self.flight.animate(number, duration_ms, self._clock())
+
+    def _config_ids(self, session: str, user: str, application: str) -> None:
+        self._ids = (str(session).lower(), str(user).lower(), str(application).lower())
+
+    def _config(self, ids: Ids | None, name: str, value: str) -> None:
+        self._ack = True  # means that it was received, not that it was obeyed
+        self._set(str(name), str(value), ids)
+
+    def _set(self, name: str, text: str, ids: Ids | None = None) -> None:
+        if not self.configuration.write(name, text, ids):
+            return
+        name = name.strip().lower()
+        self._apply_limits()
+        if name == "general:navdata_demo":
+            self.bootstrap = False
+        elif name == "control:flight_anim":
+            number, duration_ms = map(int, text.split(","))
+            self.flight.animate(number, duration_ms, self._clock())
+        elif name == "leds:leds_anim":
+            led, frequency, duration_s = map(int, text.split(","))
+            self._led(led, frequency, duration_s)
+
+    def _apply_limits(self) -> None:
+        self._vehicle.set_limits(limits_of(self.configuration))

@@ -1,0 +1,280 @@
+"""The options of navdata from what the vehicle believes, in the drone's units, axes and signs. Pure.
+
+The drone's body axes are x forward, y right, z down; theta is positive nose up, psi clockwise. What the simulation does
+not have is zero: tags seen by the drone's own vision, optical flow, trackers, the barometer's and the vision's inner
+values, GPS (no receiver plugged in).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from skyloop.emulators.video import NOTHING_SENT, VideoStatus
+from skyloop.messages import FlightState
+from skyloop.sim.parameters import GRAVITY_M_S2
+from skyloop.sim.reports import VehicleFeedback
+from skyloop.vehicles.ardrone.emulator.setpoints import NO_PROGRESS, Progress
+from skyloop.vehicles.ardrone.wire import options as o
+from skyloop.vehicles.ardrone.wire.keys import NAVDATA_OPTIONS_USUAL, VideoChannel
+from skyloop.vehicles.ardrone.wire.navdata import ControlState
+
+STANDARD_PRESSURE_PA: Final = 101_325
+PRESSURE_PA_PER_M: Final = 12.0  #: near the ground, international standard atmosphere
+TEMPERATURE_DECI_C: Final = 250
+FIELD_MG: Final = (200.0, 400.0)  #: horizontal and downward field of the Earth, milligauss: middle latitudes
+LAST_TAG_1: Final = 19  #: of an AR.Drone 1: VIDEO_STREAM
+
+_CONTROL_STATES: Final = {
+    FlightState.LANDED: ControlState.LANDED,
+    FlightState.TAKING_OFF: ControlState.TAKING_OFF,
+    FlightState.HOVERING: ControlState.HOVERING,
+    FlightState.FLYING: ControlState.FLYING,
+    FlightState.LANDING: ControlState.LANDING,
+    FlightState.EMERGENCY: ControlState.DEFAULT,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """All that the options are made from."""
+
+    believed: VehicleFeedback
+    state: FlightState
+    time: int  #: as :meth:`skyloop.vehicles.ardrone.emulator.clock.DroneClock.navdata_time` gives it
+    thrust: float = 0.0  #: of the weight
+    most_thrust: float = 1.9
+    trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that count as level
+    progress: Progress = NO_PROGRESS
+    flipping: bool = False
+    video: VideoStatus = NOTHING_SENT
+    channel: VideoChannel = VideoChannel.FRONT
+    link_quality: int = 100
+
+    @property
+    def theta_mdeg(self) -> float:
+        """Pitch, positive nose up, relative to the trim [0.001°]."""
+        return -math.degrees(self.believed.pitch_rad - self.trim_rad[1]) * 1000
+
+    @property
+    def phi_mdeg(self) -> float:
+        """Roll, positive right side down, relative to the trim [0.001°]."""
+        return math.degrees(self.believed.roll_rad - self.trim_rad[0]) * 1000
+
+    @property
+    def psi_mdeg(self) -> float:
+        """Yaw, clockwise [0.001°]."""
+        return -math.degrees(self.believed.yaw_rad) * 1000
+
+    @property
+    def heading_deg(self) -> float:
+        """Heading, clockwise from north, within ±180."""
+        return (90.0 - math.degrees(self.believed.yaw_rad) + 180.0) % 360.0 - 180.0
+
+    @property
+    def velocity_mm_s(self) -> tuple[float, float, float]:
+        """Velocity forward, right, down, in the levelled axes."""
+        forward, left, up = self.believed.velocity_m_s
+        return forward * 1000, -left * 1000, -up * 1000
+
+    @property
+    def altitude_mm(self) -> float:
+        """Height above the ground."""
+        return self.believed.altitude_m * 1000
+
+
+def options_of(snapshot: Snapshot, tags: list[int]) -> list[o.Option]:
+    """Return the options with these tags, in their order."""
+    return [_MAKERS[tag](snapshot) for tag in tags]
+
+
+def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
+    """Return the tags of the options that are sent, ascending.
+
+    In demo mode those of the usual mask and of the configured one. In full mode those of the configured one; all where
+    it still is the usual one, for that is what drones sent to programs that never configured it.
+
+    Args:
+        mask: ``general:navdata_options``, one bit for each tag.
+        demo: Whether the drone is in demo mode.
+        version: Of the drone, 1 or 2.
+    """
+    if demo:
+        mask |= NAVDATA_OPTIONS_USUAL
+    elif mask == NAVDATA_OPTIONS_USUAL:
+        mask = ~0
+    last = LAST_TAG_1 if version == 1 else max(_MAKERS)
+    return [tag for tag in range(last + 1) if mask >> tag & 1]
+
+
+def _demo(s: Snapshot) -> o.Demo:
+    vx, vy, _ = s.velocity_mm_s  # real drones leave vz at 0
+    state = ControlState.LOOPING if s.flipping and s.state.airborne else _CONTROL_STATES[s.state]
+    return o.Demo(
+        ctrl_state=state << 16,
+        battery=round(s.believed.battery * 100),
+        theta=s.theta_mdeg,
+        phi=s.phi_mdeg,
+        psi=s.psi_mdeg,
+        altitude=max(0, round(s.altitude_mm)),
+        vx=vx,
+        vy=vy,
+        num_frames=s.video.pictures & 0xFFFFFFFF,
+        detection_camera_type=int(s.channel),
+    )
+
+
+def _accelerations_mg(s: Snapshot) -> tuple[float, float, float]:
+    x, y, z = s.believed.acceleration_m_s2
+    return x / GRAVITY_M_S2 * 1000, -y / GRAVITY_M_S2 * 1000, -z / GRAVITY_M_S2 * 1000
+
+
+def _rates_deg_s(s: Snapshot) -> tuple[float, float, float]:
+    x, y, z = s.believed.angular_velocity_rad_s
+    return math.degrees(x), -math.degrees(y), -math.degrees(z)
+
+
+def _raw(s: Snapshot) -> o.RawMeasures:
+    """Scales of the converters are estimates; the battery's voltage is what programs read here."""
+    return o.RawMeasures(
+        accs=tuple(_within(2048 + mg * 0.512, 0, 4095) for mg in _accelerations_mg(s)),
+        gyros=tuple(_within(rate * 16.4, -32768, 32767) for rate in _rates_deg_s(s)),
+        gyros_110=tuple(_within(rate * 64, -32768, 32767) for rate in _rates_deg_s(s)[:2]),
+        vbat=_millivolts(s),
+        us_distance_echo=_within(s.altitude_mm / 10, 0, 65535),
+    )
+
+
+def _physical(s: Snapshot) -> o.PhysMeasures:
+    return o.PhysMeasures(acc_temp=45.0, gyro_temp=0, accs=_accelerations_mg(s), gyros=_rates_deg_s(s), alim_3v3=3300)
+
+
+def _euler_angles(s: Snapshot) -> o.EulerAngles:
+    """By the accelerometers alone: right only while nothing accelerates."""
+    x, y, z = s.believed.acceleration_m_s2
+    theta = math.degrees(math.atan2(x, math.hypot(y, z)))
+    return o.EulerAngles(theta * 1000, -math.degrees(math.atan2(y, abs(z))) * 1000)
+
+
+def _references(s: Snapshot) -> o.References:
+    p = s.progress
+    return o.References(ui_theta=p.pitch, ui_phi=p.roll, ui_psi=p.yaw)
+
+
+def _rc_references(s: Snapshot) -> o.RcReferences:
+    pitch, roll, yaw, gaz = (
+        _within(value * 1000, -32768, 32767)
+        for value in (s.progress.pitch, s.progress.roll, s.progress.yaw, s.progress.gaz)
+    )
+    return o.RcReferences(pitch, roll, yaw, gaz, s.progress.flags & 1)
+
+
+def _pwm(s: Snapshot) -> o.Pwm:
+    """In proportion to thrust, the same for all motors."""
+    motor = _within(255 * s.thrust / s.most_thrust, 0, 255)
+    return o.Pwm(motors=(motor,) * 4, saturations=(255 if motor else 0,) * 4, vz_ref=s.progress.gaz)
+
+
+def _altitude(s: Snapshot) -> o.Altitude:
+    mm = s.altitude_mm
+    return o.Altitude(
+        vision=round(mm),
+        vz=-s.velocity_mm_s[2],
+        reference=round(mm),
+        raw=round(mm),
+        obs_acc_z=s.believed.acceleration_m_s2[2],
+        obs_altitude=mm / 1000,
+    )
+
+
+def _vision(s: Snapshot) -> o.Vision:
+    return o.Vision(
+        theta_capture=math.radians(s.theta_mdeg / 1000),
+        phi_capture=math.radians(s.phi_mdeg / 1000),
+        psi_capture=math.radians(s.psi_mdeg / 1000),
+        altitude_capture=round(s.altitude_mm),
+        time_capture=s.time & 0x7FFFFFFF,
+        body_velocity=s.velocity_mm_s,
+    )
+
+
+def _video_stream(s: Snapshot) -> o.VideoStream:
+    return o.VideoStream(
+        frame_size=s.video.bytes_last & 0xFFFFFFFF,
+        frame_number=s.video.pictures & 0xFFFFFFFF,
+        out_bitrate=s.video.bitrate_kbps,
+        desired_bitrate=s.video.bitrate_kbps,
+    )
+
+
+def _pressure_raw(s: Snapshot) -> o.PressureRaw:
+    pressure = STANDARD_PRESSURE_PA - PRESSURE_PA_PER_M * s.believed.altitude_m
+    return o.PressureRaw(temperature=TEMPERATURE_DECI_C, pressure=round(pressure))
+
+
+def _magneto(s: Snapshot) -> o.Magneto:
+    heading = math.radians(s.heading_deg)
+    level, down = FIELD_MG
+    field = (level * math.cos(heading), -level * math.sin(heading), down)
+    mx, my, mz = (_within(each, -32768, 32767) for each in field)
+    return o.Magneto(
+        *(mx, my, mz),
+        raw=field,
+        rectified=field,
+        heading=s.heading_deg,
+        heading_gyro=s.heading_deg,
+        heading_fusion=s.heading_deg,
+        calibrated=1,
+        radius=math.hypot(level, down),
+    )
+
+
+def _kalman_pressure(s: Snapshot) -> o.KalmanPressure:
+    return o.KalmanPressure(est_z=s.altitude_mm, est_zdot=-s.velocity_mm_s[2])
+
+
+def _zero(kind: Callable[[], Any]) -> Callable[[Snapshot], Any]:
+    option = kind()
+    return lambda _: option
+
+
+_MAKERS: Final[dict[int, Callable[[Snapshot], Any]]] = {
+    0: _demo,
+    1: lambda s: o.Time(s.time),
+    2: _raw,
+    3: _physical,
+    4: _zero(o.GyrosOffsets),
+    5: _euler_angles,
+    6: _references,
+    7: lambda s: o.Trims(0.0, -s.trim_rad[1], s.trim_rad[0]),
+    8: _rc_references,
+    9: _pwm,
+    10: _altitude,
+    11: _zero(o.VisionRaw),
+    12: _zero(o.VisionOpticalFlow),
+    13: _vision,
+    14: _zero(o.VisionPerf),
+    15: _zero(o.TrackersSend),
+    16: _zero(o.VisionDetect),
+    17: _zero(o.Watchdog),
+    18: _zero(o.AdcDataFrame),
+    19: _video_stream,
+    20: _zero(o.Games),
+    21: _pressure_raw,
+    22: _magneto,
+    23: _zero(o.WindSpeed),
+    24: _kalman_pressure,
+    25: _zero(o.HdVideo),
+    26: lambda s: o.Wifi(s.link_quality),
+    27: _zero(o.Gps),
+}
+
+
+def _millivolts(s: Snapshot) -> int:
+    return _within(s.believed.battery_v * 1000, 0, 0xFFFFFFFF)
+
+
+def _within(value: float, low: int, high: int) -> int:
+    return max(low, min(high, round(value)))

@@ -1,0 +1,103 @@
+"""Options of an ``ardrone://`` address. Pure. ``docs/ardrone.md`` has them as a table."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+from skyloop.drivers.base import reject_unknown_options
+from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.vehicles.ardrone.telemetry import OPTION_TAGS
+from skyloop.vehicles.ardrone.wire import at, configuration, navdata, ports
+from skyloop.vehicles.ardrone.wire.ports import Ports
+
+MAX_RATE_HZ: Final = 200.0
+_Meaning = TypeVar("_Meaning")
+_VERSIONS: Final = {"auto": None, "1": 1, "2": 2}
+_MODES: Final = {"demo": False, "full": True}
+_HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
+KNOWN: Final = {
+    *("version", "navdata", "navdata_options", "rate", "video", "ids"),
+    *("navdata_port", "video_port", "at_port", "control_port"),
+    *INTRINSICS_OPTIONS,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ArdroneOptions:
+    """A parsed address."""
+
+    host: str
+    ports: Ports = ports.STANDARD
+    version: int | None = None  #: of the drone; None: as its configuration says
+    full: bool = False  #: navdata of 200 Hz with all options instead of the demo mode
+    navdata_options: int | None = None  #: one bit for each tag; None: as the drone is configured
+    rate_hz: float = 50.0  #: of feedback, at most
+    video: bool = True
+    ids: bool = True  #: settings of our own on an AR.Drone 2 (multi-configuration)
+
+
+def options_of(uri: VehicleUri) -> ArdroneOptions:
+    """Parse an address.
+
+    Raises:
+        UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
+        UsageError: It names no host, or an option's value makes no sense.
+    """
+    reject_unknown_options(uri, KNOWN)
+    if not uri.place:
+        raise UsageError(f"{uri} names no host: it looks like ardrone://192.168.1.1")
+    if not _HOST.match(uri.place):
+        hint = "; ports are given as options, such as ?at_port=5556" if ":" in uri.place else ""
+        raise UsageError(f"{uri}: {uri.place!r} is not the name or IPv4 address of a host{hint}")
+    check_intrinsics(uri)
+    return ArdroneOptions(
+        host=uri.place,
+        ports=Ports(
+            navdata=_port(uri, "navdata_port", navdata.PORT),
+            video=_port(uri, "video_port", ports.VIDEO),
+            at=_port(uri, "at_port", at.PORT),
+            control=_port(uri, "control_port", configuration.PORT),
+        ),
+        version=_one_of(uri, "version", "auto", _VERSIONS),
+        full=_one_of(uri, "navdata", "demo", _MODES),
+        navdata_options=_mask(uri),
+        rate_hz=uri.number("rate", 50.0, minimum=1.0, maximum=MAX_RATE_HZ),
+        video=uri.flag("video", default=True),
+        ids=uri.flag("ids", default=True),
+    )
+
+
+def _port(uri: VehicleUri, name: str, usual: int) -> int:
+    return uri.whole(name, usual, minimum=1, maximum=65535)
+
+
+def _one_of(uri: VehicleUri, name: str, usual: str, meanings: dict[str, _Meaning]) -> _Meaning:
+    given = uri.options.get(name, usual)
+    if given not in meanings:
+        raise UnknownNameError(f"{name} of ardrone://", given, meanings)
+    return meanings[given]
+
+
+def _mask(uri: VehicleUri) -> int | None:
+    """Return ``navdata_options``: names of options, or a number with a bit for each tag.
+
+    The demo option is always in it.
+    """
+    given = uri.options.get("navdata_options")
+    if given is None:
+        return None
+    if re.fullmatch(r"0x[0-9a-fA-F]{1,8}|[0-9]{1,10}", given):
+        mask = int(given, 0) if given.startswith("0x") else int(given)
+        if mask >= 1 << 32:
+            raise UsageError(f"{uri}: navdata_options is {given} and must fit in 32 bits")
+        return mask | 1
+    mask = 1
+    for name in filter(None, given.split(",")):
+        if name not in OPTION_TAGS:
+            raise UnknownNameError("option of navdata", name, OPTION_TAGS)
+        mask |= 1 << OPTION_TAGS[name]
+    return mask

@@ -1,0 +1,318 @@
+"""The protocol of one drone, from the first datagram on: navdata in, AT commands out. No socket, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
+from skyloop.messages import AnyAction, EmergencyStop, EventKind, LinkState, Severity, Value
+from skyloop.vehicles.ardrone.configuration import Configurator, Exchange, Ids, Setup
+from skyloop.vehicles.ardrone.options import ArdroneOptions
+from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController, limits_of
+from skyloop.vehicles.ardrone.telemetry import (
+    ClimbMeter,
+    DroneClock,
+    Health,
+    Reception,
+    control_state,
+    feedback_of,
+    native_of,
+)
+from skyloop.vehicles.ardrone.wire.at import AtMessage, format_command
+from skyloop.vehicles.ardrone.wire.navdata import Navdata, State
+from skyloop.vehicles.ardrone.wire.options import Demo
+
+#: So many datagrams begin at sequence 1 after a restart: the first may be lost, and only a 1 resets the drone's count.
+FRESH_DATAGRAMS: Final = 3
+
+
+class Sequencer:
+    """Numbers the commands. The drone executes only what is newer than the last, and takes a 1 as a new beginning."""
+
+    def __init__(self) -> None:
+        self._sequence = 0
+        self._fresh = FRESH_DATAGRAMS
+
+    def restart(self) -> None:
+        """Begin at 1 again: the drone was away or lost us."""
+        self._fresh = FRESH_DATAGRAMS
+
+    def datagram(self, messages: Iterable[AtMessage]) -> bytes:
+        """Return the messages as one datagram; empty for none."""
+        messages = tuple(messages)
+        if messages and self._fresh:
+            self._fresh -= 1
+            self._sequence = 0
+        lines = []
+        for name, arguments in messages:
+            self._sequence += 1
+            lines.append(format_command(name, self._sequence, *arguments))
+        return b"".join(lines)
+
+
+TICK_NS: Final = nanoseconds(0.03)  #: between AT commands, as the drone's guide asks for
+HURRY_NS: Final = nanoseconds(
+    0.01
+)  #: least time between a datagram and a new set-point that does not wait for its tick
+DEGRADED_NS: Final = nanoseconds(0.25)  #: of silence
+LOST_NS: Final = nanoseconds(1.0)
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
+START_NS: Final = nanoseconds(0.25)  #: between requests for navdata while none come
+SETUP_NS: Final = nanoseconds(6.0)  #: to set the drone up, before it is tried again
+SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: after it the link is DEGRADED, and the drone may fly without set-up
+DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit that stays for so long means that our commands are ignored
+REPEATS: Final = 3  #: of a command that has no acknowledgement
+START_NAVDATA: Final = b"\x01\x00\x00\x00"
+
+_WATCHDOG: Final[AtMessage] = ("COMWDG", ())
+
+
+class ArdroneSession(VehicleSession):
+    """The protocol of one opened driver with its drone. Not thread-safe.
+
+    Args:
+        options: Of the vehicle's address.
+        ids: Ours, for a drone that keeps everybody's settings apart.
+        now_ns: The time of opening.
+        extra: Gives telemetry of others for feedback's ``native``, such as the video's counters.
+    """
+
+    TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
+
+    def __init__(
+        self,
+        options: ArdroneOptions,
+        ids: Ids,
+        now_ns: int,
+        *,
+        extra: Callable[[], Mapping[str, Value]] = dict,
+    ) -> None:
+        super().__init__(now_ns)
+        self.options = options
+        self.version = options.version  #: None until the drone's configuration was read
+        self.setpoints = SetpointController()
+        self.configurator = Configurator()
+        self.reception = Reception()
+        self.ready = False  #: whether the drone is set up and its configuration known
+        self.remembered: dict[str, str] = {}  #: keys that were written, and how the drone writes them
+        self._ids = ids
+        self._extra = extra
+        self._sequencer = Sequencer()
+        self._clock = DroneClock()
+        self._climb = ClimbMeter()
+        self._health = Health()
+        self._setup_ns: int | None = None
+        self._setups_failed = 0
+        self._state = self._earlier = State(0)  # of the newest datagram, and of the one before
+        self._sent_ns = 0
+        self._started_ns = 0
+        self._published_ns = 0
+        self._deaf_since_ns: int | None = None
+        self._once: list[list[AtMessage]] = []  # more to send at each of the next ticks
+        self._place = f"{options.host}, UDP port {options.ports.navdata}"
+        self._set_link_state(LinkState.CONNECTING, f"waiting for navdata from {self._place}")
+
+    # From the driver -------------------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction, now_ns: int) -> AnyAction:
+        """Accept an action and have it sent soon.
+
+        Returns:
+            What is applied, after the drone's limits.
+
+        Raises:
+            DriverError: It can't be done now; see :meth:`SetpointController.apply`.
+        """
+        before = self.setpoints.intent
+        applied = self.setpoints.apply(action, now_ns)
+        self._keep(action, now_ns)
+        if isinstance(action, EmergencyStop):
+            self._once.clear()
+            self.due_ns = now_ns
+        elif self.setpoints.intent != before:
+            self.due_ns = min(self.due_ns, max(now_ns, self._sent_ns + HURRY_NS))
+        return applied
+
+    def send(self, message: AtMessage, times: int = REPEATS) -> None:
+        """Send a command that has no acknowledgement, at this many ticks."""
+        while len(self._once) < times:
+            self._once.append([])
+        for at in range(times):
+            self._once[at].append(message)
+
+    def submit(self, exchange: Exchange) -> None:
+        """Run an exchange of the configuration."""
+        self.configurator.submit(exchange)
+        self.due_ns = 0
+
+    def _new_events(self) -> list[VehicleEvent]:
+        return self.setpoints.pop_events()
+
+    def _forget_landing(self) -> bool:
+        return self.setpoints.forget_landing()
+
+    def close(self) -> None:
+        """End the session: exchanges that are not done fail."""
+        self.configurator.abandon("the driver was closed")
+
+    @property
+    def state(self) -> State | None:
+        """The newest bits of the drone's state; None before any came."""
+        return None if self._received_ns is None else self._state
+
+    # From the sockets ------------------------------------------------------------------------------------------
+
+    def on_navdata(self, datagram: bytes, now_ns: int) -> None:
+        """Handle a datagram of the navdata port, whatever it holds. Never raises."""
+        navdata = self.reception.receive(datagram, now_ns)
+        if navdata is None:
+            return
+        state = navdata.state
+        demo = navdata.get(Demo)
+        self._detect_break(state, now_ns)
+        self._state, self._received_ns = state, now_ns
+        condition = Condition(state, control_state(demo) if demo is not None else None)
+        self.setpoints.on_condition(condition, now_ns, self.reception.passed_ns)
+        if self.configurator.on_acknowledge(bool(state & State.COMMAND_ACK)):
+            self.due_ns = 0
+        for event in self._health.changes(state):
+            self._publish_event(event)
+        if self._setup_ns is None:
+            self._begin_setup(now_ns)
+        elif self.link_state is LinkState.DEGRADED and self.ready:
+            self._set_link_state(LinkState.UP)
+        if demo is not None:
+            self._publish(navdata, demo, now_ns)
+
+    def _detect_break(self, state: State, now_ns: int) -> None:
+        """Detect that the drone restarted or lost us, even if it was silent for less time than we would detect.
+
+        What it forgot meanwhile is not known. Two datagrams in a row have to say so.
+        """
+        both, begins = state & self._state, ~self._earlier
+        self._earlier = self._state
+        if not self.ready:
+            return
+        if both & State.BOOTSTRAP:
+            self._lose("the drone rebooted", now_ns)
+        elif both & begins & State.COMMUNICATION_LOST:
+            self._lose("the drone reports that it lost its link to us", now_ns)
+
+    def _publish(self, navdata: Navdata, demo: Demo, now_ns: int) -> None:
+        captured_ns = self._clock.captured_ns(navdata, now_ns)
+        climb = self._climb.climb(demo.altitude / 1000, captured_ns)
+        if self.options.full and now_ns - self._published_ns < 0.9e9 / self.options.rate_hz:
+            return
+        self._published_ns = now_ns
+        native = native_of(navdata, everything=self.options.full)
+        native.update(self.reception.telemetry())
+        native.update(self._extra())
+        feedback = feedback_of(navdata, demo, captured_ns, climb, native)
+        self._pending.append(lambda sink: sink.feedback(feedback))
+
+    # Time ------------------------------------------------------------------------------------------------------
+
+    def poll(self, now_ns: int) -> bytes:
+        """Return the datagram for the AT port that is due now, empty if nothing is to be sent."""
+        self._check_silence(now_ns)
+        self.due_ns, self._sent_ns = now_ns + TICK_NS, now_ns
+        messages: list[AtMessage] = []
+        if self._state & State.COMMUNICATION_WATCHDOG and self._received_ns is not None:
+            messages.append(_WATCHDOG)
+            self._check_deafness(now_ns)
+        else:
+            self._deaf_since_ns = None
+        messages += self.setpoints.messages(now_ns)
+        messages += self._once.pop(0) if self._once else []
+        messages += self.configurator.messages(now_ns)
+        return self._sequencer.datagram(messages)
+
+    def wants_start(self, now_ns: int) -> bool:
+        """Return whether to ask for navdata now, because none come. True once in :data:`START_NS`."""
+        silent_ns = now_ns - (self._received_ns if self._received_ns is not None else 0)
+        if silent_ns < DEGRADED_NS or now_ns - self._started_ns < START_NS:
+            return False
+        self._started_ns = now_ns
+        return True
+
+    def _check_silence(self, now_ns: int) -> None:
+        super()._check_silence(now_ns)
+        if not self.ready and self._setup_ns is not None and now_ns - self._setup_ns >= SETUP_PATIENCE_NS:
+            why = self.configurator.trouble or "the drone does not acknowledge"
+            self._set_link_state(LinkState.DEGRADED, f"the drone's configuration is not known: {why}")
+
+    def _describe_silence(self, since: str, why: str) -> str:
+        return f"no navdata{since} from {self._place}{why}"
+
+    def _advice(self) -> str:
+        if self.options.host.startswith("127."):
+            return "start the emulated drone: skyloop sim --firmware ardrone2"
+        return "switch the AR.Drone on and join its Wi-Fi network, ardrone…; or correct the host in the address"
+
+    def _check_deafness(self, now_ns: int) -> None:
+        """Restart the sequence if the watchdog bit stays.
+
+        The drone clears the bit when it accepts commands; if it does not, its count may be past ours.
+        """
+        if self._deaf_since_ns is None:
+            self._deaf_since_ns = now_ns
+        elif now_ns - self._deaf_since_ns >= DEAF_NS:
+            self._deaf_since_ns = now_ns
+            self._sequencer.restart()
+
+    # Losing and finding ----------------------------------------------------------------------------------------
+
+    def _lose(self, reason: str, _now_ns: int) -> None:
+        self._received_ns = self._setup_ns = None
+        self.ready = False
+        self._once.clear()
+        self.configurator.abandon(reason)
+        self.setpoints.lost()
+        self.setpoints.limits = None
+        self.reception.expect_restart()
+        self._sequencer.restart()
+        self._set_link_state(LinkState.LOST, reason)
+
+    def _begin_setup(self, now_ns: int) -> None:
+        self._setup_ns = now_ns
+        self._unreachable = ""
+        self._sequencer.restart()
+        self._submit_setup(now_ns)
+
+    def _submit_setup(self, now_ns: int) -> None:
+        failed = self._setups_failed
+        options = replace(self.options, ids=False) if failed > 1 else self.options
+        # A drone that kept our ids ignores what does not name them, and one that lost them what does: take turns.
+        self.configurator.ids = self._ids if failed % 2 else None
+        setup = Setup(options, self.configurator, self._ids, self.remembered)
+        done = partial(self._setup_done, setup)
+        self.configurator.submit(Exchange(setup.steps(self._state), now_ns + SETUP_NS, done))
+        self.due_ns = 0
+
+    def _setup_done(self, setup: Setup, failure: str | None) -> None:
+        if self._setup_ns is None or self._received_ns is None:
+            return  # it was lost meanwhile
+        if failure is not None:
+            self._setups_failed += 1
+            self.configurator.trouble = failure
+            self._submit_setup(self._received_ns)
+            return
+        self._setups_failed = 0
+        self.version = setup.version or self.version
+        if setup.refused_ids:
+            text = "the drone keeps no settings of our own: they are shared with everybody who connects to it"
+            self._publish_event(message(text, "ids_refused", Severity.WARNING))
+        self.ready = True
+        self.read_limits()
+        if self.setpoints.limits is None:
+            text = "the drone's configuration has no limits: set-points are refused"
+            self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "configuration"}))
+        self._set_link_state(LinkState.UP)
+
+    def read_limits(self) -> None:
+        """Take the limits of set-points from the configuration that was read."""
+        self.setpoints.limits = limits_of(self.configurator.values)

@@ -1,0 +1,323 @@
+"""Navdata to feedback: order and time of datagrams, units, axes and signs, and what the state bits say. Pure.
+
+The drone's body axes are x forward, y right, z down: a positive ``theta`` is nose up, a positive ``phi`` right side
+down, a positive ``psi`` clockwise seen from above, ``vy`` is to the right. That accelerometers and gyros follow the
+same axes was checked on a datagram of a real AR.Drone 2 that stood tilted.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter, deque
+from typing import Any, Final
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
+from skyloop.errors import DecodeError
+from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
+from skyloop.messages.geometry import wrap_angle
+from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, State, decode
+from skyloop.vehicles.ardrone.wire.options import LAYOUTS, Demo, PhysMeasures, RawMeasures, Time, VisionDetect
+
+# Datagrams as they come ----------------------------------------------------------------------------------------------
+
+#: Between two datagrams, as the drone makes them: few of them, as before its set-up, or all.
+PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
+RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: after it a lower sequence is a new count, and not a late datagram
+_MICROSECOND_BITS: Final = 21
+_TIME_WRAP_S: Final = 1 << 11
+
+
+class Reception:
+    """Decodes navdata and keeps those that are whole and newer than the last.
+
+    ``counts`` has ``received``, ``damaged`` (no navdata, or a wrong checksum), ``late`` (repeated or out of order),
+    ``missed`` (gaps in the sequence), ``restarts`` of the sequence and ``unknown`` options.
+    """
+
+    def __init__(self) -> None:
+        self.counts = Counter(dict.fromkeys(("received", "damaged", "late", "missed", "restarts", "unknown"), 0))
+        self.passed_ns = 0  #: the drone's own time between the two newest that were accepted, by their numbers
+        self._sequence = 0
+        self._accepted_ns = 0
+        self._watch = RestartWatch()
+
+    def receive(self, datagram: bytes, now_ns: int) -> Navdata | None:
+        """Return the content of a datagram, or None if it is damaged or late. Never raises."""
+        try:
+            navdata = decode(datagram)
+        except DecodeError:
+            self.counts["damaged"] += 1
+            return None
+        before = self._sequence
+        if not self._is_new(navdata.sequence, now_ns):
+            self.counts["late"] += 1
+            return None
+        few = bool(navdata.state & (State.DEMO | State.BOOTSTRAP))
+        self.passed_ns = max(0, navdata.sequence - before) * PERIODS_NS[few]
+        self.counts["received"] += 1
+        self.counts["unknown"] += len(navdata.unknown)
+        return navdata
+
+    def expect_restart(self) -> None:
+        """Accept whatever comes next as the first: the drone was silent or lost us."""
+        self._accepted_ns = 0
+
+    def telemetry(self) -> dict[str, Value]:
+        """Return the counts under their names in feedback's ``native``."""
+        return {f"navdata.{name}": count for name, count in self.counts.items()}
+
+    def _is_new(self, sequence: int, now_ns: int) -> bool:
+        if sequence == self._sequence:
+            return False
+        if now_ns - self._accepted_ns >= RESTART_SILENCE_NS:
+            self._watch.forget()
+        if self._watch.update(sequence, now_ns) is Arrival.LATE:
+            return False
+        if sequence < self._sequence:
+            self.counts["restarts"] += 1
+        elif self._sequence:
+            self.counts["missed"] += sequence - self._sequence - 1
+        self._sequence, self._accepted_ns = sequence, now_ns
+        return True
+
+
+class DroneClock:
+    """Maps a datagram to the time of its state, on this host's clock.
+
+    Without the option ``time`` that is when the datagram arrived; with it, its stamps are mapped by the smallest delay
+    seen lately. Times never run backwards.
+    """
+
+    def __init__(self) -> None:
+        self._live = LiveClock()
+        self._stamp_s: float | None = None
+        self._turns = 0
+        self._captured_ns = 0
+
+    def captured_ns(self, navdata: Navdata, arrived_ns: int) -> int:
+        """Return when the drone was in the state of a datagram that arrived at ``arrived_ns``."""
+        time = navdata.get(Time)
+        captured_ns = arrived_ns if time is None else self._live.captured_ns(self._unwrapped(time.time), arrived_ns)
+        self._captured_ns = max(self._captured_ns, captured_ns)
+        return self._captured_ns
+
+    def _unwrapped(self, time: int) -> float:
+        stamp_s = (time >> _MICROSECOND_BITS) + (time & ((1 << _MICROSECOND_BITS) - 1)) / 1e6
+        before_s = self._stamp_s
+        self._stamp_s = stamp_s
+        if before_s is not None and stamp_s < before_s - _TIME_WRAP_S / 2:
+            self._turns += 1
+        return self._turns * _TIME_WRAP_S + stamp_s
+
+
+# Feedback in SI ------------------------------------------------------------------------------------------------------
+
+STANDARD_GRAVITY: Final = 9.80665  #: m/s²
+CLIMB_WINDOW_NS: Final = nanoseconds(0.3)
+Vector = tuple[float, float, float]
+
+_FLIGHT_STATES: Final = {
+    ControlState.FLYING: FlightState.FLYING,
+    ControlState.HOVERING: FlightState.HOVERING,
+    ControlState.TAKING_OFF: FlightState.TAKING_OFF,
+    ControlState.GOING_TO_FIX: FlightState.FLYING,
+    ControlState.LANDING: FlightState.LANDING,
+    ControlState.LOOPING: FlightState.FLYING,
+}
+
+
+def control_state(demo: Demo) -> ControlState | None:
+    """Return what the drone's control does; None for a number that no known firmware sends."""
+    try:
+        return ControlState(demo.ctrl_state >> 16)
+    except ValueError:
+        return None
+
+
+def flight_state(state: State, control: ControlState | None) -> FlightState:
+    """Return the flight state from the state bits and the control's state."""
+    if state & State.EMERGENCY:
+        return FlightState.EMERGENCY
+    resting = FlightState.FLYING if state & State.FLYING else FlightState.LANDED
+    return resting if control is None else _FLIGHT_STATES.get(control, resting)
+
+
+class ClimbMeter:
+    """Measures climb [m/s] as the slope of the altitude over the last 0.3 s.
+
+    The firmware leaves ``demo.vz`` at zero.
+    """
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[int, float]] = deque()
+
+    def climb(self, altitude_m: float, at_ns: int) -> float | None:
+        """Add a sample and return the climb [m/s], positive up; None for the first one and after a gap."""
+        samples = self._samples
+        samples.append((at_ns, altitude_m))
+        while len(samples) > 2 and at_ns - samples[1][0] >= CLIMB_WINDOW_NS:
+            samples.popleft()
+        begun_ns, begun_m = samples[0]
+        if at_ns - begun_ns > 4 * CLIMB_WINDOW_NS:  # after a gap the slope is not that of now
+            samples.popleft()
+            return None
+        return (altitude_m - begun_m) / seconds(at_ns - begun_ns) if at_ns > begun_ns else None
+
+
+def feedback_of(
+    navdata: Navdata, demo: Demo, captured_ns: int, climb_m_s: float | None, native: dict[str, Value]
+) -> Feedback:
+    """Return the drone's state in SI units and our axes.
+
+    What the drone does not report, or reports as an impossible number, is None.
+
+    Args:
+        navdata: The datagram.
+        demo: Its demo option.
+        captured_ns: When the drone was in this state.
+        climb_m_s: Positive up; None if it is not known, and then the velocity isn't either.
+        native: The drone's own telemetry.
+    """
+    measured, raw = navdata.get(PhysMeasures), navdata.get(RawMeasures)
+    yaw = _angle(demo.psi)
+    pitch = _angle(demo.theta)
+    return Feedback(
+        captured_ns=captured_ns,
+        state=flight_state(navdata.state, control_state(demo)),
+        battery=demo.battery / 100 if demo.battery <= 100 else None,
+        battery_v=raw.vbat / 1000 if raw is not None and raw.vbat else None,
+        roll_rad=_angle(demo.phi),
+        pitch_rad=-pitch if pitch is not None else None,
+        yaw_rad=wrap_angle(-yaw) if yaw is not None else None,
+        altitude_m=demo.altitude / 1000,
+        velocity_m_s=_vector(demo.vx / 1000, -demo.vy / 1000, climb_m_s),
+        angular_velocity_rad_s=_flipped(measured.gyros, math.radians(1.0)) if measured is not None else None,
+        acceleration_m_s2=_flipped(measured.accs, STANDARD_GRAVITY / 1000) if measured is not None else None,
+        native=native,
+    )
+
+
+def _angle(millidegrees: float) -> float | None:
+    return math.radians(millidegrees / 1000) if abs(millidegrees) <= 180_000 else None
+
+
+def _flipped(forward_right_down: tuple[float, ...], factor: float) -> Vector | None:
+    """Turn axes forward, right, down into forward, left, up."""
+    x, y, z = forward_right_down
+    return _vector(x * factor, -y * factor, -z * factor)
+
+
+def _vector(x: float, y: float, z: float | None) -> Vector | None:
+    if z is None or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+        return None
+    return x, y, z
+
+
+# Native telemetry ----------------------------------------------------------------------------------------------------
+
+
+def _name(kind: type[Any]) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
+
+
+#: Of each option the names of its fields.
+_FIELDS: Final = {kind: tuple(f"{_name(kind)}.{field}" for field in kind._fields) for kind in LAYOUTS}
+#: Tags by the options' names, as ``navdata_options`` of an address takes them.
+OPTION_TAGS: Final = {_name(kind): layout.tag for kind, layout in LAYOUTS.items()}
+#: Fields of the demo option that are useful: the drone's matrices are deprecated, and most tags empty.
+_DEMO_FIELDS: Final = len(Demo._fields) - 6
+
+
+def native_of(navdata: Navdata, *, everything: bool) -> dict[str, Value]:
+    """Return all options of a datagram as telemetry; numbers that are not finite are left out.
+
+    Args:
+        navdata: The datagram.
+        everything: If not, the deprecated matrices of the demo option and an empty list of tags are left out as well.
+    """
+    native: dict[str, Value] = {"state": int(navdata.state), "sequence": navdata.sequence}
+    for kind, option in navdata.options.items():
+        names: tuple[str, ...] = _FIELDS[kind]
+        fields: tuple[Value, ...] = option
+        if not everything and kind is Demo:
+            names = names[:_DEMO_FIELDS]
+        elif not everything and isinstance(option, VisionDetect) and not option.detected:
+            names = names[:1]
+        for name, value in zip(names, fields, strict=False):
+            if type(value) is int or _finite(value):
+                native[name] = value
+    return native
+
+
+def _finite(value: Any) -> bool:
+    return all(map(math.isfinite, value)) if type(value) is tuple else math.isfinite(value)
+
+
+# Health --------------------------------------------------------------------------------------------------------------
+
+#: Bit, its name in events' data, what it means while it is set.
+_CONDITIONS: Final = (
+    (State.COMMUNICATION_LOST, "communication_lost", "the drone reports that it lost its link to us", Severity.WARNING),
+    (State.BATTERY_LOW, "battery_low", "the drone's battery is low", Severity.WARNING),
+    (State.ULTRASOUND_DEAF, "ultrasound", "the drone's ultrasound receives no echo", Severity.WARNING),
+    (State.MOTORS_PROBLEM, "motors", "the drone has a problem with its motors", Severity.ERROR),
+    (State.SOFTWARE_FAULT, "software", "the drone detected a fault of its software", Severity.ERROR),
+    (State.ANGLES_OUT_OF_RANGE, "angles", "the drone tilted too far", Severity.WARNING),
+    (State.CUTOUT, "cutout", "a motor of the drone was blocked", Severity.WARNING),
+    (State.WIND, "wind", "the wind is too strong for the drone", Severity.WARNING),
+    (State.MAGNETOMETER_UNCALIBRATED, "magnetometer", "the drone's magnetometer needs calibration", Severity.INFO),
+    (State.TIMER_ELAPSED, "timer", "the drone's timer elapsed", Severity.WARNING),
+)
+#: Why the motors were cut, as far as there is a bit for it.
+_REASONS: Final = (
+    (State.USER_EMERGENCY, "user"),
+    (State.ANGLES_OUT_OF_RANGE, "angles"),
+    (State.CUTOUT, "cutout"),
+    (State.MOTORS_PROBLEM, "motors"),
+    (State.ULTRASOUND_DEAF, "ultrasound"),
+    (State.BATTERY_LOW, "battery"),
+    (State.SOFTWARE_FAULT, "software"),
+    (State.COMMUNICATION_LOST, "communication_lost"),
+)
+
+
+def emergency_reason(state: State) -> str:
+    """Return why the motors are cut: names joined by commas, or ``unknown``."""
+    return ",".join(name for bit, name in _REASONS if state & bit) or "unknown"
+
+
+class Health:
+    """Reports each change of the drone's health bits once."""
+
+    def __init__(self) -> None:
+        self._reported = State(0)
+
+    def changes(self, state: State) -> list[VehicleEvent]:
+        """Return what changed since the last call."""
+        before, self._reported = self._reported, state
+        changed = before ^ state
+        found = []
+        if changed & State.EMERGENCY:
+            found.append(_emergency(state))
+        for bit, name, text, severity in _CONDITIONS:
+            if not changed & bit:
+                continue
+            data: dict[str, Value] = {"reason": name, "active": bool(state & bit)}
+            if state & bit:
+                found.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, severity, data))
+            else:
+                found.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, f"no longer: {text}", Severity.INFO, data))
+        return found
+
+
+def _emergency(state: State) -> VehicleEvent:
+    if not state & State.EMERGENCY:
+        return VehicleEvent(
+            EventKind.VEHICLE_MESSAGE, "the drone left the emergency", Severity.INFO, {"reason": "reset"}
+        )
+    reason = emergency_reason(state)
+    text = f"the drone cut its motors ({reason}); reset the emergency when it lies safely"
+    return VehicleEvent(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": reason})

@@ -1,0 +1,455 @@
+"""The drone's video port: streams, frames and their times, decoders, and cameras.
+
+An AR.Drone 2 sends PaVE over TCP, an AR.Drone 1 a picture a datagram over UDP while somebody keeps asking for them.
+Stamps of a PaVE header are the drone's own time in milliseconds, 32 bits (``video_encapsulation.h`` of the AR.Drone SDK
+2.0.1). Which moment of the picture they name is written nowhere; it is taken for the capture. Intrinsics of the
+AR.Drone 2 are calibrations of one such drone as published with ardrone_autonomy (branch of TUM), for pictures of
+640×360; another drone's differ by some per cent. Nothing is known of the AR.Drone 1's.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from skyloop.clock import Clock, monotonic_ns, nanoseconds
+from skyloop.drivers.backlog import Coded
+from skyloop.drivers.base import Sink
+from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.live_video import Decoded, Decoder, LiveVideo, Picture, Stream, VideoEvent
+from skyloop.drivers.stream_relay import StreamRelay
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
+from skyloop.messages import CameraInfo, Intrinsics
+from skyloop.messages.encoded import H264
+from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame, PaveParser
+from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture, is_intra, is_p264
+from skyloop.wire.h264 import Unit
+
+# Cameras -------------------------------------------------------------------------------------------------------------
+
+Rotation = tuple[float, float, float, float, float, float, float, float, float]
+
+_LOOKING_FORWARD: Final[Rotation] = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
+_LOOKING_DOWN: Final[Rotation] = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+_FRONT: Final = Intrinsics(
+    561.999146, 561.782697, 307.433982, 190.144373, distortion=(-0.50758, 0.24911, 0.000579, 0.000996, 0.0)
+)
+_BOTTOM: Final = Intrinsics(686.994766, 688.195055, 329.323208, 159.323007)
+_CAMERAS: Final = {
+    1: (
+        CameraInfo("front", 320, 240, 15.0, rotation=_LOOKING_FORWARD),
+        CameraInfo("bottom", 176, 144, 60.0, rotation=_LOOKING_DOWN),
+    ),
+    2: (
+        CameraInfo("front", 640, 360, 30.0, intrinsics=_FRONT, rotation=_LOOKING_FORWARD, stream=H264),
+        CameraInfo("bottom", 640, 360, 30.0, intrinsics=_BOTTOM, rotation=_LOOKING_DOWN, stream=H264),
+    ),
+}
+
+
+def cameras_of(uri: VehicleUri, version: int | None) -> tuple[CameraInfo, ...]:
+    """Return both cameras, of which the drone shows one at a time.
+
+    Args:
+        uri: The vehicle's address; intrinsics in it are the front camera's.
+        version: Of the drone; None counts as 2.
+    """
+    front, bottom = _CAMERAS[version or 2]
+    given = intrinsics_of(uri, front.width, front.height)
+    return (msgspec.structs.replace(front, intrinsics=given) if given is not None else front, bottom)
+
+
+# Capture times -------------------------------------------------------------------------------------------------------
+
+_WRAP: Final = 1 << 32
+
+
+class DroneStamps:
+    """Capture times of one connection's frames.
+
+    Follows a drift of the drone's clock and the wrap of its stamps. Stamps that go back (a drone that was restarted)
+    void what was learned.
+    """
+
+    def __init__(self) -> None:
+        self._clock = LiveClock()
+        self._stamp_ms = 0  # of the frame before, as the drone wrote it
+        self._time_ms = 0  # the same without wraps
+
+    def captured_ns(self, stamp_ms: int, arrived_ns: int) -> int:
+        """Return when a picture was captured, never later than it arrived.
+
+        Args:
+            stamp_ms: The PaVE header's, 32 bits.
+            arrived_ns: On this host's clock.
+        """
+        step_ms = (stamp_ms - self._stamp_ms + _WRAP // 2) % _WRAP - _WRAP // 2
+        self._stamp_ms = stamp_ms
+        self._time_ms += step_ms
+        return self._clock.captured_ns(self._time_ms / 1000.0, arrived_ns)
+
+
+# Streams -------------------------------------------------------------------------------------------------------------
+
+
+class PaveAssembly:
+    """Assembles the frames of one connection.
+
+    The first frame may be one that is seconds old (seen in a capture of a real drone). So it is returned with the
+    second one, and only if their numbers follow one another.
+    """
+
+    def __init__(self, connection: int) -> None:
+        self._connection = connection
+        self._parser = PaveParser()
+        self._stamps = DroneStamps()
+        self._stale = 0
+        self._first: tuple[int, Coded] | None = None  # and its number, until the second one came
+        self._greeted = False
+
+    @property
+    def broken(self) -> int:
+        """Frames that were begun and not finished, or stale."""
+        return self._parser.broken_frames + self._stale
+
+    @property
+    def lost_bytes(self) -> int:
+        """Bytes that belong to no whole frame."""
+        return self._parser.skipped_bytes
+
+    def feed(self, data: bytes, now_ns: int) -> list[Coded]:
+        """Return the frames that these bytes complete. Never raises, whatever the bytes are."""
+        return [coded for frame in self._parser.feed(data) for coded in self._greet(frame, self._coded(frame, now_ns))]
+
+    def end(self) -> None:
+        """Note that the connection ended."""
+        self._parser.end()
+        self._stale += self._first is not None
+
+    def _coded(self, frame: PaveFrame, now_ns: int) -> Coded:
+        captured_ns = self._stamps.captured_ns(frame.timestamp_ms, now_ns)
+        return Coded(frame, frame.is_key, captured_ns, now_ns, self._connection)
+
+    def _greet(self, frame: PaveFrame, coded: Coded) -> list[Coded]:
+        if self._greeted:
+            return [coded]
+        if self._first is None:
+            self._first = frame.number, coded
+            return []
+        (number, first), self._first = self._first, None
+        self._greeted = True
+        if frame.number == number + 1 & 0xFFFFFFFF:
+            return [first, coded]
+        self._stale += 1
+        return [coded]
+
+
+CONNECT_S: Final = 1.0
+POLL_S: Final = 0.1
+SILENT_S: Final = 3.0  #: without a whole frame for so long, a connection is given up
+KEEP_ALIVE_S: Final = 0.5
+WAKE: Final = b"\x01\x00\x00\x00"  #: to an AR.Drone 1: any small datagram starts the video and keeps it up
+_CHUNK: Final = 1 << 16
+
+
+class PaveStream:
+    """A connection to an AR.Drone 2: PaVE over TCP.
+
+    Raises:
+        OSError: The drone can't be reached within :data:`CONNECT_S`.
+    """
+
+    def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
+        self._clock = clock
+        self._assembly = PaveAssembly(connection)
+        self._received_ns = clock()
+        self._socket = socket.create_connection((host, port), CONNECT_S)
+        self._socket.settimeout(POLL_S)
+
+    @property
+    def broken(self) -> int:
+        """See :class:`skyloop.drivers.live_video.Stream`."""
+        return self._assembly.broken
+
+    @property
+    def lost_bytes(self) -> int:
+        """See :class:`skyloop.drivers.live_video.Stream`."""
+        return self._assembly.lost_bytes
+
+    def read(self) -> list[Coded]:
+        """Return the frames that arrived, after :data:`POLL_S` at most.
+
+        Raises:
+            OSError: The connection ended, or no whole frame came for :data:`SILENT_S`.
+        """
+        try:
+            data = self._socket.recv(_CHUNK)
+        except TimeoutError:
+            frames = []
+        else:
+            if not data:
+                self._assembly.end()
+                raise ConnectionError("the drone ended the stream")
+            frames = self._assembly.feed(data, self._clock())
+        self._received_ns = self._clock() if frames else self._received_ns
+        _give_up_if_silent(self._clock() - self._received_ns)
+        return frames
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+
+class DatagramStream:
+    """The video of an AR.Drone 1: one picture in a datagram over UDP, while somebody keeps asking for them.
+
+    Raises:
+        OSError: There is no route to the drone.
+    """
+
+    def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
+        self.broken = 0
+        self.lost_bytes = 0
+        self._connection = connection
+        self._clock = clock
+        self._received_ns = clock()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.settimeout(POLL_S)
+            self._socket.connect((host, port))  # what others send is not taken then
+            self._socket.send(WAKE)
+        except OSError:
+            self._socket.close()
+            raise
+        self._woken_ns = self._received_ns
+
+    def read(self) -> list[Coded]:
+        """Return the picture that arrived, after :data:`POLL_S` at most.
+
+        A picture has no stamp: it counts as captured when it arrived.
+
+        Raises:
+            OSError: The drone refused, or nothing came for :data:`SILENT_S`.
+        """
+        try:
+            data = self._socket.recv(_CHUNK)
+        except TimeoutError:
+            data = b""
+        now_ns = self._clock()
+        if now_ns - self._woken_ns > nanoseconds(KEEP_ALIVE_S):
+            self._woken_ns = now_ns
+            self._socket.send(WAKE)
+        if data:
+            self._received_ns = now_ns
+            return [Coded(data, is_intra(data), now_ns, now_ns, self._connection)]
+        _give_up_if_silent(now_ns - self._received_ns)
+        return []
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def open_stream(version: int, host: str, port: int, connection: int, clock: Clock) -> Stream:
+    """Connect to the drone's video. An AR.Drone 1's absence shows only when reading.
+
+    Raises:
+        OSError: The drone can't be reached.
+    """
+    return (PaveStream if version == 2 else DatagramStream)(host, port, connection, clock)
+
+
+def _give_up_if_silent(silent_ns: int) -> None:
+    if silent_ns > nanoseconds(SILENT_S):
+        raise TimeoutError(f"no frame came for {SILENT_S:g} s")
+
+
+# Decoders ------------------------------------------------------------------------------------------------------------
+
+REORDERED: Final = 64  #: a number further back than this is not a late picture but a drone that was restarted,
+OLD_RUN: Final = 4  #: and so are this many pictures in a row that are older than the newest
+_DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
+
+
+class PaveVideo:
+    """Decodes an AR.Drone 2's video.
+
+    Raises:
+        MissingExtraError: PyAV is not installed.
+    """
+
+    def __init__(self) -> None:
+        try:
+            from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder
+        except MissingExtraError as error:
+            raise MissingExtraError("the video of an AR.Drone 2", error.extra, cause=str(error.__cause__)) from error
+        self._decoder = PaveDecoder()
+
+    @property
+    def waited(self) -> int:
+        """See :class:`skyloop.drivers.live_video.Decoder`."""
+        return self._decoder.waited
+
+    @property
+    def damaged(self) -> int:
+        """See :class:`skyloop.drivers.live_video.Decoder`."""
+        return self._decoder.damaged
+
+    def restart(self) -> None:
+        """Wait for the next key frame."""
+        self._decoder.restart()
+
+    def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
+        """See :class:`skyloop.drivers.live_video.Decoder`. Decodes MPEG-4 and H.264."""
+        frame = coded.data
+        if not isinstance(frame, PaveFrame):
+            raise TypeError("a frame of an AR.Drone 2 is wanted")
+        if frame.codec not in _DECODED:
+            raise UnsupportedError(
+                f"the drone sends video in codec {_codec_name(frame.codec)}, which is not decoded here: "
+                "set video:video_codec to H.264 (129)"
+            )
+        image = self._decoder.decode(frame)
+        if image is None or not show:
+            return None
+        return Decoded(frame.number, np.ascontiguousarray(image.to_ndarray(format="bgr24"), dtype=np.uint8))
+
+
+class UvlcVideo:
+    """Decodes an AR.Drone 1's video, and leaves out pictures that come after a newer one."""
+
+    def __init__(self) -> None:
+        self.waited = 0
+        self.damaged = 0
+        self._decoder = UvlcDecoder()
+        self._number: int | None = None  # of the newest picture
+        self._old_run = 0
+
+    def restart(self) -> None:
+        """Forget the stream so far."""
+        self._decoder = UvlcDecoder()
+        self._number = None
+
+    def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
+        """See :class:`skyloop.drivers.live_video.Decoder`. Decodes UVLC, not P264."""
+        packet = coded.data
+        if not isinstance(packet, bytes):
+            raise TypeError("a datagram of an AR.Drone 1 is wanted")
+        if is_p264(packet):
+            raise UnsupportedError(
+                "the drone sends video in P264, which is not decoded here: set video:video_codec to UVLC (32)"
+            )
+        try:
+            picture = self._decoder.decode(packet)
+        except DecodeError:
+            self.damaged += 1
+            return None
+        self._old_run = self._old_run + 1 if self._is_old(picture) else 0
+        if 0 < self._old_run < OLD_RUN:
+            self.waited += 1
+            return None
+        self._number = picture.number
+        return Decoded(picture.number, picture.pixels) if show else None
+
+    def _is_old(self, picture: UvlcPicture) -> bool:
+        """Return whether it came after a newer one, or a second time."""
+        return self._number is not None and 0 <= (self._number - picture.number) % (1 << 32) < REORDERED
+
+
+def make_decoder(version: int) -> Decoder:
+    """Return the decoder for a version of the drone.
+
+    Raises:
+        MissingExtraError: What it needs is not installed.
+    """
+    return PaveVideo() if version == 2 else UvlcVideo()
+
+
+def _codec_name(codec: int) -> str:
+    try:
+        return Codec(codec).name
+    except ValueError:
+        return str(codec)
+
+
+# Encoded pictures for recorders --------------------------------------------------------------------------------------
+
+
+class EncodedStream:
+    """Hands H.264 on while somebody wants it; see :class:`StreamRelay`. Used by the thread that reads.
+
+    A frame came over TCP, so it is whole, and need not be decoded to know that.
+
+    Args:
+        sink: The proxy's.
+        camera: Returns the name of the camera that the drone shows now.
+        intrinsics: Returns those of that camera for a width and height.
+    """
+
+    def __init__(
+        self, sink: Sink, camera: Callable[[], str], intrinsics: Callable[[int, int], Intrinsics | None]
+    ) -> None:
+        """Store the arguments."""
+        self._camera = camera
+        self._relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
+
+    def take(self, coded: Coded) -> None:
+        """Hand on a frame that arrived whole, if it is H.264, wanted, and decodable after the last one."""
+        frame = coded.data
+        if not isinstance(frame, PaveFrame) or frame.codec != Codec.MPEG4_AVC:
+            self._relay.restart()
+            return
+        self._relay.take(
+            self._camera(),
+            Unit(frame.payload, frame.is_key, frame.after_damage, frame.width, frame.height),
+            coded.captured_ns,
+            number=frame.number,
+            connection=coded.connection,
+            picture=frame.type != FrameType.HEADERS,
+        )
+
+
+# The receiver --------------------------------------------------------------------------------------------------------
+
+
+class VideoReceiver(LiveVideo):
+    """The live video of an AR.Drone 1 or 2; see :class:`skyloop.drivers.live_video.LiveVideo` for the callbacks.
+
+    Raises:
+        UsageError: For a version other than 1 and 2.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        version: int,
+        show: Callable[[Picture], None],
+        on_event: Callable[[VideoEvent, str], None],
+        wants: Callable[[], bool] = lambda: True,
+        came: Callable[[Coded], None] | None = None,
+        clock: Clock = monotonic_ns,
+    ) -> None:
+        """Store the arguments. No I/O."""
+        if version not in (1, 2):
+            raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, not {version}")
+
+        super().__init__(
+            f"{host}:{port}",
+            connect=lambda connection: open_stream(version, host, port, connection, clock),
+            make_decoder=partial(make_decoder, version),
+            show=show,
+            on_event=on_event,
+            wants=wants,
+            came=came,
+            clock=clock,
+            name="ardrone-video",
+        )

@@ -1,0 +1,177 @@
+"""The run and level codes of UVLC, read many at once. Pure.
+
+A coefficient is a *pair*: a run of zeros before it, and its level. Both codes are some zeros, a one, and as many bits
+as there were zeros, less one; a level ends with its sign (Developer Guide, "Specific block entropy-encoding"):
+
+======== ===== ======================  ======== ================ =========================
+run      code                          level    code
+======== ===== ======================  ======== ================ =========================
+0        1                             ±1       1 s
+1        01                            end      01
+2 … 3    001 x                         ±2 … 3   001 x s
+4 … 7    0001 xx                       ±4 … 7   0001 xx s
+…        …                             …        …
+======== ===== ======================  ======== ================ =========================
+
+The end of a block comes as a level, after a run of 0.
+
+Reading bit by bit would be far too slow in Python. So one table says for each 16 bits which whole pairs they begin
+with, and how far to go on; the reader only walks, and NumPy makes coefficients of where it has been.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import DecodeError
+from skyloop.vehicles.ardrone.wire.uvlc_tables import COEFFICIENTS, MAX_RUN_ZEROS
+
+WINDOW: Final = 16  #: bits looked at in one go
+PADDING: Final = 32  #: zero bytes after the packet's, so that no look can go past the end
+_PAIRS: Final = 5  #: whole pairs in a window at most: the shortest takes 3 bits
+_MAX_LEVEL_ZEROS: Final = 11  #: levels below 2048: no picture of 8-bit samples has greater ones
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class PairTable:
+    """What each window of 16 bits begins with."""
+
+    step: NDArray[np.int8]  #: (65536,) bits of its whole pairs; negative: the block ends with them; 0: not even one
+    count: NDArray[np.int64]  #: (65536,) its pairs
+    advance: NDArray[np.int64]  #: (65536 · 5,) run + 1 of its pairs
+    level: NDArray[np.int16]  #: (65536 · 5,) their levels
+
+
+@cache
+def pair_table() -> PairTable:
+    """The table, made at first use (tens of milliseconds)."""
+    rest = np.arange(1 << WINDOW)
+    used = np.zeros_like(rest)
+    count = np.zeros_like(rest)
+    going = np.ones(rest.size, bool)
+    ended = np.zeros(rest.size, bool)
+    advance = np.zeros((rest.size, _PAIRS), np.int64)
+    level = np.zeros((rest.size, _PAIRS), np.int16)
+    for k in range(_PAIRS + 1):
+        run_zeros, run, run_bits = _value(rest)
+        level_zeros, magnitude, level_bits = _value(rest << run_bits & 0xFFFF)
+        end = level_zeros == 1
+        bits = np.minimum(run_bits + level_bits + ~end, WINDOW + 1)
+        whole = going & (used + bits <= WINDOW) & (run_zeros <= MAX_RUN_ZEROS) & ~(end & (run > 0))
+        ended |= whole & end
+        pair = whole & ~end
+        if k < _PAIRS:
+            negative = (rest << (bits - 1) & 0x8000) != 0
+            advance[pair, k] = run[pair] + 1
+            magnitude = np.maximum(magnitude, 1)  # the code without a zero stands for run 0, but level 1
+            level[pair, k] = np.where(negative, -magnitude, magnitude)[pair]
+        count += pair
+        used += np.where(whole, bits, 0)
+        rest = np.where(whole, rest << bits & 0xFFFF, rest)
+        going = pair
+    step = np.where(ended, -used, used).astype(np.int8)
+    return PairTable(step, count, advance.ravel(), level.ravel())
+
+
+def _value(window: Ints) -> tuple[Ints, Ints, Ints]:
+    """The leading zeros of windows, the number that the code there stands for, and its bits, without a sign."""
+    zeros = WINDOW - np.frexp(window.astype(np.float64))[1].astype(np.int64)
+    extra = np.maximum(zeros - 1, 0)
+    tail = (window << (zeros + 1) & 0xFFFF) >> (WINDOW - extra)
+    return zeros, np.where(zeros > 0, 1 << extra | tail, 0), zeros + 1 + extra
+
+
+def bit_windows(packet: bytes) -> NDArray[np.uint16]:
+    """The 16 bits from each bit of a packet on, in the order of the stream, and zeros beyond its end.
+
+    The stream is a sequence of 32-bit little-endian words read from the most significant bit on; ``packet`` must be
+    made of whole ones. Shape (8 · (bytes + about 30),).
+    """
+    words = np.frombuffer(packet, dtype="<u4").astype(">u4")
+    stream = np.concatenate([words.view(np.uint8), np.zeros(PADDING, np.uint8)]).astype(np.uint32)
+    three = stream[:-2] << 16 | stream[1:-1] << 8 | stream[2:]
+    return (three[:, None] >> np.arange(8, 0, -1, dtype=np.uint32)).astype(np.uint16).ravel()
+
+
+class BlockWalker:
+    """Walks over the pairs of blocks and remembers where it has been."""
+
+    def __init__(self, windows: NDArray[np.uint16]) -> None:
+        self._table = pair_table()
+        self._windows = windows
+        self.window = windows.data  #: the same, quicker to look at one by one
+        self._steps = self._table.step[windows].data
+        self._visits: list[int] = []  # bits where windows with whole pairs, or one long pair, begin
+        self._ends: list[int] = []  # visits done when each block had ended
+        self._long: list[tuple[int, int, int]] = []  # visit, run + 1 and level of each pair longer than a window
+
+    def walk(self, at: int) -> int:
+        """Reads the pairs of the next block from bit ``at`` on, to its end. Returns the bit after it.
+
+        Raises DecodeError for a code that the format doesn't have; what lies beyond the packet reads as one.
+        """
+        visits, steps = self._visits, self._steps
+        while (step := steps[at]) >= 0:
+            visits.append(at)
+            at = at + step if step else self._long_pair(at)
+        visits.append(at)
+        self._ends.append(len(visits))
+        return at - step
+
+    def skip(self) -> None:
+        """The next block has no pairs."""
+        self._ends.append(len(self._visits))
+
+    def _long_pair(self, at: int) -> int:
+        """Reads one pair that doesn't fit in a window, or that the format doesn't have. Returns the bit after it."""
+        zeros, run, at = self._read_value(at)
+        if zeros > MAX_RUN_ZEROS:
+            raise DecodeError(f"{zeros} zeros begin no code of a run")
+        zeros, level, at = self._read_value(at)
+        if zeros == 1 or zeros > _MAX_LEVEL_ZEROS:
+            raise DecodeError(f"{zeros} zeros begin no code of a level after a run of {run}")
+        level = max(level, 1)
+        negative = self.window[at] >> (WINDOW - 1)
+        self._long.append((len(self._visits) - 1, run + 1, -level if negative else level))
+        return at + 1
+
+    def _read_value(self, at: int) -> tuple[int, int, int]:
+        """The leading zeros, the number and the next bit of the code at a bit, without a sign."""
+        zeros = WINDOW - self.window[at].bit_length()
+        at += zeros + 1
+        if zeros < 2:
+            return zeros, zeros, at
+        extra = zeros - 1
+        return zeros, 1 << extra | self.window[at] >> (WINDOW - extra), at + extra
+
+    def levels(self) -> NDArray[np.float32]:
+        """The levels of all blocks walked or skipped so far, in the stream's order, those in first place 0.
+
+        Shape (blocks, 64). Raises DecodeError for a block with more than 64.
+        """
+        count = self._table.count[keys := self._windows[np.array(self._visits, np.int64)].astype(np.int64)]
+        long_visit, long_advance, long_level = np.array(self._long, np.int64).reshape(-1, 3).T
+        count[long_visit] = 1
+        pairs_after = np.cumsum(count)
+        pairs_before = pairs_after - count
+        source = np.repeat(keys * _PAIRS - pairs_before, count) + np.arange(count.sum())
+        advance, level = self._table.advance[source], self._table.level[source]
+        advance[pairs_before[long_visit]] = long_advance
+        level[pairs_before[long_visit]] = long_level
+
+        ends = np.concatenate([[0], np.concatenate([[0], pairs_after])[self._ends]])  # of blocks, in pairs
+        travelled = np.concatenate([[0], np.cumsum(advance)])
+        pairs = np.diff(ends)
+        place = travelled[1:] - np.repeat(travelled[ends[:-1]], pairs)
+        if place.size and place.max() >= COEFFICIENTS:
+            raise DecodeError(f"a block has a coefficient {place.max()}; {COEFFICIENTS - 1} is the last")
+        levels = np.zeros((pairs.size, COEFFICIENTS), np.float32)
+        levels[np.repeat(np.arange(pairs.size), pairs), place] = level
+        return levels
