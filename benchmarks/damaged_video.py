@@ -25,14 +25,14 @@ from numpy.typing import NDArray
 
 from skyloop.drivers.backlog import Coded
 from skyloop.drivers.live_container import LiveDecoder, Piece
-from skyloop.drivers.tello.video import TelloVideo
-from skyloop.emulators.tello.emulator import TelloPacker, automatic_kbps
 from skyloop.emulators.video import OneCamera
 from skyloop.vehicles.ardrone.pave_decoder import av
 from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
+from skyloop.vehicles.tello.emulator.emulator import TelloPacker, automatic_kbps
+from skyloop.vehicles.tello.video import TelloVideo
+from skyloop.vehicles.tello.wire.video import Assembly, pieces
 from skyloop.wire.h264 import Inspector
-from skyloop.wire.tello.video import Assembly, pieces
 from tests.recordings import FIXTURES
 
 LOSSES: Final = (0.01, 0.05, 0.10)

@@ -25,8 +25,6 @@ from follow_judge import Judge
 import skyloop
 from skyloop.client import Drone, Frame
 from skyloop.clock import monotonic_ns
-from skyloop.emulators.tello import TelloFirmware, with_tellos
-from skyloop.emulators.tello.settings import FRONT
 from skyloop.messages import Feedback
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
@@ -34,6 +32,8 @@ from skyloop.sim.world import Wind
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports, with_ardrones
 from skyloop.vehicles.ardrone.emulator.video import FRONT_2
+from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
+from skyloop.vehicles.tello.emulator.settings import FRONT
 from skyloop.vision import simulated_detector
 
 CAMERAS: Final = {"ardrone2": FRONT_2, "tello": FRONT}

@@ -14,7 +14,6 @@ from skyloop.drivers.msp import options as msp_options
 from skyloop.drivers.replay import options as replay_options
 from skyloop.drivers.ros2 import options as ros2_options
 from skyloop.drivers.sim import options as sim_options
-from skyloop.drivers.tello import options as tello_options
 from skyloop.drivers.uri import parse_uri
 from skyloop.drivers.video import options as video_options
 from skyloop.messages import Action, FlightState, Hover, Land, ResetEmergency, Takeoff, Velocity
@@ -28,6 +27,7 @@ from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS
 from skyloop.transport.local.frame_exchange import MAX_LEASES
 from skyloop.transport.local.server import MAX_CLIENTS
 from skyloop.vehicles.ardrone import options as ardrone_options
+from skyloop.vehicles.tello import options as tello_options
 from tests.docs.pages import ROOT, rows, section
 
 

@@ -8,8 +8,6 @@ from typing import Final
 
 from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.emulators.datagrams import Address
-from skyloop.emulators.tello.logic import TelloLogic
-from skyloop.emulators.tello.settings import LIMITS, TELLO
 from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.messages import FlightState
 from skyloop.sim.dynamics import STEP_S
@@ -18,8 +16,10 @@ from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.reports import VehicleTruth
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
-from skyloop.wire.tello.commands import Sdk
-from skyloop.wire.tello.state import State, parse
+from skyloop.vehicles.tello.emulator.logic import TelloLogic
+from skyloop.vehicles.tello.emulator.settings import LIMITS, TELLO
+from skyloop.vehicles.tello.wire.commands import Sdk
+from skyloop.vehicles.tello.wire.state import State, parse
 
 TICK_S: Final = 0.02
 PILOT: Final = ("10.0.0.2", 9000)

@@ -12,12 +12,12 @@ import pytest
 import skyloop
 from skyloop.client import Drone
 from skyloop.control import FollowTarget
-from skyloop.emulators.tello import TelloFirmware, with_tellos
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import wrap_angle
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports, with_ardrones
+from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
 from skyloop.vision import simulated_detector
 from tests.drivers.tello.addresses import Addresses
 

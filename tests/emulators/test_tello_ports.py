@@ -9,15 +9,15 @@ from typing import Any
 
 import pytest
 
-from skyloop.emulators.tello import Faults, TelloFirmware, with_tellos
-from skyloop.emulators.tello.emulator import FULL_KBPS, LEAST_KBPS, automatic_kbps
 from skyloop.errors import LinkError, UsageError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
+from skyloop.vehicles.tello.emulator import Faults, TelloFirmware, with_tellos
+from skyloop.vehicles.tello.emulator.emulator import FULL_KBPS, LEAST_KBPS, automatic_kbps
+from skyloop.vehicles.tello.wire.state import parse
+from skyloop.vehicles.tello.wire.video import PIECE, AccessUnit, Assembly
 from skyloop.wire.h264 import parse_sequence, units
-from skyloop.wire.tello.state import parse
-from skyloop.wire.tello.video import PIECE, AccessUnit, Assembly
 from tests.drivers.tello.addresses import Addresses
 
 pytest.importorskip("av")

@@ -13,7 +13,7 @@ PACKAGES = {
     "packets": ["skyloop.messages", "skyloop.transport.local.packets", "skyloop.transport.fabric.packets"],
     "proxy": ["skyloop.messages", "skyloop.proxy"],
     "ardrone": ["skyloop.vehicles.ardrone.wire"],
-    "tello": ["skyloop.wire.tello"],
+    "tello": ["skyloop.vehicles.tello.wire"],
     "mavlink": ["skyloop.wire.mavlink"],
     "msp": ["skyloop.wire.msp"],
     "vrpn": ["skyloop.wire.vrpn", "skyloop.motion_capture.vrpn"],

@@ -90,9 +90,9 @@ def ardrone(data: bytes) -> None:
 
 def tello(data: bytes) -> None:
     """What a Tello sends."""
+    from skyloop.vehicles.tello.wire import commands, state
+    from skyloop.vehicles.tello.wire.video import Assembly
     from skyloop.wire import h264
-    from skyloop.wire.tello import commands, state
-    from skyloop.wire.tello.video import Assembly
 
     with suppress(DecodeError):
         state.parse(data)

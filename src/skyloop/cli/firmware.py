@@ -16,10 +16,10 @@ from skyloop.errors import UsageError
 if TYPE_CHECKING:
     from skyloop.emulators.mavlink import MavlinkFirmware
     from skyloop.emulators.msp import BetaflightFirmware
-    from skyloop.emulators.tello import TelloFirmware
     from skyloop.faults import Faults
     from skyloop.sim.options import SimOptions
     from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
+    from skyloop.vehicles.tello.emulator import TelloFirmware
 
     Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | MavlinkFirmware | TelloFirmware
 
@@ -134,11 +134,11 @@ def _racers(options: SimOptions, drones: int, serving: Serving) -> list[Betaflig
 
 
 def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFirmware]:
-    from skyloop.emulators.tello import TelloFirmware, with_tellos
-    from skyloop.emulators.tello.settings import FRONT
     from skyloop.sim.host import SimHost
     from skyloop.sim.render.planar import Quality, prepare
-    from skyloop.wire.tello.commands import PORT
+    from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
+    from skyloop.vehicles.tello.emulator.settings import FRONT
+    from skyloop.vehicles.tello.wire.commands import PORT
 
     prepare(FRONT, Quality(options.quality))  # so that its first picture comes at once when it is asked for
     host = SimHost(with_tellos(options), drones)
@@ -208,8 +208,8 @@ def _run(firmwares: Sequence[Emulated]) -> None:
 
 def describe(firmware: Emulated) -> str:
     """Return one line with the ports of a drone."""
-    from skyloop.emulators.tello import TelloFirmware
     from skyloop.vehicles.ardrone.emulator import ArdroneFirmware
+    from skyloop.vehicles.tello.emulator import TelloFirmware
 
     if isinstance(firmware, TelloFirmware):
         tello = firmware.settings

@@ -6,10 +6,10 @@ import random
 from collections.abc import Callable, Mapping
 
 from skyloop.drivers.recording_sink import RecordingSink
-from skyloop.drivers.tello.options import TelloOptions
-from skyloop.drivers.tello.protocol import TelloSession
 from skyloop.messages import AnyAction, Feedback, FlightState
-from skyloop.wire.tello.commands import Sdk
+from skyloop.vehicles.tello.options import TelloOptions
+from skyloop.vehicles.tello.protocol import TelloSession
+from skyloop.vehicles.tello.wire.commands import Sdk
 from tests.emulators.tello_rig import PILOT, Bench
 
 STATE_TICKS = 5

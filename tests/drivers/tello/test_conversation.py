@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.tello.protocol import MOTION_NS, PATIENCE_NS, TRIES, Conversation, Request
+from skyloop.vehicles.tello.protocol import MOTION_NS, PATIENCE_NS, TRIES, Conversation, Request
 
 STEP = PATIENCE_NS + 1
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from skyloop.drivers.tello.telemetry import PAD_LOST, Health
 from skyloop.messages import Severity
-from skyloop.wire.tello.state import Pad, State
+from skyloop.vehicles.tello.telemetry import PAD_LOST, Health
+from skyloop.vehicles.tello.wire.state import Pad, State
 
 
 def hot(celsius: float) -> State:

@@ -12,11 +12,11 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
-from skyloop.emulators.tello import TelloFirmware, with_tellos
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import FlightState, LinkState, Refusal, Takeoff
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
 from tests.drivers.tello.addresses import Addresses
 
 pytest.importorskip("av")

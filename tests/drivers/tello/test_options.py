@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.drivers.tello import TelloDriver
-from skyloop.drivers.tello.options import TelloOptions, VelocityAxes, options_of
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
+from skyloop.vehicles.tello import TelloDriver
+from skyloop.vehicles.tello.options import TelloOptions, VelocityAxes, options_of
 
 
 def test_an_address_without_options() -> None:

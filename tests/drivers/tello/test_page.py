@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 
-from skyloop.drivers.tello import options
-from skyloop.drivers.tello.parameters import SETTINGS, flip_parameter, scale_parameters
-from skyloop.drivers.tello.protocol import ALIVE_NS, DEGRADED_NS, ENTER_NS, LOST_NS
-from skyloop.drivers.tello.setpoints import Scale, sticks_of
 from skyloop.messages import Attitude, Velocity
+from skyloop.vehicles.tello import options
+from skyloop.vehicles.tello.parameters import SETTINGS, flip_parameter, scale_parameters
+from skyloop.vehicles.tello.protocol import ALIVE_NS, DEGRADED_NS, ENTER_NS, LOST_NS
+from skyloop.vehicles.tello.setpoints import Scale, sticks_of
 from tests.docs.pages import rows, section
 
 

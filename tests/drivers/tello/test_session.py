@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyloop.drivers.tello.options import TelloOptions, VelocityAxes
 from skyloop.errors import DriverError
 from skyloop.messages import (
     Attitude,
@@ -23,7 +22,8 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.wire.tello.commands import Sdk
+from skyloop.vehicles.tello.options import TelloOptions, VelocityAxes
+from skyloop.vehicles.tello.wire.commands import Sdk
 from tests.drivers.tello.rig import Rig
 from tests.emulators.tello_rig import PILOT
 from tests.wire.tello.test_state import strings

@@ -9,9 +9,9 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.tello import TelloFirmware, with_tellos
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
 from tests.drivers.tello.addresses import Addresses
 
 

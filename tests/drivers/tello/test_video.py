@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.drivers.backlog import Coded
-from skyloop.drivers.tello.video import TelloVideo, cameras_of, intrinsics_for
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.tello.emulator import GROUP, TelloPacker
-from skyloop.emulators.tello.settings import FRONT
 from skyloop.emulators.video import OneCamera
-from skyloop.wire.tello.video import AccessUnit, Assembly, pieces
+from skyloop.vehicles.tello.emulator.emulator import GROUP, TelloPacker
+from skyloop.vehicles.tello.emulator.settings import FRONT
+from skyloop.vehicles.tello.video import TelloVideo, cameras_of, intrinsics_for
+from skyloop.vehicles.tello.wire.video import AccessUnit, Assembly, pieces
 
 pytest.importorskip("av")
 

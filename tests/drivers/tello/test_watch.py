@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.tello.options import VelocityAxes
-from skyloop.drivers.tello.telemetry import FlightWatch, height_m, velocity_m_s
 from skyloop.messages import FlightState
-from skyloop.wire.tello.state import State
+from skyloop.vehicles.tello.options import VelocityAxes
+from skyloop.vehicles.tello.telemetry import FlightWatch, height_m, velocity_m_s
+from skyloop.vehicles.tello.wire.state import State
 
 PERIOD_S = 0.1
 

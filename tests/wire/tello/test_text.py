@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.wire.tello.commands import LEVEL, Sdk, Stick, decoded, ports
-from skyloop.wire.tello.replies import READ, answers, is_error
+from skyloop.vehicles.tello.wire.commands import LEVEL, Sdk, Stick, decoded, ports
+from skyloop.vehicles.tello.wire.replies import READ, answers, is_error
 
 
 def test_commands_are_written_as_the_guide_has_them() -> None:

@@ -9,18 +9,18 @@ from skyloop.drivers.backlog import Coded
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.live_video import LiveVideo, Picture, VideoEvent
 from skyloop.drivers.stream_relay import StreamRelay
-from skyloop.drivers.tello.link import TelloLink
-from skyloop.drivers.tello.options import options_of
-from skyloop.drivers.tello.parameters import DroneSettings
-from skyloop.drivers.tello.protocol import TelloSession
-from skyloop.drivers.tello.video import TelloVideo, VideoStream, cameras_of, intrinsics_for
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Hover, Intrinsics, Land, Parameter, Refusal, Value
 from skyloop.messages.checkup import Diagnostic
+from skyloop.vehicles.tello.link import TelloLink
+from skyloop.vehicles.tello.options import options_of
+from skyloop.vehicles.tello.parameters import DroneSettings
+from skyloop.vehicles.tello.protocol import TelloSession
+from skyloop.vehicles.tello.video import TelloVideo, VideoStream, cameras_of, intrinsics_for
+from skyloop.vehicles.tello.wire.video import AccessUnit
 from skyloop.wire.h264 import Unit
-from skyloop.wire.tello.video import AccessUnit
 
 ACTIONS: Final = frozenset(
     {"idle", "takeoff", "hover", "land", "velocity", "attitude", "emergency_stop", "reset_emergency"}

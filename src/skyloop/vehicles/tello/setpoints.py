@@ -11,7 +11,6 @@ from typing import Final
 
 from skyloop.clock import nanoseconds
 from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.tello.telemetry import FlightWatch
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DriverError
 from skyloop.messages import (
@@ -29,8 +28,16 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.geometry import clamped
-from skyloop.wire.tello.commands import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, LEVEL, MAX_STICK, Stick
-from skyloop.wire.tello.replies import is_error
+from skyloop.vehicles.tello.telemetry import FlightWatch
+from skyloop.vehicles.tello.wire.commands import (
+    FULL_CLIMB_M_S,
+    FULL_SPEED_M_S,
+    FULL_YAW_RATE_RAD_S,
+    LEVEL,
+    MAX_STICK,
+    Stick,
+)
+from skyloop.vehicles.tello.wire.replies import is_error
 
 FULL_TILT_RAD: Final = 0.2  #: the attitude that is taken for a full stick: as much as an AR.Drone tilts indoors
 

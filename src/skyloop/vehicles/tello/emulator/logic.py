@@ -14,15 +14,15 @@ from typing import Final
 
 from skyloop.clock import Clock, nanoseconds
 from skyloop.emulators.datagrams import Address
-from skyloop.emulators.tello import telemetry
-from skyloop.emulators.tello.manoeuvres import OK, Flipping, Going, Job, Landing, Rising, Turning
-from skyloop.emulators.tello.pads import Sighting, seen
-from skyloop.emulators.tello.protocol import MOVES, NUMBERS, numbers_of
 from skyloop.emulators.vehicle import Vehicle
 from skyloop.messages import EmergencyStop, FlightState, Hover, ResetEmergency, Velocity
 from skyloop.sim.host import Report
 from skyloop.sim.world import Vec3
-from skyloop.wire.tello.commands import (
+from skyloop.vehicles.tello.emulator import telemetry
+from skyloop.vehicles.tello.emulator.manoeuvres import OK, Flipping, Going, Job, Landing, Rising, Turning
+from skyloop.vehicles.tello.emulator.pads import Sighting, seen
+from skyloop.vehicles.tello.emulator.protocol import MOVES, NUMBERS, numbers_of
+from skyloop.vehicles.tello.wire.commands import (
     ENTER,
     FULL_CLIMB_M_S,
     FULL_SPEED_M_S,

@@ -2,7 +2,7 @@
 
 At an address of this machine, for a test::
 
-    from skyloop.emulators.tello import TelloFirmware, with_tellos
+    from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
     from skyloop.sim.host import SimHost
     from skyloop.sim.options import SimOptions
 
@@ -15,8 +15,8 @@ State and video go to ports 8890 and 11111 of the sender of ``command``, or to t
 ``faults=Faults(seed=1, drop=0.1)`` of :mod:`skyloop.faults` datagrams get lost both ways.
 """
 
-from skyloop.emulators.tello.emulator import TelloFirmware
-from skyloop.emulators.tello.settings import with_tellos
 from skyloop.faults import Faults
+from skyloop.vehicles.tello.emulator.emulator import TelloFirmware
+from skyloop.vehicles.tello.emulator.settings import with_tellos
 
 __all__ = ["Faults", "TelloFirmware", "with_tellos"]

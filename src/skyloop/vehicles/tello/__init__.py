@@ -1,5 +1,5 @@
 """``tello://HOST``: the Ryze Tello, by its text protocol."""
 
-from skyloop.drivers.tello.driver import TelloDriver
+from skyloop.vehicles.tello.driver import TelloDriver
 
 __all__ = ["TelloDriver"]

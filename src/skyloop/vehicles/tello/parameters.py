@@ -10,13 +10,13 @@ from typing import Final
 
 import msgspec
 
-from skyloop.drivers.tello.link import TelloLink
-from skyloop.drivers.tello.setpoints import Scale
-from skyloop.drivers.tello.video import BOTTOM, FRONT
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
-from skyloop.wire.tello.commands import Sdk
-from skyloop.wire.tello.replies import is_error
+from skyloop.vehicles.tello.link import TelloLink
+from skyloop.vehicles.tello.setpoints import Scale
+from skyloop.vehicles.tello.video import BOTTOM, FRONT
+from skyloop.vehicles.tello.wire.commands import Sdk
+from skyloop.vehicles.tello.wire.replies import is_error
 
 NO_FLIP: Final = "none"
 FLIPS: Final = {"left": "l", "right": "r", "forward": "f", "back": "b"}

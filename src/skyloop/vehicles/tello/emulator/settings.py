@@ -10,7 +10,7 @@ from skyloop.faults import Faults
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import Limits, VehicleParameters
-from skyloop.wire.tello.commands import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, Sdk
+from skyloop.vehicles.tello.wire.commands import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, Sdk
 
 REPORTS_HZ: Final = 50.0
 TAKEOFF_ALTITUDE_M: Final = 0.8  #: of a recorded flight
@@ -63,7 +63,7 @@ def with_tellos(options: SimOptions | None = None) -> SimOptions:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The arguments of :class:`skyloop.emulators.tello.TelloFirmware`."""
+    """The arguments of :class:`skyloop.vehicles.tello.emulator.TelloFirmware`."""
 
     sdk: Sdk
     bind: str

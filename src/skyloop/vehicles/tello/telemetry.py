@@ -11,12 +11,12 @@ import math
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.tello.options import VelocityAxes
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.messages import Feedback, FlightState, Severity, Value
 from skyloop.messages.checkup import Diagnostic
 from skyloop.messages.geometry import wrap_angle
-from skyloop.wire.tello.state import GROUND_CM, Pad, State, Vector
+from skyloop.vehicles.tello.options import VelocityAxes
+from skyloop.vehicles.tello.wire.state import GROUND_CM, Pad, State, Vector
 
 # Feedback in SI ------------------------------------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from skyloop.wire.tello.commands import Sdk
+from skyloop.vehicles.tello.wire.commands import Sdk
 
 OUT_OF_RANGE: Final = "out of range"
 Range = tuple[int, int]

@@ -8,9 +8,6 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.tello.options import TelloOptions
-from skyloop.drivers.tello.setpoints import SetpointController
-from skyloop.drivers.tello.telemetry import Health, feedback_of, native_of
 from skyloop.drivers.vehicle_session import (
     KEPT_NS,
     Arrival,
@@ -23,9 +20,12 @@ from skyloop.drivers.vehicle_session import (
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, Hover, LinkState, Severity, Value
 from skyloop.messages.checkup import Diagnostic
-from skyloop.wire.tello.commands import ENTER, Sdk, decoded, ports
-from skyloop.wire.tello.replies import Shape, answers, is_error, shape_of
-from skyloop.wire.tello.state import parse
+from skyloop.vehicles.tello.options import TelloOptions
+from skyloop.vehicles.tello.setpoints import SetpointController
+from skyloop.vehicles.tello.telemetry import Health, feedback_of, native_of
+from skyloop.vehicles.tello.wire.commands import ENTER, Sdk, decoded, ports
+from skyloop.vehicles.tello.wire.replies import Shape, answers, is_error, shape_of
+from skyloop.vehicles.tello.wire.state import parse
 
 PATIENCE_NS: Final = nanoseconds(0.3)  #: real ones answer within 29 ms, over a good link
 TRIES: Final = 3

@@ -13,17 +13,17 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.emulators.datagrams import Address, DatagramPort
 from skyloop.emulators.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
 from skyloop.emulators.encoders import Encoder, Format, require_encoder
-from skyloop.emulators.tello.logic import TelloLogic
-from skyloop.emulators.tello.pads import MOST
-from skyloop.emulators.tello.settings import BOTTOM, FRONT, LIMITS, Settings
 from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.emulators.video import OneCamera, Piece, VideoEncoding
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.host import Report, SimHost
 from skyloop.vehicles.ardrone.wire.pave import Codec
-from skyloop.wire.tello.commands import PORT, Sdk
-from skyloop.wire.tello.video import pieces
+from skyloop.vehicles.tello.emulator.logic import TelloLogic
+from skyloop.vehicles.tello.emulator.pads import MOST
+from skyloop.vehicles.tello.emulator.settings import BOTTOM, FRONT, LIMITS, Settings
+from skyloop.vehicles.tello.wire.commands import PORT, Sdk
+from skyloop.vehicles.tello.wire.video import pieces
 
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera

@@ -9,11 +9,11 @@ from functools import partial
 from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns
-from skyloop.drivers.tello.options import TelloOptions
-from skyloop.drivers.tello.protocol import TelloSession
 from skyloop.drivers.vehicle_link import VehicleLink
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.messages import AnyAction
+from skyloop.vehicles.tello.options import TelloOptions
+from skyloop.vehicles.tello.protocol import TelloSession
 
 _BUFFER: Final = 1 << 20  # half a second of video
 

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.emulators.tello.pads import Sighting
 from skyloop.messages.geometry import turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2
-from skyloop.wire.tello.commands import Sdk
-from skyloop.wire.tello.state import GROUND_CM, NO_DISTANCE_CM, NO_PAD, NOWHERE_CM, build
+from skyloop.vehicles.tello.emulator.pads import Sighting
+from skyloop.vehicles.tello.wire.commands import Sdk
+from skyloop.vehicles.tello.wire.state import GROUND_CM, NO_DISTANCE_CM, NO_PAD, NOWHERE_CM, build
 
 FARTHEST_CM: Final = 400  #: the distance sensor measures no more; estimate
 COLD_C: Final = 60  #: lowest temperature that is reported; a simulated drone does not warm up
