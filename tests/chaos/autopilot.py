@@ -15,12 +15,12 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.messages import FlightState
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
-from skyloop.wire.mavlink.codec import Codec, Message
-from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.chaos.journal import Journal
 from tests.chaos.radio import FORCE, Radio
 from tests.chaos.vehicle import NUMBER_RAD_S

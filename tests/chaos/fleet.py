@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 
 from skyloop.drivers.base import Sink
-from skyloop.drivers.mavlink.driver import MavlinkDriver
 from skyloop.drivers.uri import parse_uri
 from skyloop.host.fleet import Defaults, Fleet, VehicleSettings
 from skyloop.host.serve import serve
 from skyloop.messages import Hover, Land
+from skyloop.vehicles.mavlink.driver import MavlinkDriver
 from tests.chaos.journal import Journal
 
 

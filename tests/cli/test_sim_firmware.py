@@ -113,8 +113,8 @@ def test_a_port_that_is_taken_is_named(run: Run) -> None:
 
 
 def test_the_autopilots_ports() -> None:
-    from skyloop.emulators.mavlink import Kind
-    from skyloop.emulators.mavlink import Ports as MavlinkPorts
+    from skyloop.vehicles.mavlink.emulator import Kind
+    from skyloop.vehicles.mavlink.emulator import Ports as MavlinkPorts
 
     assert MavlinkPorts.counted(Kind.PX4, None, 1) == MavlinkPorts(14581, 14541)
     assert MavlinkPorts.counted(Kind.ARDUCOPTER, None, 1) == MavlinkPorts(5773, 14560, 5770)

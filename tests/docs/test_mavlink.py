@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from skyloop.drivers.mavlink import options
-from skyloop.drivers.mavlink.options import OWN_LIMITS
-from skyloop.drivers.mavlink.protocol import DEGRADED_NS, FIRST_WORD_NS, LOST_NS, PARAMETERS_NS
+from skyloop.vehicles.mavlink import options
+from skyloop.vehicles.mavlink.options import OWN_LIMITS
+from skyloop.vehicles.mavlink.protocol import DEGRADED_NS, FIRST_WORD_NS, LOST_NS, PARAMETERS_NS
 from tests.docs.pages import rows, section
 
 PAGE = "docs/mavlink.md"

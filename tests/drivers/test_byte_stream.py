@@ -16,8 +16,8 @@ import pytest
 
 from skyloop.clock import ManualClock
 from skyloop.drivers.byte_stream import END_S, STUCK_NS, LinePace, Rank, SerialStream, TcpStream, line_speed
-from skyloop.wire.mavlink.codec import Codec, Message
-from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.wire.mavlink.codec import Codec, dialect
+from skyloop.vehicles.mavlink.wire.codec import Codec, dialect
 from tests.chaos.journal import Entry
 from tests.chaos.judge import Fault, Verdict, faults_of, judge
 from tests.chaos.radio import frames_of, is_stop

@@ -8,8 +8,8 @@ import pytest
 
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.fleet import Fleet
-from skyloop.emulators.mavlink import Kind
 from skyloop.transport.testing import wait_until
+from skyloop.vehicles.mavlink.emulator import Kind
 from tests.cockpit.fake import cockpit
 from tests.cockpit.test_control import page
 from tests.faults.test_vehicle_of_others import KINDS, Scene, taken_off

@@ -21,7 +21,6 @@ from skyloop.control import Controller, FlyRoute
 from skyloop.control.route import Route, RouteWaypoint
 from skyloop.control.route_law import RouteState
 from skyloop.drivers.registry import make_driver
-from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import NoAnswerError, RefusedError, SwarmError
 from skyloop.messages import EventKind, Feedback
 from skyloop.proxy.core.failsafe import FailsafeSettings
@@ -32,8 +31,9 @@ from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
 from skyloop.transport.testing import wait_until
-from skyloop.wire.mavlink.codec import Codec, Message
-from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 WAIT_S = 20.0
 STATION = 250  #: the other one's system id

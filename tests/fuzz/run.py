@@ -14,7 +14,7 @@ PACKAGES = {
     "proxy": ["skyloop.messages", "skyloop.proxy"],
     "ardrone": ["skyloop.vehicles.ardrone.wire"],
     "tello": ["skyloop.vehicles.tello.wire"],
-    "mavlink": ["skyloop.wire.mavlink"],
+    "mavlink": ["skyloop.vehicles.mavlink.wire"],
     "msp": ["skyloop.wire.msp"],
     "vrpn": ["skyloop.wire.vrpn", "skyloop.motion_capture.vrpn"],
     "recording": ["skyloop.logfile", "mcap"],

@@ -108,7 +108,7 @@ def tello(data: bytes) -> None:
 
 def mavlink(data: bytes) -> None:
     """What comes from a MAVLink vehicle, in one datagram, as a stream, and as one that was cut into datagrams."""
-    from skyloop.wire.mavlink.codec import Codec
+    from skyloop.vehicles.mavlink.wire.codec import Codec
 
     Codec(1, 1).decode(data, whole=True)
     stream, cut, signed = Codec(1, 1), Codec(1, 1), Codec(1, 1, key=bytes(32))

@@ -15,14 +15,14 @@ from skyloop.client import Drone, Swarm
 from skyloop.client.drone import open_drone
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.registry import make_driver
-from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.emulators.mavlink.places import ORIGIN
 from skyloop.errors import NoAnswerError, RefusedError, SwarmError, UnknownNameError, UsageError
 from skyloop.messages import Applied, EventKind, Feedback, FlightState, Hover, Vector, Velocity
 from skyloop.proxy import Proxy
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
+from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.vehicles.mavlink.emulator.places import ORIGIN
 from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
 from tests.client.scripted import WAIT_S
 from tests.drivers.tello.addresses import Addresses

@@ -50,9 +50,9 @@ def seeing(name: str) -> Iterator[MotionCapture]:
 
 
 def test_an_autopilot_without_gps_flies_by_them() -> None:
-    from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
     from skyloop.sim.host import SimHost
     from skyloop.sim.options import SimOptions
+    from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 
     host = SimHost(with_multirotors(SimOptions(world="empty", seed=4, wind=0.0, speed=3.0)), 1)
     with (

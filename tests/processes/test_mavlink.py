@@ -13,8 +13,8 @@ import pytest
 
 import skyloop
 from skyloop.control.follow import FollowMarker
-from skyloop.emulators.mavlink.video import CAMERA
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
+from skyloop.vehicles.mavlink.emulator.video import CAMERA
 from tests.processes.conftest import Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]

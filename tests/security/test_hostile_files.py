@@ -10,12 +10,12 @@ import pytest
 
 from skyloop.calibration import load_calibration
 from skyloop.cockpit.access import read_tokens
-from skyloop.drivers.mavlink.options import options_of
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.keys import Lab
 from skyloop.sim.identification import read_recording
 from skyloop.sim.world_file import load_world
+from skyloop.vehicles.mavlink.options import options_of
 
 ROOM = b"[room]\nsize = [8, 6, 3]\n"
 DEEP = b"a." * 100_000 + b"a = 1\n"

@@ -22,7 +22,6 @@ from skyloop.address import shown_address
 from skyloop.cockpit.access import Person, Token
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.camera_source import source_of
-from skyloop.drivers.mavlink.options import options_of as mavlink_options
 from skyloop.drivers.replay.options import options_of as replay_options
 from skyloop.drivers.sim.options import firmware_options
 from skyloop.drivers.uri import VehicleUri, parse_uri
@@ -37,6 +36,7 @@ from skyloop.proxy import Proxy
 from skyloop.proxy.audit import AuditTrail
 from skyloop.transport.fabric.packets import Key
 from skyloop.transport.memory import MemoryServer
+from skyloop.vehicles.mavlink.options import options_of as mavlink_options
 from tests.proxy.fake import App, Bench
 
 SECRET = "s3cr3t"

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 from tests.third_party.conftest import HERE, INSTALLED, PATIENCE_S, absent
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]

@@ -19,8 +19,8 @@ from skyloop.errors import DecodeError
 from skyloop.files import wait_readable
 from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG
 from skyloop.sim.firmware import Readings
+from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
 from skyloop.wire.ardupilot_json import MAX_PACKET, SimulatedState, decode_servos, encode_state
-from skyloop.wire.mavlink.axes import flip, swap, turned_axes
 
 VARIABLE: Final = "SKYLOOP_ARDUCOPTER"
 WHERE: Final = "How to get it: https://ardupilot.org/dev/docs/building-setup-linux.html (board sitl, vehicle copter)"

@@ -23,8 +23,8 @@ from skyloop.child_process import ChildProcess
 from skyloop.errors import DecodeError, UsageError
 from skyloop.sim.earth import geodetic
 from skyloop.sim.firmware import GpsFix, Readings
+from skyloop.vehicles.mavlink.wire.axes import turned_axes
 from skyloop.wire.betaflight_sitl import MOTORS_PORT, MSP_PORT, STATE_PORT, FlightState, decode_motors, encode_state
-from skyloop.wire.mavlink.axes import turned_axes
 from skyloop.wire.msp.frames import Frame, encode
 from skyloop.wire.msp.messages import Function
 

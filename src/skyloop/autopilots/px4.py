@@ -26,7 +26,7 @@ from skyloop.messages.geometry import in_16_bits
 from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, geodetic
 from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.sim.rotor_parameters import InstrumentParameters
-from skyloop.wire.mavlink.axes import flip, swap, turned_axes
+from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
 
 VARIABLE: Final = "SKYLOOP_PX4"
 WHERE: Final = (
@@ -87,7 +87,7 @@ class Px4(CoupledFirmware):
         folder: Path | None = None,
         instruments: InstrumentParameters = InstrumentParameters(),  # noqa: B008  it never changes
     ) -> None:
-        from skyloop.wire.mavlink.codec import Codec
+        from skyloop.vehicles.mavlink.wire.codec import Codec
 
         super().__init__(on_event, folder=folder)
         self._gps_delay_ms = round(instruments.gps_delay_s * 1000.0)
@@ -246,7 +246,7 @@ class Px4(CoupledFirmware):
         self._backlog = self._backlog[sent:]
 
     def _sensor(self, readings: Readings, inertial: list[float]) -> Any:
-        from skyloop.wire.mavlink.codec import dialect
+        from skyloop.vehicles.mavlink.wire.codec import dialect
 
         gyro, acceleration = flip(*inertial[:3]), flip(*inertial[3:])
         return dialect.MAVLink_hil_sensor_message(
@@ -262,7 +262,7 @@ class Px4(CoupledFirmware):
         )
 
     def _gps(self, fix: GpsFix) -> Any:
-        from skyloop.wire.mavlink.codec import dialect
+        from skyloop.vehicles.mavlink.wire.codec import dialect
 
         east, north, up = fix.velocity_m_s
         speed = math.hypot(east, north)
@@ -286,7 +286,7 @@ class Px4(CoupledFirmware):
         )
 
     def _truth(self, readings: Readings) -> Any:
-        from skyloop.wire.mavlink.codec import dialect
+        from skyloop.vehicles.mavlink.wire.codec import dialect
 
         latitude, longitude, altitude = geodetic(readings.position_m)
         north, east, down = swap(*readings.velocity_m_s)
@@ -305,7 +305,7 @@ class Px4(CoupledFirmware):
         )
 
     def _range(self, range_m: float) -> Any:
-        from skyloop.wire.mavlink.codec import dialect
+        from skyloop.vehicles.mavlink.wire.codec import dialect
 
         return dialect.MAVLink_distance_sensor_message(
             self._own_us // 1000 & 0xFFFFFFFF, 5, 1000, round(range_m * 100.0), 0, 0, _DOWN, 0

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
-    from skyloop.emulators.mavlink import MavlinkFirmware
     from skyloop.emulators.msp import BetaflightFirmware
     from skyloop.faults import Faults
     from skyloop.sim.options import SimOptions
     from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
+    from skyloop.vehicles.mavlink.emulator import MavlinkFirmware
     from skyloop.vehicles.tello.emulator import TelloFirmware
 
     Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | MavlinkFirmware | TelloFirmware
@@ -96,8 +96,8 @@ def _ardrones(options: SimOptions, drones: int, firmware: Firmware, serving: Ser
 
 
 def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> list[MavlinkFirmware]:
-    from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
     from skyloop.sim.host import SimHost
+    from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 
     kind, video = Kind(firmware.value), serving.video_port
     host = SimHost(with_multirotors(options), drones)

@@ -12,7 +12,7 @@ from skyloop.messages import Velocity as VelocityAction
 from skyloop.messages.geometry import clamped, turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits
-from skyloop.wire.mavlink.axes import Vector
+from skyloop.vehicles.mavlink.wire.axes import Vector
 
 LIFT_M: Final = 0.3  #: what the simulated vehicle's own take-off does, before these loops go on
 LIMITS: Final = Limits(

@@ -23,7 +23,7 @@ link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 place, port = options.serial0.removeprefix("udpclient:").split(":")
 rotors = (0, 0, 0, 0) if manner == "mavlink" else (1100, 1200, 1300, 1400)
 if manner == "mavlink":
-    from skyloop.wire.mavlink.codec import Codec, dialect
+    from skyloop.vehicles.mavlink.wire.codec import Codec, dialect
 
     telemetry = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     codec = Codec(int(options.sysid), 1)

@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from skyloop.wire.mavlink.codec import Codec, dialect
+from skyloop.vehicles.mavlink.wire.codec import Codec, dialect
 
 instance = int(sys.argv[sys.argv.index("-i") + 1])
 files = Path(sys.argv[sys.argv.index("-d") + 1])

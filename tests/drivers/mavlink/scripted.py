@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from skyloop.clock import ManualClock, nanoseconds
-from skyloop.drivers.mavlink.options import MavlinkOptions, Peer, options_of
-from skyloop.drivers.mavlink.protocol import TICK_NS, MavlinkSession
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.messages import AnyAction, Feedback, FlightState, LinkState
-from skyloop.wire.mavlink.codec import Codec, Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import COPTER_NUMBERS, Landed, px4_custom
+from skyloop.vehicles.mavlink.options import MavlinkOptions, Peer, options_of
+from skyloop.vehicles.mavlink.protocol import TICK_NS, MavlinkSession
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS, Landed, px4_custom
 
 PEER: Peer = ("127.0.0.1", 14580)
 PX4 = 12

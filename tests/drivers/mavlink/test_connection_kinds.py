@@ -13,12 +13,12 @@ from dataclasses import replace
 
 import pytest
 
-from skyloop.drivers.mavlink.link import MavlinkConnection, SerialPort, open_connection
-from skyloop.drivers.mavlink.options import Address, ConnectionKind, options_of
-from skyloop.drivers.mavlink.protocol import Packet
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import MissingExtraError
 from skyloop.transport.testing import wait_until
+from skyloop.vehicles.mavlink.link import MavlinkConnection, SerialPort, open_connection
+from skyloop.vehicles.mavlink.options import Address, ConnectionKind, options_of
+from skyloop.vehicles.mavlink.protocol import Packet
 
 LOCAL = "127.0.0.1"
 

@@ -20,21 +20,21 @@ import pytest
 
 from skyloop.drivers.base import Driver, ExternalPose, ServedLink
 from skyloop.drivers.byte_stream import END_S
-from skyloop.drivers.mavlink import MavlinkDriver
-from skyloop.drivers.mavlink.link import MavlinkLink, TcpClient
-from skyloop.drivers.mavlink.protocol import MavlinkSession
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import DriverError, UnsupportedError, UsageError
 from skyloop.host.links import LinkThread
 from skyloop.messages import EmergencyStop, FlightState, Land, LinkState, Takeoff, Velocity
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
-from skyloop.wire.mavlink.codec import Codec
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import Landed
+from skyloop.vehicles.mavlink import MavlinkDriver
+from skyloop.vehicles.mavlink.emulator import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.vehicles.mavlink.link import MavlinkLink, TcpClient
+from skyloop.vehicles.mavlink.protocol import MavlinkSession
+from skyloop.vehicles.mavlink.wire.codec import Codec
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import Landed
 from tests.drivers.mavlink.scripted import ARDUPILOT, Vehicle, options
 
 PATIENCE_S = 15.0

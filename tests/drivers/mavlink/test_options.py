@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.drivers.mavlink import MavlinkDriver
-from skyloop.drivers.mavlink.options import ConnectionKind, MavlinkOptions, options_of
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
+from skyloop.vehicles.mavlink import MavlinkDriver
+from skyloop.vehicles.mavlink.options import ConnectionKind, MavlinkOptions, options_of
 
 
 def understood(text: str) -> MavlinkOptions:

@@ -6,14 +6,16 @@ import math
 
 import pytest
 
-from skyloop.drivers.mavlink.autopilots import (
+from skyloop.errors import ParameterError, UnknownNameError
+from skyloop.messages import ParameterType
+from skyloop.vehicles.mavlink.autopilots import (
     ArduCopterProfile,
     ClimbRateThrust,
     CollectiveThrust,
     Px4Profile,
 )
-from skyloop.drivers.mavlink.options import USUAL, limits_text, takeoff_height
-from skyloop.drivers.mavlink.parameters import (
+from skyloop.vehicles.mavlink.options import USUAL, limits_text, takeoff_height
+from skyloop.vehicles.mavlink.parameters import (
     ParameterExchange,
     ReportedParameter,
     check_exact,
@@ -22,11 +24,9 @@ from skyloop.drivers.mavlink.parameters import (
     with_limit,
     writable_parameter,
 )
-from skyloop.errors import ParameterError, UnknownNameError
-from skyloop.messages import ParameterType
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.parameter_values import to_field
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.parameter_values import to_field
 
 S = 1_000_000_000
 

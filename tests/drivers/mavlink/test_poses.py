@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.mavlink.microservices import pose_message
-from skyloop.drivers.mavlink.options import PoseMessage
 from skyloop.errors import DriverError
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.wire.mavlink.axes import angles_of, from_wire
+from skyloop.vehicles.mavlink.microservices import pose_message
+from skyloop.vehicles.mavlink.options import PoseMessage
+from skyloop.vehicles.mavlink.wire.axes import angles_of, from_wire
 
 #: 1 m east, 2 m north, 3 m up; left turned 30° from east, nose down 10°, right side down 5°.
 POSE = ExternalPose(

@@ -12,11 +12,6 @@ from hypothesis import strategies as st
 
 from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.byte_stream import Rank
-from skyloop.drivers.mavlink.microservices import pose_message
-from skyloop.drivers.mavlink.options import PoseMessage
-from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession, rank_of
-from skyloop.drivers.mavlink.setpoints import STEP_NS, Goal
-from skyloop.drivers.mavlink.telemetry import VehicleState
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
 from skyloop.messages import (
@@ -32,10 +27,15 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.wire.mavlink.codec import Codec, Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import COPTER_NUMBERS
-from skyloop.wire.mavlink.texts import chunks_of
+from skyloop.vehicles.mavlink.microservices import pose_message
+from skyloop.vehicles.mavlink.options import PoseMessage
+from skyloop.vehicles.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession, rank_of
+from skyloop.vehicles.mavlink.setpoints import STEP_NS, Goal
+from skyloop.vehicles.mavlink.telemetry import VehicleState
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS
+from skyloop.vehicles.mavlink.wire.texts import chunks_of
 from tests.drivers.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
 from tests.recordings import recorded
 

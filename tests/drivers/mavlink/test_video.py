@@ -16,14 +16,14 @@ import pytest
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers import live_camera as camera
-from skyloop.drivers.mavlink import MavlinkDriver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.mavlink import Kind, Ports, video
-from skyloop.emulators.mavlink.video import TransportStream
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind
 from skyloop.transport.testing import wait_until
+from skyloop.vehicles.mavlink import MavlinkDriver
+from skyloop.vehicles.mavlink.emulator import Kind, Ports, video
+from skyloop.vehicles.mavlink.emulator.video import TransportStream
 from tests.drivers.ardrone.video_ports import TcpPort
 from tests.drivers.mavlink.film import FPS, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
 from tests.drivers.mavlink.rtsp_server import HOST, RtspServer

@@ -5,20 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from skyloop.emulators.mavlink import Kind
-from skyloop.emulators.mavlink.arducopter import ArduCopter
-from skyloop.emulators.mavlink.places import geodetic
-from skyloop.emulators.mavlink.px4 import Px4
-from skyloop.emulators.mavlink.streams import Streams
 from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import VehicleParameters, with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
-from skyloop.wire.mavlink.codec import Codec, Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.texts import Texts
+from skyloop.vehicles.mavlink.emulator import Kind
+from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
+from skyloop.vehicles.mavlink.emulator.places import geodetic
+from skyloop.vehicles.mavlink.emulator.px4 import Px4
+from skyloop.vehicles.mavlink.emulator.streams import Streams
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.texts import Texts
 
 TICK_STEPS = 4
 HOME_M = 488.0

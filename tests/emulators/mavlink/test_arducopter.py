@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from skyloop.emulators.mavlink import Kind
-from skyloop.emulators.mavlink.places import geodetic
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
-from skyloop.wire.mavlink.axes import to_wire
-from skyloop.wire.mavlink.codec import Codec, Message
-from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.vehicles.mavlink.emulator import Kind
+from skyloop.vehicles.mavlink.emulator.places import geodetic
+from skyloop.vehicles.mavlink.wire.axes import to_wire
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.emulators.mavlink.rig import HOME_M, Rig
 
 

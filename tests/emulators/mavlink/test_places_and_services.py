@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from skyloop.emulators.mavlink import Kind
-from skyloop.emulators.mavlink.places import geodetic, on_earth, place_of
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.vehicles.mavlink.emulator import Kind
+from skyloop.vehicles.mavlink.emulator.places import geodetic, on_earth, place_of
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.emulators.mavlink.rig import HOME_M, Rig
 
 BOTH = pytest.mark.parametrize("kind", list(Kind))

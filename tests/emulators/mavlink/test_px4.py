@@ -6,11 +6,11 @@ import math
 
 import pytest
 
-from skyloop.emulators.mavlink import Kind
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.wire.mavlink.axes import to_wire
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.vehicles.mavlink.emulator import Kind
+from skyloop.vehicles.mavlink.wire.axes import to_wire
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.emulators.mavlink.rig import HOME_M, Rig
 
 

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skyloop.drivers.mavlink.manoeuvres import AttitudeSetpoint
-from skyloop.emulators.mavlink.setpoints import attitude_target_of
-from skyloop.emulators.mavlink.telemetry import MAKERS
 from skyloop.messages import Attitude
-from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.vehicles.mavlink.emulator.setpoints import attitude_target_of
+from skyloop.vehicles.mavlink.emulator.telemetry import MAKERS
+from skyloop.vehicles.mavlink.manoeuvres import AttitudeSetpoint
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 ROLL, PITCH, YAW = math.radians(5), math.radians(10), math.radians(30)  # ours: right down, nose down, to the left
 #: Forward, right, down to north, east, down; no two of its numbers are alike.

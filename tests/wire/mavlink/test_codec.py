@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
-from skyloop.wire.mavlink.codec import Codec, Message
-from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.recordings import recorded
 
 FLIGHT = "mavlink/arduplane-flight.tlog"
@@ -231,7 +231,7 @@ class Wall:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, now_s: float = 1.8e9) -> None:
         self.now_s = now_s
-        monkeypatch.setattr("skyloop.wire.mavlink.codec.time", self)
+        monkeypatch.setattr("skyloop.vehicles.mavlink.wire.codec.time", self)
 
     def time(self) -> float:
         return self.now_s

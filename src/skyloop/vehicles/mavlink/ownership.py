@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.mavlink.autopilots import AutopilotProfile
-from skyloop.drivers.mavlink.manoeuvres import STRAYED_NS
-from skyloop.drivers.mavlink.telemetry import VehicleState
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, Attitude, Position, Velocity
+from skyloop.vehicles.mavlink.autopilots import AutopilotProfile
+from skyloop.vehicles.mavlink.manoeuvres import STRAYED_NS
+from skyloop.vehicles.mavlink.telemetry import VehicleState
 
 LATE_NS: Final = nanoseconds(3.0)  #: a command to change the mode may take effect so much later
 PAUSE_NS: Final = nanoseconds(0.5)  #: an action after such a pause is no repeat

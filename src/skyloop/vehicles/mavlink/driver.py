@@ -7,19 +7,6 @@ from typing import Final
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, ExternalPose, Sink
 from skyloop.drivers.live_camera import LiveCamera
-from skyloop.drivers.mavlink.link import MavlinkLink
-from skyloop.drivers.mavlink.microservices import pose_message
-from skyloop.drivers.mavlink.options import options_of
-from skyloop.drivers.mavlink.parameters import (
-    VehicleParameter,
-    check_exact,
-    limit_parameters,
-    vehicle_parameters,
-    with_limit,
-    writable_parameter,
-)
-from skyloop.drivers.mavlink.protocol import MavlinkSession
-from skyloop.drivers.mavlink.video import camera_info, camera_receiver, source
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
@@ -33,7 +20,20 @@ from skyloop.messages import (
     Value,
 )
 from skyloop.messages.checkup import Diagnostic
-from skyloop.wire.mavlink.parameter_values import is_integer
+from skyloop.vehicles.mavlink.link import MavlinkLink
+from skyloop.vehicles.mavlink.microservices import pose_message
+from skyloop.vehicles.mavlink.options import options_of
+from skyloop.vehicles.mavlink.parameters import (
+    VehicleParameter,
+    check_exact,
+    limit_parameters,
+    vehicle_parameters,
+    with_limit,
+    writable_parameter,
+)
+from skyloop.vehicles.mavlink.protocol import MavlinkSession
+from skyloop.vehicles.mavlink.video import camera_info, camera_receiver, source
+from skyloop.vehicles.mavlink.wire.parameter_values import is_integer
 
 ACTIONS: Final = frozenset(
     {"idle", "takeoff", "hover", "land", "attitude", "velocity", "position", "emergency_stop", "reset_emergency"}

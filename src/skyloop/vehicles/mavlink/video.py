@@ -8,10 +8,10 @@ from skyloop.drivers.base import Sink
 from skyloop.drivers.camera_source import CameraSource, source_of
 from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
-from skyloop.drivers.mavlink.options import FACINGS, CameraOptions
 from skyloop.drivers.uri import VehicleUri
 from skyloop.messages import CameraInfo
 from skyloop.messages.encoded import H264
+from skyloop.vehicles.mavlink.options import FACINGS, CameraOptions
 
 
 def camera_info(uri: VehicleUri, options: CameraOptions) -> CameraInfo:

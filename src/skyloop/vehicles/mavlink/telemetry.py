@@ -13,10 +13,10 @@ from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.earth import EarthOrigin
 from skyloop.messages.geometry import turned
-from skyloop.wire.mavlink.axes import Vector, flip, swap, yaw_between
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.modes import Landed, ModeFlag, SystemState
-from skyloop.wire.mavlink.texts import Texts
+from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, yaw_between
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.modes import Landed, ModeFlag, SystemState
+from skyloop.vehicles.mavlink.wire.texts import Texts
 
 FLOWING_S: Final = 1.0  #: older than this, attitude, position and velocity are not known
 SLOW_S: Final = 6.0  #: the same for battery, GPS and the like

@@ -9,9 +9,9 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.emulators.byte_server import ByteServer
 from skyloop.emulators.datagrams import Address, DatagramPort
 from skyloop.emulators.loop import Loop
-from skyloop.emulators.mavlink.settings import Settings
-from skyloop.emulators.mavlink.streams import Streams
-from skyloop.wire.mavlink.codec import Codec, Message
+from skyloop.vehicles.mavlink.emulator.settings import Settings
+from skyloop.vehicles.mavlink.emulator.streams import Streams
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 
 OnMessage = Callable[["Port", Message], None]
 

@@ -6,15 +6,15 @@ import math
 from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.drivers.mavlink.autopilots import AutopilotProfile, ThrustModel
-from skyloop.drivers.mavlink.microservices import ACCEPTED, CommandSender, VehicleCommand, result_name
-from skyloop.drivers.mavlink.telemetry import VehicleState
 from skyloop.messages import Attitude, Position, Velocity
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
-from skyloop.wire.mavlink.axes import Vector, flip, swap, to_wire, yaw_between
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import Landed
+from skyloop.vehicles.mavlink.autopilots import AutopilotProfile, ThrustModel
+from skyloop.vehicles.mavlink.microservices import ACCEPTED, CommandSender, VehicleCommand, result_name
+from skyloop.vehicles.mavlink.telemetry import VehicleState
+from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_between
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import Landed
 
 # Frames of SET_POSITION_TARGET_LOCAL_NED that both autopilots take.
 WORLD: Final = 1

@@ -9,18 +9,18 @@ from typing import Final
 from skyloop.clock import monotonic_ns
 from skyloop.emulators.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
 from skyloop.emulators.loop import Loop
-from skyloop.emulators.mavlink.arducopter import ArduCopter
-from skyloop.emulators.mavlink.autopilot import Autopilot
-from skyloop.emulators.mavlink.links import Port, TcpPort, UdpPort
-from skyloop.emulators.mavlink.px4 import Px4
-from skyloop.emulators.mavlink.settings import Kind, Ports, Settings
-from skyloop.emulators.mavlink.streams import Streams
-from skyloop.emulators.mavlink.video import CAMERA, TransportStream, encoding
 from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
+from skyloop.vehicles.mavlink.emulator.autopilot import Autopilot
+from skyloop.vehicles.mavlink.emulator.links import Port, TcpPort, UdpPort
+from skyloop.vehicles.mavlink.emulator.px4 import Px4
+from skyloop.vehicles.mavlink.emulator.settings import Kind, Ports, Settings
+from skyloop.vehicles.mavlink.emulator.streams import Streams
+from skyloop.vehicles.mavlink.emulator.video import CAMERA, TransportStream, encoding
 
 _KINDS: dict[Kind, type[Autopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px4}
 

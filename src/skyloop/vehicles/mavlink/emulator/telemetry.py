@@ -7,15 +7,15 @@ from collections.abc import Callable
 from typing import ClassVar, Final, Protocol
 
 from skyloop.emulators.flight import FlightControl
-from skyloop.emulators.mavlink.places import ORIGIN, geodetic
 from skyloop.messages import FlightState
 from skyloop.messages.geometry import in_16_bits, quaternion_from_euler
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2
-from skyloop.wire.mavlink.axes import Vector, flip, swap, to_wire, yaw_between
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import Landed
+from skyloop.vehicles.mavlink.emulator.places import ORIGIN, geodetic
+from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_between
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import Landed
 
 PREARM: Final = 0x10000000
 _SENSORS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x20  #: gyro, accelerometer, magnetometer, pressure, GPS
@@ -32,7 +32,7 @@ _LANDED: Final = {
 
 
 class AutopilotState(Protocol):
-    """What the messages are made from; see :class:`skyloop.emulators.mavlink.autopilot.Autopilot`."""
+    """What the messages are made from; see :class:`skyloop.vehicles.mavlink.emulator.autopilot.Autopilot`."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
     REPORTS_PREARM: ClassVar[bool]

@@ -109,7 +109,7 @@ def with_multirotors(options: SimOptions | None = None, *, rate_hz: float = REPO
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The arguments of :class:`skyloop.emulators.mavlink.MavlinkFirmware`."""
+    """The arguments of :class:`skyloop.vehicles.mavlink.emulator.MavlinkFirmware`."""
 
     kind: Kind
     bind: str

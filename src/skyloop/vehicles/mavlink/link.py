@@ -11,12 +11,12 @@ from typing import Final, Protocol
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import ServedLink
 from skyloop.drivers.byte_stream import END_S, ByteStream, SerialStream, TcpStream
-from skyloop.drivers.mavlink.options import Address, ConnectionKind, Peer
-from skyloop.drivers.mavlink.protocol import MavlinkSession, Packet
 from skyloop.drivers.vehicle_link import ConnectionLink
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.messages import AnyAction
-from skyloop.wire.mavlink.codec import Message
+from skyloop.vehicles.mavlink.options import Address, ConnectionKind, Peer
+from skyloop.vehicles.mavlink.protocol import MavlinkSession, Packet
+from skyloop.vehicles.mavlink.wire.codec import Message
 
 MAX_DATAGRAM: Final = 65_536
 BURST: Final = 64  #: datagrams that are read before others get their turn

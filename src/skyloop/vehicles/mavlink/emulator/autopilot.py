@@ -11,21 +11,21 @@ from collections.abc import Callable
 from typing import ClassVar, Final
 
 from skyloop.emulators.flight import FlightControl
-from skyloop.emulators.mavlink.links import Port
-from skyloop.emulators.mavlink.manoeuvres import Manoeuvres
-from skyloop.emulators.mavlink.parameters import ParameterTable
-from skyloop.emulators.mavlink.places import ORIGIN, on_earth, place_of
-from skyloop.emulators.mavlink.services import answers
-from skyloop.emulators.mavlink.streams import MAX_INTERVAL_US
-from skyloop.emulators.mavlink.telemetry import MAKERS
 from skyloop.emulators.vehicle import Vehicle
 from skyloop.messages import FlightState
 from skyloop.sim.host import Report
-from skyloop.wire.mavlink.axes import Vector
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import ModeFlag, SystemState
-from skyloop.wire.mavlink.texts import chunks_of
+from skyloop.vehicles.mavlink.emulator.links import Port
+from skyloop.vehicles.mavlink.emulator.manoeuvres import Manoeuvres
+from skyloop.vehicles.mavlink.emulator.parameters import ParameterTable
+from skyloop.vehicles.mavlink.emulator.places import ORIGIN, on_earth, place_of
+from skyloop.vehicles.mavlink.emulator.services import answers
+from skyloop.vehicles.mavlink.emulator.streams import MAX_INTERVAL_US
+from skyloop.vehicles.mavlink.emulator.telemetry import MAKERS
+from skyloop.vehicles.mavlink.wire.axes import Vector
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import ModeFlag, SystemState
+from skyloop.vehicles.mavlink.wire.texts import chunks_of
 
 ACCEPTED: Final = 0
 TEMPORARILY_REJECTED: Final = 1

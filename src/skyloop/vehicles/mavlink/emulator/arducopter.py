@@ -7,8 +7,10 @@ from dataclasses import replace
 from typing import ClassVar, Final
 
 from skyloop.emulators.flight import GO_M_S, SINK_M_S, Speeds
-from skyloop.emulators.mavlink import parameters
-from skyloop.emulators.mavlink.autopilot import (
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.messages.geometry import turned, wrap_angle
+from skyloop.vehicles.mavlink.emulator import parameters
+from skyloop.vehicles.mavlink.emulator.autopilot import (
     ACCEPTED,
     CRITICAL,
     DENIED,
@@ -18,11 +20,11 @@ from skyloop.emulators.mavlink.autopilot import (
     Autopilot,
     whole,
 )
-from skyloop.emulators.mavlink.links import Port
-from skyloop.emulators.mavlink.manoeuvres import Turn
-from skyloop.emulators.mavlink.parameters import ParameterTable
-from skyloop.emulators.mavlink.places import geodetic
-from skyloop.emulators.mavlink.services import (
+from skyloop.vehicles.mavlink.emulator.links import Port
+from skyloop.vehicles.mavlink.emulator.manoeuvres import Turn
+from skyloop.vehicles.mavlink.emulator.parameters import ParameterTable
+from skyloop.vehicles.mavlink.emulator.places import geodetic
+from skyloop.vehicles.mavlink.emulator.services import (
     MISSION_ACCEPTED,
     MISSION_ERROR,
     MISSION_INVALID_X,
@@ -32,7 +34,7 @@ from skyloop.emulators.mavlink.services import (
     Mission,
     mission_ack,
 )
-from skyloop.emulators.mavlink.setpoints import (
+from skyloop.vehicles.mavlink.emulator.setpoints import (
     BODY,
     BODY_OFFSET,
     WORLD,
@@ -43,13 +45,11 @@ from skyloop.emulators.mavlink.setpoints import (
     global_target_of,
     target_of,
 )
-from skyloop.emulators.vehicle import Vehicle
-from skyloop.messages.geometry import turned, wrap_angle
-from skyloop.wire.mavlink.axes import yaw_between
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import COPTER_MODES, COPTER_NUMBERS
-from skyloop.wire.mavlink.modes import Autopilot as Number
+from skyloop.vehicles.mavlink.wire.axes import yaw_between
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import COPTER_MODES, COPTER_NUMBERS
+from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
 SINK_WITHOUT_STICKS_M_S: Final = -2.5
 STICK_TIMEOUT_S: Final = 3.0

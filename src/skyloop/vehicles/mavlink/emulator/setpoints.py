@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.emulators.flight import USUAL, FlightControl, Speeds
-from skyloop.emulators.mavlink.places import on_earth, place_of
-from skyloop.wire.mavlink.axes import Vector, angles_of, flip, from_wire, swap, yaw_between
-from skyloop.wire.mavlink.codec import Message
+from skyloop.vehicles.mavlink.emulator.places import on_earth, place_of
+from skyloop.vehicles.mavlink.wire.axes import Vector, angles_of, flip, from_wire, swap, yaw_between
+from skyloop.vehicles.mavlink.wire.codec import Message
 
 WORLD: Final = 1  #: MAV_FRAME_LOCAL_NED
 WORLD_OFFSET: Final = 7

@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from skyloop.messages.earth import EarthOrigin
-from skyloop.wire.mavlink.axes import Vector
+from skyloop.vehicles.mavlink.wire.axes import Vector
 
 ORIGIN: Final = EarthOrigin(47.397742, 8.545594, 488.0, math.degrees(111_320.0))
 

@@ -1,5 +1,5 @@
 """``mavlink://…``: ArduCopter and PX4 multirotors."""
 
-from skyloop.drivers.mavlink.driver import MavlinkDriver
+from skyloop.vehicles.mavlink.driver import MavlinkDriver
 
 __all__ = ["MavlinkDriver"]

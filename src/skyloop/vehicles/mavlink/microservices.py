@@ -11,15 +11,15 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.live_clock import LiveClock
-from skyloop.drivers.mavlink.options import Peer, PoseMessage
-from skyloop.drivers.mavlink.telemetry import Telemetry
 from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
 from skyloop.messages import EventKind, Severity, Value
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.wire.mavlink.axes import angles_of, swap, to_wire, yaw_between
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import Autopilot
+from skyloop.vehicles.mavlink.options import Peer, PoseMessage
+from skyloop.vehicles.mavlink.telemetry import Telemetry
+from skyloop.vehicles.mavlink.wire.axes import angles_of, swap, to_wire, yaw_between
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import Autopilot
 
 MOVED_NS: Final = nanoseconds(0.3)  #: a vehicle that is silent for so long may go on from another port
 MOST_OTHERS: Final = 16  #: other vehicles that are reported; a hostile sender can make up any number

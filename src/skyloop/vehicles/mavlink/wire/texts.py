@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from skyloop.wire.mavlink.codec import Message, dialect
+from skyloop.vehicles.mavlink.wire.codec import Message, dialect
 
 CHUNK: Final = 50
 _MOST_OPEN: Final = 8  #: texts that are begun and not ended: the oldest is given out as it is

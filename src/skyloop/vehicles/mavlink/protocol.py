@@ -8,8 +8,13 @@ from typing import Final, NamedTuple
 from skyloop.clock import nanoseconds
 from skyloop.drivers.byte_stream import Rank
 from skyloop.drivers.link_reasons import LinkTrouble, serial_trouble, trouble_of
-from skyloop.drivers.mavlink.autopilots import AutopilotProfile, profile_of
-from skyloop.drivers.mavlink.microservices import (
+from skyloop.drivers.motor_stop import MotorStop
+from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, VehicleEvent, VehicleSession
+from skyloop.errors import DriverError
+from skyloop.messages import AnyAction, EmergencyStop, EventKind, FlightState, Idle, LinkState, Severity, Takeoff, Value
+from skyloop.messages.feedback import WAKING_UP
+from skyloop.vehicles.mavlink.autopilots import AutopilotProfile, profile_of
+from skyloop.vehicles.mavlink.microservices import (
     CommandSender,
     MessageIntervals,
     VehicleClock,
@@ -18,19 +23,14 @@ from skyloop.drivers.mavlink.microservices import (
     VehicleSelector,
     unsupported_reason,
 )
-from skyloop.drivers.mavlink.options import ConnectionKind, MavlinkOptions, Peer, limits_text, takeoff_height
-from skyloop.drivers.mavlink.parameters import ParameterExchange
-from skyloop.drivers.mavlink.setpoints import CUT, SetpointController
-from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
-from skyloop.drivers.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
-from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, VehicleEvent, VehicleSession
-from skyloop.errors import DriverError
-from skyloop.messages import AnyAction, EmergencyStop, EventKind, FlightState, Idle, LinkState, Severity, Takeoff, Value
-from skyloop.messages.feedback import WAKING_UP
-from skyloop.wire.mavlink.codec import Codec, Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.parameter_values import BYTEWISE
+from skyloop.vehicles.mavlink.options import ConnectionKind, MavlinkOptions, Peer, limits_text, takeoff_height
+from skyloop.vehicles.mavlink.parameters import ParameterExchange
+from skyloop.vehicles.mavlink.setpoints import CUT, SetpointController
+from skyloop.vehicles.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.parameter_values import BYTEWISE
+from skyloop.vehicles.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
 
 TICK_NS: Final = nanoseconds(0.02)
 REST_NS: Final = nanoseconds(0.1)  #: the same while nothing is under way: for silence, heartbeats and requests

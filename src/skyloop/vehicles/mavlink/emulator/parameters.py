@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from skyloop.emulators.mavlink.links import Port
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.parameter_values import REAL32, bounds, from_field, is_integer, to_field
+from skyloop.vehicles.mavlink.emulator.links import Port
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.parameter_values import REAL32, bounds, from_field, is_integer, to_field
 
 AT_ONCE: Final = 16  #: parameters of a list that go out with each report
 INT8: Final = 2

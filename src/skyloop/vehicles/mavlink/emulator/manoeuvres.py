@@ -9,9 +9,9 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.emulators.flight import USUAL, YAW_GAIN_PER_S, FlightControl, Speeds
-from skyloop.emulators.mavlink.setpoints import AttitudeTarget, Target
 from skyloop.messages.geometry import clamped, wrap_angle
-from skyloop.wire.mavlink.axes import Vector
+from skyloop.vehicles.mavlink.emulator.setpoints import AttitudeTarget, Target
+from skyloop.vehicles.mavlink.wire.axes import Vector
 
 _THERE_M: Final = 0.3
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import Final
 
 from skyloop.messages.earth import EarthOrigin
-from skyloop.wire.mavlink.axes import Vector, swap
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.axes import Vector, swap
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 ORIGIN: Final = "GPS_GLOBAL_ORIGIN"  #: says where the autopilot's axes begin
 ORIGIN_HZ: Final = 1.0

@@ -6,8 +6,9 @@ import math
 from typing import ClassVar, Final
 
 from skyloop.emulators.flight import USUAL, Speeds
-from skyloop.emulators.mavlink import parameters
-from skyloop.emulators.mavlink.autopilot import (
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.vehicles.mavlink.emulator import parameters
+from skyloop.vehicles.mavlink.emulator.autopilot import (
     ACCEPTED,
     CRITICAL,
     DENIED,
@@ -18,10 +19,10 @@ from skyloop.emulators.mavlink.autopilot import (
     Autopilot,
     whole,
 )
-from skyloop.emulators.mavlink.links import Port
-from skyloop.emulators.mavlink.parameters import ParameterTable
-from skyloop.emulators.mavlink.places import ORIGIN, place_of
-from skyloop.emulators.mavlink.setpoints import (
+from skyloop.vehicles.mavlink.emulator.links import Port
+from skyloop.vehicles.mavlink.emulator.parameters import ParameterTable
+from skyloop.vehicles.mavlink.emulator.places import ORIGIN, place_of
+from skyloop.vehicles.mavlink.emulator.setpoints import (
     BODY,
     WORLD,
     AttitudeTarget,
@@ -30,12 +31,11 @@ from skyloop.emulators.mavlink.setpoints import (
     global_target_of,
     target_of,
 )
-from skyloop.emulators.vehicle import Vehicle
-from skyloop.wire.mavlink.axes import yaw_between
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import PX4_MODES, px4_custom
-from skyloop.wire.mavlink.modes import Autopilot as Number
+from skyloop.vehicles.mavlink.wire.axes import yaw_between
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import PX4_MODES, px4_custom
+from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
 SINK_IN_POSCTL_M_S: Final = -0.7  #: without a remote control
 _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")

@@ -2,7 +2,7 @@
 
 On free ports of this machine, for a test::
 
-    from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+    from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
     from skyloop.sim.host import SimHost
     from skyloop.sim.options import SimOptions
 
@@ -13,8 +13,8 @@ On free ports of this machine, for a test::
 What the two do differently is what was observed on the real ones; ``docs/mavlink.md`` has it as a table.
 """
 
-from skyloop.emulators.mavlink.emulator import MavlinkFirmware
-from skyloop.emulators.mavlink.settings import Kind, Ports, with_multirotors
 from skyloop.faults import Faults
+from skyloop.vehicles.mavlink.emulator.emulator import MavlinkFirmware
+from skyloop.vehicles.mavlink.emulator.settings import Kind, Ports, with_multirotors
 
 __all__ = ["Faults", "Kind", "MavlinkFirmware", "Ports", "with_multirotors"]

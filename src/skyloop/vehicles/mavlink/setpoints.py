@@ -1,7 +1,7 @@
 """Turns the last decided action into the messages that are due at each tick. Pure.
 
 Set-points are streamed while somebody is at the controls, and only in the mode that follows them. A failsafe, a lost
-link and somebody else's change of mode (see :mod:`~skyloop.drivers.mavlink.ownership`) end the stream: from then on
+link and somebody else's change of mode (see :mod:`~skyloop.vehicles.mavlink.ownership`) end the stream: from then on
 only the vehicle's own safety nets fly it.
 """
 
@@ -12,21 +12,6 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.mavlink.autopilots import AutopilotProfile, ThrustModel
-from skyloop.drivers.mavlink.manoeuvres import (
-    ARMED_NS,
-    STRAYED_NS,
-    AttitudeSetpoint,
-    PositionHold,
-    PositionSetpoint,
-    Setpoint,
-    TakeoffSequence,
-    VelocitySetpoint,
-    velocity_message,
-)
-from skyloop.drivers.mavlink.microservices import CommandSender, VehicleCommand
-from skyloop.drivers.mavlink.ownership import FlightOwnership
-from skyloop.drivers.mavlink.telemetry import VehicleState
 from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.vehicle_session import KEPT_NS, VehicleEvent
 from skyloop.errors import DriverError
@@ -46,9 +31,24 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.wire.mavlink.codec import Message
-from skyloop.wire.mavlink.codec import dialect as m
-from skyloop.wire.mavlink.modes import Landed
+from skyloop.vehicles.mavlink.autopilots import AutopilotProfile, ThrustModel
+from skyloop.vehicles.mavlink.manoeuvres import (
+    ARMED_NS,
+    STRAYED_NS,
+    AttitudeSetpoint,
+    PositionHold,
+    PositionSetpoint,
+    Setpoint,
+    TakeoffSequence,
+    VelocitySetpoint,
+    velocity_message,
+)
+from skyloop.vehicles.mavlink.microservices import CommandSender, VehicleCommand
+from skyloop.vehicles.mavlink.ownership import FlightOwnership
+from skyloop.vehicles.mavlink.telemetry import VehicleState
+from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import dialect as m
+from skyloop.vehicles.mavlink.wire.modes import Landed
 
 FORCE: Final = 21196.0  #: "even in flight", of the command to disarm
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
