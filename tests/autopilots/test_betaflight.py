@@ -16,8 +16,8 @@ from skyloop.autopilots.betaflight import LEAST_SPACING_S, SETTINGS, VARIABLE, B
 from skyloop.autopilots.coupling import STOPPED
 from skyloop.autopilots.ports import bound
 from skyloop.autopilots.program import FirmwareEventKind
-from skyloop.drivers.msp.firmware import LONG_DELAY_S
 from skyloop.errors import UsageError
+from skyloop.vehicles.msp.firmware import LONG_DELAY_S
 from tests.autopilots.rig import COMMANDS, FIX, Rig, flying, program
 
 pytestmark = pytest.mark.process

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from skyloop.cli import checkup
-from skyloop.emulators.msp import BetaflightFirmware
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.vehicles.msp.emulator import BetaflightFirmware
 from tests.cli.conftest import Run
 from tests.drivers.msp.rig import world
 

@@ -9,7 +9,6 @@ from types import ModuleType
 import pytest
 
 from skyloop.cockpit.server import _LARGEST_MESSAGE
-from skyloop.drivers.msp import options as msp_options
 from skyloop.drivers.replay import options as replay_options
 from skyloop.drivers.ros2 import options as ros2_options
 from skyloop.drivers.sim import options as sim_options
@@ -27,6 +26,7 @@ from skyloop.transport.local.frame_exchange import MAX_LEASES
 from skyloop.transport.local.server import MAX_CLIENTS
 from skyloop.vehicles.ardrone import options as ardrone_options
 from skyloop.vehicles.mavlink import options as mavlink_options
+from skyloop.vehicles.msp import options as msp_options
 from skyloop.vehicles.tello import options as tello_options
 from tests.docs.pages import ROOT, rows, section
 

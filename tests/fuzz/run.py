@@ -15,7 +15,7 @@ PACKAGES = {
     "ardrone": ["skyloop.vehicles.ardrone.wire"],
     "tello": ["skyloop.vehicles.tello.wire"],
     "mavlink": ["skyloop.vehicles.mavlink.wire"],
-    "msp": ["skyloop.wire.msp"],
+    "msp": ["skyloop.vehicles.msp.wire"],
     "vrpn": ["skyloop.wire.vrpn", "skyloop.motion_capture.vrpn"],
     "recording": ["skyloop.logfile", "mcap"],
     "files": ["skyloop.sim", "skyloop.calibration", "skyloop.zones", "skyloop.drivers.uri", "tomllib"],

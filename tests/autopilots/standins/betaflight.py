@@ -11,9 +11,9 @@ import threading
 import time
 from pathlib import Path
 
+from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
+from skyloop.vehicles.msp.wire.messages import Function
 from skyloop.wire.betaflight_sitl import decode_state, encode_motors
-from skyloop.wire.msp.frames import Direction, Frame, encode
-from skyloop.wire.msp.messages import Function
 
 API_VERSION = encode(Frame(Function.API_VERSION))
 

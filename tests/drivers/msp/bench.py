@@ -9,12 +9,8 @@ from typing import Final
 
 from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.msp.options import MspOptions, options_of
-from skyloop.drivers.msp.protocol import MspSession
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.msp.board import Board
-from skyloop.emulators.msp.settings import RACER, BoardSettings
 from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.messages import Attitude, Feedback
 from skyloop.sim.dynamics import STEP_S
@@ -22,7 +18,11 @@ from skyloop.sim.host import Report
 from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
-from skyloop.wire.msp.frames import Direction, Frame, Parser, encode
+from skyloop.vehicles.msp.emulator.board import Board
+from skyloop.vehicles.msp.emulator.settings import RACER, BoardSettings
+from skyloop.vehicles.msp.options import MspOptions, options_of
+from skyloop.vehicles.msp.protocol import MspSession
+from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 
 TICK_S: Final = 0.008
 POSE_TICKS: Final = 2

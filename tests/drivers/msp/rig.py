@@ -7,11 +7,11 @@ import time
 from collections.abc import Callable
 
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.msp import MspDriver
-from skyloop.emulators.msp import BetaflightFirmware, with_racers
 from skyloop.errors import DriverError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.msp import MspDriver
+from skyloop.vehicles.msp.emulator import BetaflightFirmware, with_racers
 
 POSE_S = 0.01
 

@@ -14,8 +14,8 @@ from typing import IO, Final
 
 from skyloop.autopilots.betaflight import connected, program_path
 from skyloop.autopilots.prompt import become_prompt
-from skyloop.wire.msp.frames import Frame, encode
-from skyloop.wire.msp.messages import Function
+from skyloop.vehicles.msp.wire.frames import Frame, encode
+from skyloop.vehicles.msp.wire.messages import Function
 
 MSP_PORT: Final = 5761  # all its ports are constants
 _STATE, _MOTORS = 9003, 9002

@@ -9,22 +9,22 @@ import pytest
 
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.msp import MspDriver
-from skyloop.drivers.msp.firmware import Setup, hindrances
-from skyloop.drivers.msp.motion import MotionEstimate
-from skyloop.drivers.msp.options import options_of
-from skyloop.drivers.msp.parameters import DriverParameters
-from skyloop.drivers.msp.protocol import MspSession
-from skyloop.drivers.msp.requests import PATIENCE_NS, Questions, Telemetry
-from skyloop.drivers.msp.setpoints import Phase, Report, SetpointController
-from skyloop.drivers.msp.telemetry import charge_left
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, ParameterError, UnknownNameError, UsageError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, LinkState, ResetEmergency, Takeoff
-from skyloop.wire.msp import messages as msp
-from skyloop.wire.msp.frames import Direction, Frame, Parser, encode
-from skyloop.wire.msp.messages import Function, Identity, ModeRange
+from skyloop.vehicles.msp import MspDriver
+from skyloop.vehicles.msp.firmware import Setup, hindrances
+from skyloop.vehicles.msp.motion import MotionEstimate
+from skyloop.vehicles.msp.options import options_of
+from skyloop.vehicles.msp.parameters import DriverParameters
+from skyloop.vehicles.msp.protocol import MspSession
+from skyloop.vehicles.msp.requests import PATIENCE_NS, Questions, Telemetry
+from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
+from skyloop.vehicles.msp.telemetry import charge_left
+from skyloop.vehicles.msp.wire import messages as msp
+from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
+from skyloop.vehicles.msp.wire.messages import Function, Identity, ModeRange
 
 # Addresses -----------------------------------------------------------------------------------------------------------
 

@@ -12,16 +12,16 @@ from typing import Final
 
 import pytest
 
-from skyloop.drivers.msp import MspDriver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.msp import BetaflightFirmware
-from skyloop.emulators.msp.board import bit
 from skyloop.errors import DriverError
 from skyloop.messages import Attitude, FlightState, LinkState, Takeoff
-from skyloop.wire.msp.frames import Frame, Parser, encode
-from skyloop.wire.msp.messages import Function, Status, channels, pack_channels
-from skyloop.wire.msp.names import flag_names
+from skyloop.vehicles.msp import MspDriver
+from skyloop.vehicles.msp.emulator import BetaflightFirmware
+from skyloop.vehicles.msp.emulator.board import bit
+from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
+from skyloop.vehicles.msp.wire.messages import Function, Status, channels, pack_channels
+from skyloop.vehicles.msp.wire.names import flag_names
 from tests.autopilots.real_betaflight import real_betaflight
 from tests.drivers.msp.rig import world
 from tests.drivers.msp.sitl import MSP_PORT, Sitl

@@ -15,13 +15,13 @@ from unittest.mock import create_autospec
 import pytest
 
 from skyloop.drivers.byte_stream import END_S, Rank, TcpStream
-from skyloop.drivers.msp import MspDriver
-from skyloop.drivers.msp.link import MspLink
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.msp import BetaflightFirmware
 from skyloop.errors import MissingExtraError
 from skyloop.messages import Attitude, EmergencyStop, Idle, LinkState, ResetEmergency
+from skyloop.vehicles.msp import MspDriver
+from skyloop.vehicles.msp.emulator import BetaflightFirmware
+from skyloop.vehicles.msp.link import MspLink
 from tests.drivers.msp.bench import Bench
 from tests.drivers.msp.rig import world
 

@@ -9,7 +9,7 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import VehicleUri, parse_uri
-from skyloop.emulators.msp import BetaflightFirmware
+from skyloop.vehicles.msp.emulator import BetaflightFirmware
 from tests.drivers.msp.rig import Cameras, SeenDriver, world
 
 

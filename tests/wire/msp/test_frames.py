@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from skyloop.wire.msp.frames import MOST, Direction, Frame, Parser, crc8, encode, xor
+from skyloop.vehicles.msp.wire.frames import MOST, Direction, Frame, Parser, crc8, encode, xor
 
 directions = st.sampled_from(Direction)
 frames = st.one_of(

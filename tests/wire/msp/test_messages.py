@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.wire.msp import curves
-from skyloop.wire.msp import messages as msp
-from skyloop.wire.msp.messages import Sensor, Status
-from skyloop.wire.msp.names import explained, flag_names
+from skyloop.vehicles.msp.wire import curves
+from skyloop.vehicles.msp.wire import messages as msp
+from skyloop.vehicles.msp.wire.messages import Sensor, Status
+from skyloop.vehicles.msp.wire.names import explained, flag_names
 
 #: What Betaflight 4.6.0's own simulation answered, at rest and not set up.
 STATUS_EX = bytes.fromhex("7d0000002300000000000000000400001d0403000000000004")

@@ -10,22 +10,22 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.link_reasons import LinkTrouble, serial_trouble
-from skyloop.drivers.msp.firmware import SUPPORTED, Setup, hindrances
-from skyloop.drivers.msp.identification import Identification
-from skyloop.drivers.msp.motion import MotionEstimate
-from skyloop.drivers.msp.options import MspOptions
-from skyloop.drivers.msp.requests import Questions, Telemetry
-from skyloop.drivers.msp.setpoints import PASSING, Phase, Report, SetpointController
-from skyloop.drivers.msp.telemetry import Reported, feedback_of
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
 from skyloop.messages.checkup import Diagnostic
 from skyloop.messages.feedback import WAKING_UP
-from skyloop.wire.msp import messages as msp
-from skyloop.wire.msp.frames import Direction, Frame, Parser, encode
-from skyloop.wire.msp.messages import BETAFLIGHT, INAV, Function, Sensor
-from skyloop.wire.msp.names import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
+from skyloop.vehicles.msp.firmware import SUPPORTED, Setup, hindrances
+from skyloop.vehicles.msp.identification import Identification
+from skyloop.vehicles.msp.motion import MotionEstimate
+from skyloop.vehicles.msp.options import MspOptions
+from skyloop.vehicles.msp.requests import Questions, Telemetry
+from skyloop.vehicles.msp.setpoints import PASSING, Phase, Report, SetpointController
+from skyloop.vehicles.msp.telemetry import Reported, feedback_of
+from skyloop.vehicles.msp.wire import messages as msp
+from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
+from skyloop.vehicles.msp.wire.names import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
 
 DEGRADED_NS: Final = nanoseconds(0.4)
 LOST_NS: Final = nanoseconds(1.0)

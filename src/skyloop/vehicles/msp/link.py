@@ -10,9 +10,9 @@ from typing import Final
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.byte_stream import END_S, ByteStream, Rank, SerialStream, TcpStream
-from skyloop.drivers.msp.protocol import MspSession
 from skyloop.drivers.vehicle_link import ConnectionLink
 from skyloop.drivers.vehicle_session import SinkCallback
+from skyloop.vehicles.msp.protocol import MspSession
 
 EXTRA: Final = "msp"
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from skyloop.drivers.msp.motion import Motion
 from skyloop.messages import Feedback, FlightState, Value
-from skyloop.wire.msp.messages import Altitude, Attitude, Battery, CellVoltages, Status
+from skyloop.vehicles.msp.motion import Motion
+from skyloop.vehicles.msp.wire.messages import Altitude, Attitude, Battery, CellVoltages, Status
 
 
 @dataclass(slots=True)

@@ -7,8 +7,8 @@ from typing import Final
 
 from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import VehicleParameters
-from skyloop.wire.msp.curves import AxisRates, Rates
-from skyloop.wire.msp.messages import FailsafeConfig, ModeRange, OnLoss
+from skyloop.vehicles.msp.wire.curves import AxisRates, Rates
+from skyloop.vehicles.msp.wire.messages import FailsafeConfig, ModeRange, OnLoss
 
 PORT: Final = 5761  #: of the first serial port of Betaflight's own simulation
 CHANNELS: Final = 18

@@ -8,12 +8,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from skyloop.drivers.msp.firmware import Setup
-from skyloop.drivers.msp.requests import Questions
 from skyloop.errors import DecodeError
-from skyloop.wire.msp import messages as msp
-from skyloop.wire.msp.curves import betaflight_rates
-from skyloop.wire.msp.messages import BETAFLIGHT, INAV, Function
+from skyloop.vehicles.msp.firmware import Setup
+from skyloop.vehicles.msp.requests import Questions
+from skyloop.vehicles.msp.wire import messages as msp
+from skyloop.vehicles.msp.wire.curves import betaflight_rates
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function
 
 _INAV_TUNING: Final = 7  # bytes of RC_TUNING up to the yaw rate
 _MSP_RECEIVER: Final = 2  # INAV's receiver_type

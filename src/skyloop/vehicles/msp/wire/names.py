@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from skyloop.wire.msp.messages import INAV
+from skyloop.vehicles.msp.wire.messages import INAV
 
 #: Betaflight 4.1 (API 1.42) on, from bit 0; ARM_SWITCH is always the last of those that a version has.
 BETAFLIGHT_FLAGS: Final = (

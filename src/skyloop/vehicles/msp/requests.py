@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.wire.msp.frames import Direction, Frame
-from skyloop.wire.msp.messages import Function, multiple
+from skyloop.vehicles.msp.wire.frames import Direction, Frame
+from skyloop.vehicles.msp.wire.messages import Function, multiple
 
 PATIENCE_NS: Final = nanoseconds(0.5)  #: an answer that has not come by then is lost
 TRIES: Final = 3

@@ -6,16 +6,16 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, ExternalPose, Sink
-from skyloop.drivers.msp.link import EXTRA, MspLink
-from skyloop.drivers.msp.options import options_of
-from skyloop.drivers.msp.parameters import DriverParameters
-from skyloop.drivers.msp.protocol import MspSession
-from skyloop.drivers.msp.setpoints import SetpointController
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, MissingExtraError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Parameter, Refusal, Takeoff, Value
 from skyloop.messages.checkup import Diagnostic
+from skyloop.vehicles.msp.link import EXTRA, MspLink
+from skyloop.vehicles.msp.options import options_of
+from skyloop.vehicles.msp.parameters import DriverParameters
+from skyloop.vehicles.msp.protocol import MspSession
+from skyloop.vehicles.msp.setpoints import SetpointController
 
 ACTIONS: Final = frozenset({"idle", "attitude", "emergency_stop", "reset_emergency"})
 

@@ -11,7 +11,10 @@ from typing import Final
 
 from skyloop.clock import nanoseconds
 from skyloop.emulators.flight import FlightControl
-from skyloop.emulators.msp.settings import (
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.messages.earth import EarthOrigin
+from skyloop.sim.host import Report
+from skyloop.vehicles.msp.emulator.settings import (
     BOXES,
     CELLS,
     CHANNELS,
@@ -20,13 +23,10 @@ from skyloop.emulators.msp.settings import (
     THRUST_POWER,
     BoardSettings,
 )
-from skyloop.emulators.vehicle import Vehicle
-from skyloop.messages.earth import EarthOrigin
-from skyloop.sim.host import Report
-from skyloop.wire.msp import messages as msp
-from skyloop.wire.msp.curves import pack_betaflight_rates, rate_curve, share_of
-from skyloop.wire.msp.frames import Direction, Frame
-from skyloop.wire.msp.messages import (
+from skyloop.vehicles.msp.wire import messages as msp
+from skyloop.vehicles.msp.wire.curves import pack_betaflight_rates, rate_curve, share_of
+from skyloop.vehicles.msp.wire.frames import Direction, Frame
+from skyloop.vehicles.msp.wire.messages import (
     ANGLE_LIMIT_AT,
     BETAFLIGHT,
     RX_MSP,
@@ -37,7 +37,7 @@ from skyloop.wire.msp.messages import (
     Sensor,
     Status,
 )
-from skyloop.wire.msp.names import ARM_SWITCH, BETAFLIGHT_FLAGS
+from skyloop.vehicles.msp.wire.names import ARM_SWITCH, BETAFLIGHT_FLAGS
 
 API: Final = (1, 47)
 VERSION: Final = (4, 6, 0)

@@ -8,12 +8,12 @@ from skyloop.clock import monotonic_ns
 from skyloop.emulators.byte_server import ByteServer
 from skyloop.emulators.emulator import Emulator, RunningEmulator
 from skyloop.emulators.loop import Loop
-from skyloop.emulators.msp.board import Board
-from skyloop.emulators.msp.settings import PORT, BoardSettings
 from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
-from skyloop.wire.msp.frames import Parser, encode
+from skyloop.vehicles.msp.emulator.board import Board
+from skyloop.vehicles.msp.emulator.settings import PORT, BoardSettings
+from skyloop.vehicles.msp.wire.frames import Parser, encode
 
 USUAL: Final = BoardSettings()
 

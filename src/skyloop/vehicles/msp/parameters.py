@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
-from skyloop.drivers.msp.firmware import MOST_AUX
-from skyloop.drivers.msp.setpoints import Gains, Limits, SetpointController
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
+from skyloop.vehicles.msp.firmware import MOST_AUX
+from skyloop.vehicles.msp.setpoints import Gains, Limits, SetpointController
 
 AUTOMATIC: Final = 0  #: of an AUX channel: as the modes need it
 _LIMITS: Final = (

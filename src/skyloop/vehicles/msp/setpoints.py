@@ -14,14 +14,14 @@ from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.msp.firmware import Setup
-from skyloop.drivers.msp.motion import Motion
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Idle, ResetEmergency, Severity
 from skyloop.messages.geometry import clamped
-from skyloop.wire.msp.curves import Curve, stick_for
-from skyloop.wire.msp.names import ARM_SWITCH, explained
+from skyloop.vehicles.msp.firmware import Setup
+from skyloop.vehicles.msp.motion import Motion
+from skyloop.vehicles.msp.wire.curves import Curve, stick_for
+from skyloop.vehicles.msp.wire.names import ARM_SWITCH, explained
 
 GRAVITY_M_S2: Final = 9.80665
 LEVEL: Final = Attitude()

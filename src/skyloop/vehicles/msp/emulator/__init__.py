@@ -2,7 +2,7 @@
 
 For a test::
 
-    from skyloop.emulators.msp import BetaflightFirmware, with_racers
+    from skyloop.vehicles.msp.emulator import BetaflightFirmware, with_racers
     from skyloop.sim.host import SimHost
     from skyloop.sim.options import SimOptions
 
@@ -15,7 +15,7 @@ Its barometer and GPS are those of the simulated vehicle. It answers what a driv
 ``docs/msp.md`` asks for.
 """
 
-from skyloop.emulators.msp.emulator import BetaflightFirmware
-from skyloop.emulators.msp.settings import BoardSettings, with_racers
+from skyloop.vehicles.msp.emulator.emulator import BetaflightFirmware
+from skyloop.vehicles.msp.emulator.settings import BoardSettings, with_racers
 
 __all__ = ["BetaflightFirmware", "BoardSettings", "with_racers"]

@@ -13,7 +13,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import ExternalPose
 from skyloop.messages.earth import EarthOrigin
 from skyloop.messages.geometry import wrap_angle
-from skyloop.wire.msp.messages import Altitude, Attitude, Gps
+from skyloop.vehicles.msp.wire.messages import Altitude, Attitude, Gps
 
 Vector = tuple[float, float, float]
 

@@ -9,8 +9,8 @@ from itertools import pairwise
 from typing import Final
 
 from skyloop.messages.checkup import Diagnostic
-from skyloop.wire.msp.curves import Curve, Rates, inav_curve, rate_curve, share_of
-from skyloop.wire.msp.messages import (
+from skyloop.vehicles.msp.wire.curves import Curve, Rates, inav_curve, rate_curve, share_of
+from skyloop.vehicles.msp.wire.messages import (
     BETAFLIGHT,
     INAV,
     RX_MSP,
@@ -22,7 +22,7 @@ from skyloop.wire.msp.messages import (
     OnLoss,
     RxConfig,
 )
-from skyloop.wire.msp.names import ANGLE, ARM, MSP_OVERRIDE, PREARM
+from skyloop.vehicles.msp.wire.names import ANGLE, ARM, MSP_OVERRIDE, PREARM
 
 SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: channels beside the sticks that are always sent
