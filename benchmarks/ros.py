@@ -26,7 +26,7 @@ from skyloop.bench import Machine
 from skyloop.client import Drone, connect
 from skyloop.errors import NoAnswerError, UnsupportedError
 from skyloop.messages import Applied, Velocity
-from skyloop.ros_node import LOOPBACK_PROFILE, PROFILES_VARIABLE
+from skyloop.vehicles.ros2.node import LOOPBACK_PROFILE, PROFILES_VARIABLE
 
 ADDRESS: Final = "sim://?world=room&seed=0"
 PERIOD_S: Final = 1 / 32  #: of velocities, as in ``ros_probe.py``

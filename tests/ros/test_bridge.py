@@ -20,7 +20,8 @@ from skyloop.proxy.proxy import Proxy
 from skyloop.ros import Bridge, Settings
 from skyloop.ros.names import Frames, namespaces_of
 from skyloop.ros.tf_type import tf_message_type
-from skyloop.ros_node import (
+from skyloop.transport.memory import MemoryServer
+from skyloop.vehicles.ros2.node import (
     DISCOVERY_VARIABLES,
     OLD_PROFILES_VARIABLE,
     PROFILES_VARIABLE,
@@ -28,7 +29,6 @@ from skyloop.ros_node import (
     ros_name,
     stay_on_this_machine,
 )
-from skyloop.transport.memory import MemoryServer
 from tests.integration.fake_vehicle import FakeVehicle
 from tests.ros.fake_rclpy import Fake, Message, Node
 

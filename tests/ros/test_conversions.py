@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from skyloop.errors import DecodeError
 from skyloop.messages import Encoding, Intrinsics
 from skyloop.messages.geometry import quaternion_from_euler, rotation_from_euler
-from skyloop.vision import unproject
-from skyloop.wire.ros2.conversions import (
+from skyloop.vehicles.ros2.wire.conversions import (
     ENCODINGS,
     NOT_KNOWN,
     ClockMap,
@@ -34,7 +33,8 @@ from skyloop.wire.ros2.conversions import (
     rotation_of,
     stamp_of,
 )
-from skyloop.wire.ros2.tf_message import Transform, encode_transforms
+from skyloop.vehicles.ros2.wire.tf_message import Transform, encode_transforms
+from skyloop.vision import unproject
 
 ANGLE = st.floats(-math.pi, math.pi)
 TILT = st.floats(-1.5, 1.5)

@@ -12,14 +12,14 @@ import pytest
 
 from skyloop.clock import ManualClock
 from skyloop.drivers.recording_sink import RecordingSink
-from skyloop.drivers.ros2 import Ros2Driver
-from skyloop.drivers.ros2.options import Options, options_of
-from skyloop.drivers.ros2.protocol import ANSWER_S, RobotSession
-from skyloop.drivers.ros2.telemetry import CaptureClock, battery_of, state_of
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Encoding, FlightState, Hover, Idle, Land, LinkState, Takeoff, Velocity
 from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.vehicles.ros2 import Ros2Driver
+from skyloop.vehicles.ros2.options import Options, options_of
+from skyloop.vehicles.ros2.protocol import ANSWER_S, RobotSession
+from skyloop.vehicles.ros2.telemetry import CaptureClock, battery_of, state_of
 
 SERVED = "ros2://robot?takeoff=takeoff&land=land&width=4&height=2"
 EPOCH_NS = 1_700_000_000 * 10**9

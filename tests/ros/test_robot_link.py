@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from skyloop.drivers.recording_sink import RecordingSink
-from skyloop.drivers.ros2 import Ros2Driver
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError
 from skyloop.messages import Land, LinkState, Takeoff, Velocity
+from skyloop.vehicles.ros2 import Ros2Driver
 from tests.ros.fake_rclpy import Fake, Node
 from tests.ros.test_robot import image, odometry
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from skyloop.ros_node import LOOPBACK_PROFILE, OLD_PROFILES_VARIABLE, PROFILES_VARIABLE
+from skyloop.vehicles.ros2.node import LOOPBACK_PROFILE, OLD_PROFILES_VARIABLE, PROFILES_VARIABLE
 from tests.third_party.conftest import HERE, absent
 
 SECONDS = 30.0

@@ -50,7 +50,7 @@ def ros(
     otherwise. Leaving lands what it flies.
     """
     from skyloop.ros import Bridge, Settings
-    from skyloop.ros_node import domain_of
+    from skyloop.vehicles.ros2.node import domain_of
 
     join_network(network, keys)
     settings = Settings(

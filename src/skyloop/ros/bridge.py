@@ -20,7 +20,7 @@ from skyloop.ros.pilot import Pilot
 from skyloop.ros.telemetry import Telemetry
 from skyloop.ros.time import RosTime
 from skyloop.ros.video import CameraPublisher
-from skyloop.ros_node import RosContext, require_rclpy, stay_on_this_machine
+from skyloop.vehicles.ros2.node import RosContext, require_rclpy, stay_on_this_machine
 from skyloop.warmth import PERIOD_S
 
 PURPOSE: Final = "the bridge to ROS 2"

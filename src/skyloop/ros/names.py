@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from skyloop.errors import UsageError
-from skyloop.ros_node import ros_name
+from skyloop.vehicles.ros2.node import ros_name
 
 
 @dataclass(frozen=True, slots=True)

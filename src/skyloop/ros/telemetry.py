@@ -11,8 +11,15 @@ from skyloop.messages import CameraInfo, Feedback, LinkState
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.ros.names import Frames
 from skyloop.ros.time import RosTime
-from skyloop.wire.ros2.conversions import VARIANCE, Quaternion, body_velocity, covariance, quaternion_of, stamp_of
-from skyloop.wire.ros2.tf_message import Transform, encode_transforms
+from skyloop.vehicles.ros2.wire.conversions import (
+    VARIANCE,
+    Quaternion,
+    body_velocity,
+    covariance,
+    quaternion_of,
+    stamp_of,
+)
+from skyloop.vehicles.ros2.wire.tf_message import Transform, encode_transforms
 
 SLOW_NS: Final = 1_000_000_000  #: battery and place on the earth, once in so long
 _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)

@@ -6,7 +6,7 @@ import threading
 from typing import Any
 
 from skyloop.client import Drone
-from skyloop.wire.ros2.conversions import ClockMap
+from skyloop.vehicles.ros2.wire.conversions import ClockMap
 
 
 class RosTime:

@@ -12,8 +12,8 @@ from skyloop.errors import install_command
 from skyloop.messages import CameraInfo
 from skyloop.ros.names import Frames
 from skyloop.ros.time import RosTime
-from skyloop.ros_node import ros_name
-from skyloop.wire.ros2.conversions import camera_model, stamp_of
+from skyloop.vehicles.ros2.node import ros_name
+from skyloop.vehicles.ros2.wire.conversions import camera_model, stamp_of
 
 JPEG_QUALITY: Final = 90
 

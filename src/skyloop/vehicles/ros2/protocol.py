@@ -12,8 +12,6 @@ from typing import Any, Final, Protocol
 
 from skyloop.clock import Clock, nanoseconds, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.ros2.options import Options
-from skyloop.drivers.ros2.telemetry import CaptureClock, battery_of, state_of
 from skyloop.errors import DecodeError, DriverError
 from skyloop.messages import (
     AnyAction,
@@ -30,7 +28,9 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.wire.ros2.conversions import intrinsics_of, nanoseconds_of, pixels_of, skew_of
+from skyloop.vehicles.ros2.options import Options
+from skyloop.vehicles.ros2.telemetry import CaptureClock, battery_of, state_of
+from skyloop.vehicles.ros2.wire.conversions import intrinsics_of, nanoseconds_of, pixels_of, skew_of
 
 PERIOD_S: Final = 0.05  #: a velocity is repeated so often, as robots stop when none comes
 AIRBORNE_M: Final = 0.1  #: a robot that flies is off the ground above this height of its odometry

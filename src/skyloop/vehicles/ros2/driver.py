@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.ros2.link import PURPOSE, RobotLink
-from skyloop.drivers.ros2.options import options_of
-from skyloop.drivers.ros2.protocol import RobotSession
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, Capabilities
-from skyloop.ros_node import require_rclpy
+from skyloop.vehicles.ros2.link import PURPOSE, RobotLink
+from skyloop.vehicles.ros2.node import require_rclpy
+from skyloop.vehicles.ros2.options import options_of
+from skyloop.vehicles.ros2.protocol import RobotSession
 
 _MESSAGES = ("geometry_msgs.msg", "nav_msgs.msg", "sensor_msgs.msg", "std_srvs.srv")
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from skyloop.messages import Vector
-from skyloop.wire.ros2.conversions import Quaternion, stamp_of
+from skyloop.vehicles.ros2.wire.conversions import Quaternion, stamp_of
 
 TYPE_NAME: Final = "tf2_msgs/msg/TFMessage"
 #: Of its definition, by REP 2011; ``tests/third_party/ros2_bag.py`` compares it with that of rosbags.

@@ -10,7 +10,7 @@ from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import CameraInfo, Capabilities, Encoding
-from skyloop.ros_node import MOST_DOMAIN
+from skyloop.vehicles.ros2.node import MOST_DOMAIN
 
 #: Topics and services, by the option that names them; without a slash in front they are below the namespace.
 TOPICS: Final = {"image": "image_raw", "cmd_vel": "cmd_vel", "odom": "odom", "battery": "battery_state"}

@@ -8,12 +8,12 @@ from typing import Any, Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Sink
-from skyloop.drivers.ros2.options import Options
-from skyloop.drivers.ros2.protocol import PERIOD_S, RobotSession
 from skyloop.errors import DriverError
 from skyloop.messages import Velocity
-from skyloop.ros_node import RosContext, stay_on_this_machine
-from skyloop.wire.ros2.conversions import stamp_of
+from skyloop.vehicles.ros2.node import RosContext, stay_on_this_machine
+from skyloop.vehicles.ros2.options import Options
+from skyloop.vehicles.ros2.protocol import PERIOD_S, RobotSession
+from skyloop.vehicles.ros2.wire.conversions import stamp_of
 
 PURPOSE: Final = "a robot of ROS 2"
 
