@@ -10,13 +10,13 @@ from typing import Final, NamedTuple
 from benchmarks.measuring.workers import Pipe
 from skyloop.client import Drone, Frame, connect
 from skyloop.control import Controller
-from skyloop.drivers.sim import SimDriver, options_of
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import AuthorityError, LinkError, NoAnswerError
 from skyloop.messages import Applied, Failsafe, Feedback, FlightState, Velocity
 from skyloop.proxy import Proxy
 from skyloop.sim.host import SimHost
 from skyloop.transport.fabric import FabricServer, FabricSettings
+from skyloop.vehicles.sim import SimDriver, options_of
 
 #: Small pictures: what is measured is not how fast this machine draws.
 VEHICLES: Final = "sim://?world=empty&cameras=front&width=160&height=120&fps=5"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.autopilots.betaflight import program_path
 from skyloop.errors import UsageError
+from skyloop.vehicles.sim.firmware.betaflight import program_path
 
 
 @contextmanager

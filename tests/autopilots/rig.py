@@ -14,9 +14,9 @@ from typing import Any
 import msgspec
 
 import skyloop
-from skyloop.autopilots.coupling import CoupledFirmware
-from skyloop.autopilots.program import FirmwareEvent, FirmwareEventKind
 from skyloop.sim.firmware import GpsFix, Readings
+from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
+from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind
 
 SOURCE = Path(skyloop.__file__).parents[1]
 STANDINS = Path(__file__).parent / "standins"

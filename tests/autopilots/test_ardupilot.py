@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.autopilots import coupling
-from skyloop.autopilots.ardupilot import VARIABLE, ArduCopter
-from skyloop.autopilots.coupling import STOPPED, WAIT_S
-from skyloop.autopilots.program import FirmwareEventKind
 from skyloop.errors import UsageError
+from skyloop.vehicles.sim.firmware import coupling
+from skyloop.vehicles.sim.firmware.ardupilot import VARIABLE, ArduCopter
+from skyloop.vehicles.sim.firmware.coupling import STOPPED, WAIT_S
+from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
 from tests.autopilots.rig import COMMANDS, Rig, flying, program
 
 pytestmark = pytest.mark.process

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.autopilots import apart, betaflight
-from skyloop.autopilots.betaflight import LEAST_SPACING_S, SETTINGS, VARIABLE, Betaflight
-from skyloop.autopilots.coupling import STOPPED
-from skyloop.autopilots.ports import bound
-from skyloop.autopilots.program import FirmwareEventKind
 from skyloop.errors import UsageError
 from skyloop.vehicles.msp.firmware import LONG_DELAY_S
+from skyloop.vehicles.sim.firmware import apart, betaflight
+from skyloop.vehicles.sim.firmware.betaflight import LEAST_SPACING_S, SETTINGS, VARIABLE, Betaflight
+from skyloop.vehicles.sim.firmware.coupling import STOPPED
+from skyloop.vehicles.sim.firmware.ports import bound
+from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
 from tests.autopilots.rig import COMMANDS, FIX, Rig, flying, program
 
 pytestmark = pytest.mark.process

@@ -16,11 +16,11 @@ import pytest
 
 import skyloop
 from benchmarks.autopilots import compared, follow
-from skyloop.autopilots import apart
-from skyloop.autopilots.betaflight import program_path
 from skyloop.control import FIVE_GATES, FlyThroughGates
 from skyloop.errors import NoAnswerError, RefusedError
 from skyloop.messages import Failsafe, FlightState, LinkState
+from skyloop.vehicles.sim.firmware import apart
+from skyloop.vehicles.sim.firmware.betaflight import program_path
 from tests.autopilots.real_betaflight import real_betaflight
 from tests.processes.conftest import Process, eventually, proxy, sockets, start
 from tests.processes.test_pilots import PILOTS
@@ -131,7 +131,7 @@ def _comes_back_after_its_death(drone: skyloop.Drone, folder: Path) -> None:
 
 
 def _survives_a_cut(drone: skyloop.Drone) -> None:
-    """It goes on level, sinking a little, and is flown on: as set up by ``skyloop.autopilots.betaflight.SETTINGS``."""
+    """It goes on level, sinking a little, and is flown on: as set up by ``skyloop.vehicles.sim.firmware.betaflight.SETTINGS``."""
     climb_to(drone, 2.2)
     drone.hover()
     drone.config["sim.link"] = False

@@ -14,8 +14,8 @@ import pytest
 
 import skyloop
 from benchmarks.autopilots import address, compared, fly_square, follow, take_off, wait_ready
-from skyloop.autopilots import ardupilot, px4
 from skyloop.messages import FlightState
+from skyloop.vehicles.sim.firmware import ardupilot, px4
 
 pytestmark = [pytest.mark.process, pytest.mark.slow, pytest.mark.timeout(400)]
 

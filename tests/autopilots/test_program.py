@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.autopilots.program import (
+from skyloop.errors import UsageError
+from skyloop.vehicles.sim.firmware.program import (
     AT_ONCE,
     FirmwareEvent,
     FirmwareEventKind,
@@ -20,7 +21,6 @@ from skyloop.autopilots.program import (
     StartedInVainError,
     find_program,
 )
-from skyloop.errors import UsageError
 
 pytestmark = pytest.mark.process
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from skyloop.autopilots.prompt import NICENESS, SLACK_NS, become_prompt
+from skyloop.vehicles.sim.firmware.prompt import NICENESS, SLACK_NS, become_prompt
 
 
 @pytest.fixture

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.autopilots import coupling, px4
-from skyloop.autopilots.coupling import STOPPED
-from skyloop.autopilots.ports import bound
-from skyloop.autopilots.program import FirmwareEventKind
-from skyloop.autopilots.px4 import STEP_US, STEPS, VARIABLE, Px4
 from skyloop.errors import UsageError
 from skyloop.sim.rotor_parameters import InstrumentParameters
+from skyloop.vehicles.sim.firmware import coupling, px4
+from skyloop.vehicles.sim.firmware.coupling import STOPPED
+from skyloop.vehicles.sim.firmware.ports import bound
+from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
+from skyloop.vehicles.sim.firmware.px4 import STEP_US, STEPS, VARIABLE, Px4
 from tests.autopilots.rig import COMMANDS, FIX, Rig, flying, program
 
 pytestmark = pytest.mark.process

@@ -43,7 +43,7 @@ def test_a_machine_that_is_well(run: Run) -> None:
     assert ended.code == 0, ended.out
     assert "✓ Python: 3." in ended.out
     assert f"sockets in {os.environ['SKYLOOP_RUNTIME_DIR']}" in ended.out
-    assert "driver sim://: skyloop.drivers.sim" in ended.out
+    assert "driver sim://: skyloop.vehicles.sim" in ended.out
     assert "✗" not in ended.out
 
 

@@ -10,7 +10,6 @@ import pytest
 
 from skyloop.cockpit.server import _LARGEST_MESSAGE
 from skyloop.drivers.replay import options as replay_options
-from skyloop.drivers.sim import options as sim_options
 from skyloop.drivers.uri import parse_uri
 from skyloop.drivers.video import options as video_options
 from skyloop.messages import Action, FlightState, Hover, Land, ResetEmergency, Takeoff, Velocity
@@ -27,6 +26,7 @@ from skyloop.vehicles.ardrone import options as ardrone_options
 from skyloop.vehicles.mavlink import options as mavlink_options
 from skyloop.vehicles.msp import options as msp_options
 from skyloop.vehicles.ros2 import options as ros2_options
+from skyloop.vehicles.sim import options as sim_options
 from skyloop.vehicles.tello import options as tello_options
 from tests.docs.pages import ROOT, rows, section
 

@@ -39,7 +39,7 @@ def test_drivers_of_one_scheme_are_looked_up_once(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("skyloop.drivers.registry.entry_points", counted)
     assert len({type(make_driver(f"mavlink://udpin:127.0.0.1:{port}")) for port in range(20_000, 20_020)}) == 1
     assert len(calls) == 1
-    install(site, "later_drone", "laterdrone = skyloop.drivers.sim:SimDriver")
+    install(site, "later_drone", "laterdrone = skyloop.vehicles.sim:SimDriver")
     assert driver_class("laterdrone") is driver_class("sim"), "one that is installed meanwhile is found"
 
 

@@ -13,7 +13,6 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.sim import SimDriver
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import FileFormatError, ParameterError, UnknownNameError, UsageError
 from skyloop.messages import (
@@ -31,6 +30,7 @@ from skyloop.messages import (
 from skyloop.sim import load_world, pacing
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.sim import SimDriver
 
 CALM = "wind=0&noise=0&seed=1"
 

@@ -13,20 +13,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from skyloop.autopilots.ardupilot import VARIABLE
 from skyloop.clock import NS_PER_S, monotonic_ns
 from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.sim import SimDriver, options_of
-from skyloop.drivers.sim.firmware import FirmwareFlight, _InnerSink
-from skyloop.drivers.sim.telemetry import truth_at
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, ParameterError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages import EventKind, Feedback, Hover, Land, LinkState, Takeoff
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
+from skyloop.vehicles.sim import SimDriver, options_of
+from skyloop.vehicles.sim.firmware import FirmwareFlight, _InnerSink
+from skyloop.vehicles.sim.firmware.ardupilot import VARIABLE
+from skyloop.vehicles.sim.telemetry import truth_at
 from tests.autopilots.rig import program
 
 LONG_S = 60.0

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from skyloop.drivers.sim.options import options_of
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from skyloop.messages import (
@@ -28,6 +27,7 @@ from skyloop.sim import Limits, Simulation, VehicleParameters, VehicleTruth, Win
 from skyloop.sim.parameters import GRAVITY_M_S2, with_ideal_sensors
 from skyloop.sim.reports import Occurrence, OccurrenceKind, VehicleFeedback
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
+from skyloop.vehicles.sim.options import options_of
 from tests.sim.helpers import HALL, flying, steps
 
 VEHICLES = [RACER, IRIS, CRAZYFLIE]

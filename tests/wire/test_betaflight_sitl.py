@@ -10,7 +10,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.wire.betaflight_sitl import FlightState, decode_motors, decode_state, encode_motors, encode_state
+from skyloop.vehicles.sim.firmware.betaflight_sitl import (
+    FlightState,
+    decode_motors,
+    decode_state,
+    encode_motors,
+    encode_state,
+)
 
 number = st.floats(allow_nan=False, allow_infinity=False)
 vector = st.tuples(number, number, number)

@@ -149,8 +149,8 @@ def _prepare(fleet: Fleet) -> None:
     """Warn of an open network, and make room for the threads of simulators in this process."""
     from skyloop.cli.network import warn_if_open
     from skyloop.cli.simulating import settle
-    from skyloop.drivers.sim import options_of
     from skyloop.host.vehicle import network_of
+    from skyloop.vehicles.sim import options_of
 
     opened = [vehicle.name for vehicle in fleet.vehicles if (net := network_of(vehicle)) and net.tls is None]
     for vehicle in fleet.vehicles:

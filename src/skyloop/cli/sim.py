@@ -11,7 +11,6 @@ from urllib.parse import urlencode
 
 import typer
 
-from skyloop.autopilots.kinds import AutopilotKind
 from skyloop.cli.firmware import Firmware, Serving, serve
 from skyloop.cli.network import (
     ConnectOption,
@@ -28,6 +27,7 @@ from skyloop.cli.network import (
     warn_if_open,
 )
 from skyloop.errors import UsageError
+from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -171,7 +171,7 @@ def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
     Raises:
         UsageError: An option is not valid, or the drones can't share a world.
     """
-    from skyloop.drivers.sim import options_of
+    from skyloop.vehicles.sim import options_of
 
     if len(uris) > drones:
         raise UsageError(f"--autopilot is given {len(uris)} times for --drones {drones}: give one for each at most")
@@ -189,10 +189,10 @@ def _serve_proxies(
     look: Callable[[], list[str]] | None,
     beside: Beside | None,
 ) -> None:
-    from skyloop.drivers.sim import SimDriver
     from skyloop.proxy import Proxy
     from skyloop.proxy.serve import run
     from skyloop.sim.host import SimHost
+    from skyloop.vehicles.sim import SimDriver
 
     host = SimHost(options, len(names))
     drivers = [SimDriver(uri, host=host, drone=n) for n, uri in zip(range(len(names)), cycle(uris), strict=False)]

@@ -25,7 +25,6 @@ from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.clock import NS_PER_S, ManualClock, nanoseconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.sim import SimDriver, options_of
 from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.errors import UsageError
 from skyloop.messages import AnyAction, Feedback
@@ -36,6 +35,7 @@ from skyloop.stepping.executor import StepExecutor
 from skyloop.stepping.host import SteppedHost
 from skyloop.stepping.scheduler import StepScheduler
 from skyloop.stepping.transport import SteppedServer
+from skyloop.vehicles.sim import SimDriver, options_of
 
 _BEGIN_NS: Final = 10 * NS_PER_S
 _CONNECT_S: Final = 20.0

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import ClassVar, Final
 
-from skyloop.autopilots.program import FirmwareEvent, FirmwareEventKind, Launch, Program
 from skyloop.sim.firmware import Readings
+from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind, Launch, Program
 
 WAIT_S: Final = 0.3  #: longest wait for an answer; after one in vain there is none until it answers
 STOP_S: Final = 0.5  #: of simulated time without an answer until the rotors stop, as speed controllers stop them

@@ -1,8 +1,8 @@
 """Runs a flight firmware as its only child, and ends it when whoever started this process ends.
 
-``python -m skyloop.autopilots.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …``: the firmware's
+``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …``: the firmware's
 process id is written to standard output; what the firmware writes is appended to LOG. With ``--prompt`` it is woken
-before others, with ``--apart`` it gets a network of its own (:mod:`skyloop.autopilots.apart`).
+before others, with ``--apart`` it gets a network of its own (:mod:`skyloop.vehicles.sim.firmware.apart`).
 Exits with the firmware's code, with 128 and the number of the signal that ended it, as a shell does.
 """
 
@@ -16,9 +16,9 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from skyloop.autopilots import apart
-from skyloop.autopilots.prompt import become_prompt
 from skyloop.child_process import on_parent_end
+from skyloop.vehicles.sim.firmware import apart
+from skyloop.vehicles.sim.firmware.prompt import become_prompt
 
 TERMINATE_S: Final = 2.0  #: for the firmware to end by itself
 PROMPT: Final = "--prompt"

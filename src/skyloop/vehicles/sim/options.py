@@ -21,7 +21,6 @@ from dataclasses import replace
 from typing import Final
 from urllib.parse import urlencode
 
-from skyloop.autopilots.kinds import AutopilotKind
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
@@ -29,6 +28,7 @@ from skyloop.sim.camera import BOTTOM_CAMERA, FPV_CAMERA, FRONT_CAMERA, CameraMo
 from skyloop.sim.options import EVERY_ACTION, SimOptions
 from skyloop.sim.pacing import MOST_LAG_S
 from skyloop.sim.vehicles import VEHICLES
+from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA, FPV_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")

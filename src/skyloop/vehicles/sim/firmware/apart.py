@@ -4,7 +4,7 @@ A socket belongs to the network in which it was made, whoever has it. So the fir
 network before it starts the firmware, makes the socket that speaks to the firmware by datagrams, and passes it on. The
 bytes of the firmware's TCP port it carries itself, to and from a listener that it was given.
 
-``python -m skyloop.autopilots.apart`` exits with 0 where a network of one's own can be had.
+``python -m skyloop.vehicles.sim.firmware.apart`` exits with 0 where a network of one's own can be had.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Final
 
-from skyloop.autopilots.ports import LOOPBACK, bound
+from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound
 
 OPTION: Final = "--apart="
 CONNECT_S: Final = 1.0
@@ -137,7 +137,7 @@ def leave_network() -> None:
 
 def is_possible() -> bool:
     """Whether a network of one's own can be had here. Asks another process, which takes a moment."""
-    command: Sequence[str] = (sys.executable, "-m", "skyloop.autopilots.apart")
+    command: Sequence[str] = (sys.executable, "-m", "skyloop.vehicles.sim.firmware.apart")
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 

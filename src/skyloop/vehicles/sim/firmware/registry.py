@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from skyloop.autopilots.coupling import CoupledFirmware
-from skyloop.autopilots.kinds import AutopilotKind
-from skyloop.autopilots.program import FirmwareEvent
 from skyloop.sim.rotor_parameters import InstrumentParameters
+from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
+from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
+from skyloop.vehicles.sim.firmware.program import FirmwareEvent
 
 
 def make_firmware(
@@ -30,13 +30,13 @@ def make_firmware(
         MissingExtraError: A package that it needs is not installed.
     """
     if kind is AutopilotKind.ARDUPILOT:
-        from skyloop.autopilots.ardupilot import ArduCopter
+        from skyloop.vehicles.sim.firmware.ardupilot import ArduCopter
 
         return ArduCopter(on_event, folder=folder)
     if kind is AutopilotKind.PX4:
-        from skyloop.autopilots.px4 import Px4
+        from skyloop.vehicles.sim.firmware.px4 import Px4
 
         return Px4(on_event, folder=folder, instruments=instruments)
-    from skyloop.autopilots.betaflight import Betaflight
+    from skyloop.vehicles.sim.firmware.betaflight import Betaflight
 
     return Betaflight(on_event, folder=folder)

@@ -12,15 +12,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.autopilots.coupling import CoupledFirmware
-from skyloop.autopilots.kinds import AutopilotKind
-from skyloop.autopilots.program import FirmwareEvent, FirmwareEventKind
-from skyloop.autopilots.registry import make_firmware
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.drivers.base import Driver, ExternalPose, Sink
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.sim.telemetry import native_of as truth_of
-from skyloop.drivers.sim.telemetry import truth_at
 from skyloop.errors import DriverError, UnsupportedError
 from skyloop.messages import (
     AnyAction,
@@ -37,6 +31,12 @@ from skyloop.messages.feedback import WAKING_UP
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.rotor_dynamics import rotors_of
+from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
+from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
+from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind
+from skyloop.vehicles.sim.firmware.registry import make_firmware
+from skyloop.vehicles.sim.telemetry import native_of as truth_of
+from skyloop.vehicles.sim.telemetry import truth_at
 
 #: Of a driver that has not been opened: what its kind of vehicle can do does not depend on where it is.
 _SOMEWHERE: Final = {

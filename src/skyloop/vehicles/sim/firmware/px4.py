@@ -17,9 +17,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from skyloop.autopilots.coupling import Commands, CoupledFirmware
-from skyloop.autopilots.ports import LOOPBACK, bound, release_instance, reserve_instance
-from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
 from skyloop.errors import UsageError
 from skyloop.files import wait_readable
 from skyloop.messages.geometry import in_16_bits
@@ -27,6 +24,9 @@ from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, geodetic
 from skyloop.sim.firmware import GpsFix, Readings
 from skyloop.sim.rotor_parameters import InstrumentParameters
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
+from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
+from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, release_instance, reserve_instance
+from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, find_program
 
 VARIABLE: Final = "SKYLOOP_PX4"
 WHERE: Final = (

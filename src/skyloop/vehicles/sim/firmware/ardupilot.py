@@ -12,15 +12,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar, Final
 
-from skyloop.autopilots.coupling import Commands, CoupledFirmware
-from skyloop.autopilots.ports import LOOPBACK, bound, free_udp_port, release_instance, reserve_instance
-from skyloop.autopilots.program import FirmwareEvent, Launch, find_program
 from skyloop.errors import DecodeError
 from skyloop.files import wait_readable
 from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG
 from skyloop.sim.firmware import Readings
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
-from skyloop.wire.ardupilot_json import MAX_PACKET, SimulatedState, decode_servos, encode_state
+from skyloop.vehicles.sim.firmware.ardupilot_json import MAX_PACKET, SimulatedState, decode_servos, encode_state
+from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
+from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, free_udp_port, release_instance, reserve_instance
+from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, find_program
 
 VARIABLE: Final = "SKYLOOP_ARDUCOPTER"
 WHERE: Final = "How to get it: https://ardupilot.org/dev/docs/building-setup-linux.html (board sitl, vehicle copter)"

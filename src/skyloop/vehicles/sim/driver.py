@@ -11,10 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.drivers.base import Driver, ExternalPose, Sink
-from skyloop.drivers.sim import parameters as table
-from skyloop.drivers.sim.options import firmware_options, options_of
-from skyloop.drivers.sim.setpoints import SetpointController
-from skyloop.drivers.sim.telemetry import feedback_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError
 from skyloop.messages import (
@@ -34,10 +30,14 @@ from skyloop.sim.host import Report, SimHost
 from skyloop.sim.parameters import LIMIT_RANGES, Limits
 from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.sim.world import Wind, World
+from skyloop.vehicles.sim import parameters as table
+from skyloop.vehicles.sim.options import firmware_options, options_of
+from skyloop.vehicles.sim.setpoints import SetpointController
+from skyloop.vehicles.sim.telemetry import feedback_of
 
 if TYPE_CHECKING:
-    from skyloop.drivers.sim.firmware import FirmwareFlight
     from skyloop.sim.camera_pipeline import Camera
+    from skyloop.vehicles.sim.firmware import FirmwareFlight
 
 _OCCURRENCES: Final = {
     OccurrenceKind.COLLISION: (EventKind.COLLISION, Severity.WARNING),
@@ -85,7 +85,7 @@ class SimDriver(Driver):
         self._world: World | None = None
         self._firmware: FirmwareFlight | None = None  # None: the built-in autopilot flies
         if self.options.autopilot is not None:
-            from skyloop.drivers.sim.firmware import FirmwareFlight
+            from skyloop.vehicles.sim.firmware import FirmwareFlight
 
             self._firmware = FirmwareFlight(self.options, firmware_options(uri))
 
