@@ -123,7 +123,7 @@ def test_a_vehicle_that_shows_a_board_calibrates(run: Run, tmp_path: Path, pictu
 
 def test_the_cameras_of_this_machine_are_listed(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     pytest.importorskip("av")
-    from skyloop.drivers.video import devices
+    from skyloop.vehicles.video import devices
 
     monkeypatch.setattr(devices, "cameras", list)
     assert run("camera", "list").out.strip() == "no camera is connected to this machine"

@@ -9,9 +9,7 @@ from types import ModuleType
 import pytest
 
 from skyloop.cockpit.server import _LARGEST_MESSAGE
-from skyloop.drivers.replay import options as replay_options
 from skyloop.drivers.uri import parse_uri
-from skyloop.drivers.video import options as video_options
 from skyloop.messages import Action, FlightState, Hover, Land, ResetEmergency, Takeoff, Velocity
 from skyloop.proxy.core.command_checks import STATE_POLICIES, StatePolicy
 from skyloop.proxy.parameters import OWN
@@ -25,9 +23,11 @@ from skyloop.transport.local.server import MAX_CLIENTS
 from skyloop.vehicles.ardrone import options as ardrone_options
 from skyloop.vehicles.mavlink import options as mavlink_options
 from skyloop.vehicles.msp import options as msp_options
+from skyloop.vehicles.replay import options as replay_options
 from skyloop.vehicles.ros2 import options as ros2_options
 from skyloop.vehicles.sim import options as sim_options
 from skyloop.vehicles.tello import options as tello_options
+from skyloop.vehicles.video import options as video_options
 from tests.docs.pages import ROOT, rows, section
 
 

@@ -95,5 +95,5 @@ def test_one_package_found_through_two_folders_is_no_contest(tmp_path: Path, mon
     for folder in ("one", "two"):
         install(tmp_path / folder, "same_drone", "samedrone = same_module:SameDriver")
         monkeypatch.syspath_prepend(str(tmp_path / folder))
-    (tmp_path / "one" / "same_module.py").write_text("from skyloop.drivers.video import VideoDriver as SameDriver\n")
+    (tmp_path / "one" / "same_module.py").write_text("from skyloop.vehicles.video import VideoDriver as SameDriver\n")
     assert driver_class("samedrone").__name__ == "VideoDriver"

@@ -17,10 +17,6 @@ from mcap.writer import Writer
 from skyloop.clock import ManualClock
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.replay import ReplayDriver
-from skyloop.drivers.replay.options import KNOWN
-from skyloop.drivers.replay.publisher import ReplayPublisher
-from skyloop.drivers.replay.source import ReplaySource, Timeline
 from skyloop.errors import ParameterError, UnknownNameError, UsageError
 from skyloop.logfile.layout import (
     META_CLOCK,
@@ -46,6 +42,10 @@ from skyloop.messages import (
     Severity,
     Velocity,
 )
+from skyloop.vehicles.replay import ReplayDriver
+from skyloop.vehicles.replay.options import KNOWN
+from skyloop.vehicles.replay.publisher import ReplayPublisher
+from skyloop.vehicles.replay.source import ReplaySource, Timeline
 from tests.docs.pages import rows, section
 from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, UNIX_NS, Plan, feedback_at, write_flight
 

@@ -20,15 +20,15 @@ from skyloop.clock import ManualClock, monotonic_ns, nanoseconds
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.drivers.recording_sink import RecordingSink, SeenFrame
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.replay.playback import PAUSED, POSITION, SPEED, Playback
-from skyloop.drivers.replay.player import IDLE_S, Player
-from skyloop.drivers.replay.source import ReplaySource, Timeline
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.logfile.reader import Entry, Recording
 from skyloop.logfile.scan import Piece
 from skyloop.messages import Feedback, LinkState
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.memory import MemoryServer
+from skyloop.vehicles.replay.playback import PAUSED, POSITION, SPEED, Playback
+from skyloop.vehicles.replay.player import IDLE_S, Player
+from skyloop.vehicles.replay.source import ReplaySource, Timeline
 from tests.recording.flights import BEGIN_NS, MS, WIDTH, Plan, feedback_at, write_flight
 
 Action = Callable[[Playback], object]

@@ -20,11 +20,11 @@ from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.video.devices import cameras, described
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Hover, LinkState
 from skyloop.pyav import new_decoder
 from skyloop.vehicles.ardrone.wire.pave import PaveParser
+from skyloop.vehicles.video.devices import cameras, described
 from tests.recordings import recorded
 
 LONG, TORN = "ardrone2/video-8s.pave", "ardrone2/video-64-byte-headers.pave"
@@ -317,7 +317,7 @@ def test_without_pyav_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
     for name in [
         name
         for name in sys.modules
-        if name.startswith(("skyloop.drivers.video", "skyloop.vehicles.ardrone.pave_decoder", "av."))
+        if name.startswith(("skyloop.vehicles.video", "skyloop.vehicles.ardrone.pave_decoder", "av."))
     ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "av", None)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.live_clock import LiveClock
-from skyloop.drivers.video.player import FilePacer
+from skyloop.vehicles.video.player import FilePacer
 
 MS = 1_000_000
 

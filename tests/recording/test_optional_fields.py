@@ -19,9 +19,6 @@ import pytest
 from skyloop.clock import ManualClock
 from skyloop.cockpit.values import event_values, feedback_values, flat_values, set_point_values
 from skyloop.drivers.recording_sink import RecordingSink
-from skyloop.drivers.replay.playback import Playback
-from skyloop.drivers.replay.player import StepPlayer
-from skyloop.drivers.replay.source import ReplaySource
 from skyloop.logfile import layout
 from skyloop.logfile.layout import TYPES, Channel, ClockPair, DroneRecord, Drops, End, FrameRecord, ResultRecord, Start
 from skyloop.logfile.reader import Recording
@@ -33,6 +30,9 @@ from skyloop.recording.review.compare import compare
 from skyloop.recording.review.export import export_csv, export_npz, export_parquet, read
 from skyloop.recording.review.report import write_report
 from skyloop.recording.translation import Picture, Translator
+from skyloop.vehicles.replay.playback import Playback
+from skyloop.vehicles.replay.player import StepPlayer
+from skyloop.vehicles.replay.source import ReplaySource
 from tests.messages.samples import SAMPLES, TILT
 from tests.recording.flights import BEGIN_NS, CAPABILITIES, UNIX_NS, Plan, feedback_at, picture_at
 

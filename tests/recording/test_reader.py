@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from skyloop.drivers.replay.source import ReplaySource
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.logfile.layout import Channel, image_topic
 from skyloop.logfile.pictures import Picture, decode_image
@@ -22,6 +21,7 @@ from skyloop.logfile.reader import Item, Recording
 from skyloop.logfile.times import Course, reported_ns, shifted
 from skyloop.messages import Encoding, Feedback, LogEntry, Parameter, ParameterType
 from skyloop.recording.review.tables import tables
+from skyloop.vehicles.replay.source import ReplaySource
 from tests.recording.flights import BEGIN_NS, HEIGHT, MS, UNIX_NS, WIDTH, Plan, feedback_at, picture_at, write_flight
 
 

@@ -17,7 +17,6 @@ from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.replay import ReplayDriver
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import LinkError, NoAnswerError, UnsupportedError, UsageError
 from skyloop.logfile.layout import Channel
@@ -27,6 +26,7 @@ from skyloop.proxy.proxy import Proxy
 from skyloop.recording.review.compare import compare
 from skyloop.stepping.replay import SteppedReplay, connector
 from skyloop.transport.memory import MemoryServer
+from skyloop.vehicles.replay import ReplayDriver
 from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, Plan, write_flight
 
 WAIT_S = 10.0

@@ -26,7 +26,6 @@ from mcap.writer import CompressionType, Writer
 from skyloop import pyav
 from skyloop.cli import main
 from skyloop.cockpit.recordings import Recordings
-from skyloop.drivers.replay.source import ReplaySource
 from skyloop.errors import FileFormatError, SkyloopError
 from skyloop.logfile import scan
 from skyloop.logfile.h264 import Group
@@ -39,6 +38,7 @@ from skyloop.recording.review.export import export_csv, export_npz, read
 from skyloop.recording.review.recover import recover
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise
+from skyloop.vehicles.replay.source import ReplaySource
 from tests.cli.conftest import Ended
 from tests.recording.flights import Plan, write_flight
 

@@ -22,9 +22,7 @@ from skyloop.address import shown_address
 from skyloop.cockpit.access import Person, Token
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.camera_source import source_of
-from skyloop.drivers.replay.options import options_of as replay_options
 from skyloop.drivers.uri import VehicleUri, parse_uri
-from skyloop.drivers.video.options import options_of as video_options
 from skyloop.errors import DriverError, SkyloopError
 from skyloop.host.control import Add, Status
 from skyloop.host.fleet import encode_handed, parse_fleet
@@ -36,7 +34,9 @@ from skyloop.proxy.audit import AuditTrail
 from skyloop.transport.fabric.packets import Key
 from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.mavlink.options import options_of as mavlink_options
+from skyloop.vehicles.replay.options import options_of as replay_options
 from skyloop.vehicles.sim.options import firmware_options
+from skyloop.vehicles.video.options import options_of as video_options
 from tests.proxy.fake import App, Bench
 
 SECRET = "s3cr3t"

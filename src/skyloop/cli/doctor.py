@@ -173,7 +173,7 @@ def _compiled_pictures() -> Iterator[Finding]:
 
 
 def _cameras() -> Iterator[Finding]:
-    from skyloop.drivers.video.devices import cameras
+    from skyloop.vehicles.video.devices import cameras
 
     found = cameras()
     for camera in found:

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.clock import NS_PER_S, ManualClock
-from skyloop.drivers.replay import ReplayDriver
 from skyloop.drivers.uri import parse_uri
 from skyloop.proxy.proxy import Proxy
 from skyloop.stepping.executor import StepExecutor
 from skyloop.stepping.scheduler import StepScheduler
 from skyloop.stepping.transport import SteppedServer
 from skyloop.transport.base import Dialer
+from skyloop.vehicles.replay import ReplayDriver
 
 LEAD_NS: Final = NS_PER_S  #: time before the recording starts: for connecting, which takes a few ticks
 

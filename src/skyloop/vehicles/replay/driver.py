@@ -8,11 +8,6 @@ from typing import Final
 
 from skyloop.clock import Clock
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.replay.options import options_of
-from skyloop.drivers.replay.playback import NAMES, Playback
-from skyloop.drivers.replay.player import Player, StepPlayer
-from skyloop.drivers.replay.publisher import PREFIX, ReplayPublisher
-from skyloop.drivers.replay.source import ReplaySource, capabilities_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.logfile.layout import DroneRecord
@@ -28,6 +23,11 @@ from skyloop.messages import (
     Severity,
     Value,
 )
+from skyloop.vehicles.replay.options import options_of
+from skyloop.vehicles.replay.playback import NAMES, Playback
+from skyloop.vehicles.replay.player import Player, StepPlayer
+from skyloop.vehicles.replay.publisher import PREFIX, ReplayPublisher
+from skyloop.vehicles.replay.source import ReplaySource, capabilities_of
 
 _log = logging.getLogger(__name__)
 _CLOSE_S: Final = 2.0
@@ -73,7 +73,7 @@ class ReplayDriver(Driver):
         return [*recorded, *playback.parameters()]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Move, hold or slow down the replay; see :class:`skyloop.drivers.replay.playback.Playback`."""
+        """Move, hold or slow down the replay; see :class:`skyloop.vehicles.replay.playback.Playback`."""
         if self._playback is None or name.startswith(PREFIX):
             return super().set_parameter(name, value)
         return self._playback.set(name, value)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from skyloop.drivers.video.v4l2 import Ioctl, opened
+from skyloop.vehicles.video.v4l2 import Ioctl, opened
 
 _CLASS: Final = Path("/sys/class/video4linux")
 _DEVICES: Final = Path("/dev")

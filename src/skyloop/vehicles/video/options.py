@@ -13,12 +13,12 @@ from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.camera_source import CameraSource, is_address, source_of
 from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.video.devices import cameras, described
-from skyloop.drivers.video.sources import DEFAULT_FPS, is_device
-from skyloop.drivers.video.v4l2 import FORMATS, V4l2Device, opened
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.files import expand
 from skyloop.messages.encoded import H264
+from skyloop.vehicles.video.devices import cameras, described
+from skyloop.vehicles.video.sources import DEFAULT_FPS, is_device
+from skyloop.vehicles.video.v4l2 import FORMATS, V4l2Device, opened
 
 _LIVE: Final = ("width", "height", "fps", "stream")
 _DEVICE: Final = ("format", "exposure", "gain")

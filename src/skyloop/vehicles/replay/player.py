@@ -7,11 +7,11 @@ from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.replay.playback import Playback, Wanted
-from skyloop.drivers.replay.publisher import ReplayPublisher
-from skyloop.drivers.replay.source import ReplaySource, TimedSample, Timeline
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind, Feedback, LinkState, Severity
+from skyloop.vehicles.replay.playback import Playback, Wanted
+from skyloop.vehicles.replay.publisher import ReplayPublisher
+from skyloop.vehicles.replay.source import ReplaySource, TimedSample, Timeline
 
 HEARTBEAT_NS: Final = 50_000_000  #: between repeats of the first state, while somebody is waited for
 PAUSE_NS: Final = 50_000_000  #: between two passes, on the clock of the replay

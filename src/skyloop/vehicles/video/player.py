@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
 from skyloop.drivers.stream_relay import CheckedRelay, StreamRelay
-from skyloop.drivers.video.sources import DecodedImage, Source
 from skyloop.errors import SkyloopError
 from skyloop.messages import EventKind, Feedback, Intrinsics, LinkState, Severity, Value
+from skyloop.vehicles.video.sources import DecodedImage, Source
 
 FEEDBACK_NS: Final = 50_000_000
 POLL_S: Final = 0.02

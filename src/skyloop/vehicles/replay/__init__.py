@@ -1,5 +1,5 @@
 """``replay://FLIGHT.mcap``: a vehicle that does again what was recorded."""
 
-from skyloop.drivers.replay.driver import ReplayDriver
+from skyloop.vehicles.replay.driver import ReplayDriver
 
 __all__ = ["ReplayDriver"]

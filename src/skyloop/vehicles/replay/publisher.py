@@ -10,8 +10,6 @@ import msgspec
 
 from skyloop.clock import Clock, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.replay.playback import PAUSED, POSITION, SPEED, Playback
-from skyloop.drivers.replay.source import Moment, TimedSample, Timeline
 from skyloop.errors import SkyloopError
 from skyloop.logfile.pictures import Picture
 from skyloop.messages import (
@@ -25,6 +23,8 @@ from skyloop.messages import (
     Severity,
     Value,
 )
+from skyloop.vehicles.replay.playback import PAUSED, POSITION, SPEED, Playback
+from skyloop.vehicles.replay.source import Moment, TimedSample, Timeline
 
 #: Events of the vehicle itself. All others were the recorded proxy's or an application's: a client must not take them
 #: for events about its own authority or commands.

@@ -6,9 +6,9 @@ import threading
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.drivers.replay.options import SPEEDS
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
+from skyloop.vehicles.replay.options import SPEEDS
 
 POSITION: Final = "replay.position_s"
 SPEED: Final = "replay.speed"

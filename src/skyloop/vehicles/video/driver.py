@@ -12,14 +12,14 @@ from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.live_video import VideoEvent
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.video.devices import cameras, described
-from skyloop.drivers.video.options import options_of
-from skyloop.drivers.video.player import FEEDBACK_NS, CameraPublisher, FilePlayer
-from skyloop.drivers.video.sources import Source, open_file
-from skyloop.drivers.video.v4l2 import FORMATS
 from skyloop.errors import SkyloopError
 from skyloop.messages import CameraInfo, Capabilities, EventKind, Feedback, Hover, Intrinsics, Land, LinkState, Severity
 from skyloop.messages.encoded import H264
+from skyloop.vehicles.video.devices import cameras, described
+from skyloop.vehicles.video.options import options_of
+from skyloop.vehicles.video.player import FEEDBACK_NS, CameraPublisher, FilePlayer
+from skyloop.vehicles.video.sources import Source, open_file
+from skyloop.vehicles.video.v4l2 import FORMATS
 
 _CLOSE_S = 2.0
 
