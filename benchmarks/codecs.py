@@ -20,7 +20,6 @@ from benchmarks.measuring.workers import STARTS_WITHIN_S, Workers
 from benchmarks.one_core import codecs_on_one_core
 from skyloop.bench import Flight, Machine, Spread, rounds, spread
 from skyloop.drivers.backlog import Coded
-from skyloop.emulators.encoders import GROUP, Encoder
 from skyloop.errors import MissingExtraError
 from skyloop.sim.camera import FRONT_CAMERA
 from skyloop.vehicles.ardrone.emulator.uvlc import encode as encode_uvlc
@@ -30,6 +29,7 @@ from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.options import LAYOUTS
 from skyloop.vehicles.ardrone.wire.pave import FrameType, PaveFrame
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
+from skyloop.vehicles.emulation.encoders import GROUP, Encoder
 
 UVLC_PER_S: Final = 15.0  #: what an AR.Drone 1 sends: the target
 PICTURES: Final = 2 * GROUP  #: two groups of H.264 pictures, each with a key frame

@@ -23,7 +23,6 @@ from skyloop.client import Drone, connect
 from skyloop.client.core import Access
 from skyloop.client.swarm import Swarm
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.loop import Loop
 from skyloop.errors import SkyloopError
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.host import Host
@@ -32,6 +31,7 @@ from skyloop.host.vehicle import SharedVehicle
 from skyloop.messages import Feedback, LinkState, Position
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.emulation.loop import Loop
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 
 RATE_HZ: Final = 10.0  #: of the vehicles' feedback, and of the repeats of commands

@@ -18,7 +18,6 @@ import msgspec
 from benchmarks.measuring.tables import Table
 from skyloop.bench import Flight, Machine
 from skyloop.clock import NS_PER_S
-from skyloop.emulators.encoders import Encoded, Encoder
 from skyloop.logfile.layout import VERSION, Channel, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.logfile.reader import Recording
 from skyloop.messages import (
@@ -42,6 +41,7 @@ from skyloop.recording.review.video import export_mp4
 from skyloop.recording.translation import Picture, Translator
 from skyloop.sim.camera import FRONT_CAMERA
 from skyloop.vehicles.ardrone.emulator.video import H264_360P
+from skyloop.vehicles.emulation.encoders import Encoded, Encoder
 from skyloop.vehicles.replay.source import ReplaySource
 
 FPS: Final = 30

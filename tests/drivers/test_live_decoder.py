@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from skyloop.drivers.backlog import Coded
 from skyloop.drivers.live_container import HOPELESS_S, STRICT_S, LiveDecoder, Piece
-from skyloop.emulators.encoders import Encoder, Format
 from skyloop.errors import UnsupportedError
 from skyloop.vehicles.ardrone.wire.pave import Codec
+from skyloop.vehicles.emulation.encoders import Encoder, Format
 from skyloop.wire.h264 import SPS, START, Inspector, unit_type, units
 from tests.drivers.mavlink.film import FPS, GROUP, HEIGHT, WIDTH, Film
 

@@ -7,8 +7,6 @@ from dataclasses import replace
 from typing import Final
 
 from skyloop.clock import NS_PER_S, ManualClock
-from skyloop.emulators.datagrams import Address
-from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.messages import FlightState
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.host import Report
@@ -16,6 +14,8 @@ from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.reports import VehicleTruth
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
+from skyloop.vehicles.emulation.datagrams import Address
+from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
 from skyloop.vehicles.tello.emulator.logic import TelloLogic
 from skyloop.vehicles.tello.emulator.settings import LIMITS, TELLO
 from skyloop.vehicles.tello.wire.commands import Sdk

@@ -12,12 +12,12 @@ from functools import partial
 import pytest
 
 from skyloop.clock import monotonic_ns
-from skyloop.emulators.datagrams import Address, DatagramPort
-from skyloop.emulators.loop import Loop
 from skyloop.errors import LinkError
 from skyloop.faults import Faults
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.ardrone.emulator.streams import MOST_BACKLOG, MOST_CLIENTS, StreamPort
+from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
+from skyloop.vehicles.emulation.loop import Loop
 
 HERE = "127.0.0.1"
 KEY_EVERY = 15

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from skyloop.emulators.video import VideoStatus
 from skyloop.messages import FlightState
 from skyloop.vehicles.ardrone.emulator.clock import DroneClock
 from skyloop.vehicles.ardrone.emulator.listeners import MOST, Listeners
@@ -15,6 +14,7 @@ from skyloop.vehicles.ardrone.emulator.setpoints import Progress
 from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, tags_of
 from skyloop.vehicles.ardrone.wire import options as o
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, decode, encode
+from skyloop.vehicles.emulation.video import VideoStatus
 from tests.emulators.rig import RESTING
 
 EVERY = list(range(28))

@@ -12,8 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.encoders import GROUP, Encoder, as_the_drone_does, require_encoder
-from skyloop.emulators.video import Piece, VideoEncoding, with_inset
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.ardrone.emulator.clock import DroneClock
@@ -32,6 +30,8 @@ from skyloop.vehicles.ardrone.video import cameras_of
 from skyloop.vehicles.ardrone.wire import uvlc
 from skyloop.vehicles.ardrone.wire.keys import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame, PaveParser
+from skyloop.vehicles.emulation.encoders import GROUP, Encoder, as_the_drone_does, require_encoder
+from skyloop.vehicles.emulation.video import Piece, VideoEncoding, with_inset
 
 av = pytest.importorskip("av")
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from skyloop.clock import NS_PER_S
-from skyloop.emulators.encoders import Encoder, Format
 from skyloop.logfile.layout import VERSION, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.messages import CameraInfo, Capabilities, Encoding, FrameHeader
 from skyloop.messages.encoded import H264
@@ -18,6 +17,7 @@ from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.output import RecordingFile
 from skyloop.recording.translation import Picture, Translator
 from skyloop.vehicles.ardrone.wire.pave import Codec
+from skyloop.vehicles.emulation.encoders import Encoder, Format
 
 MS = 1_000_000
 BEGIN_NS = 5_000_000_000

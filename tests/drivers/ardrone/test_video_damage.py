@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.drivers.backlog import Coded
-from skyloop.emulators.encoders import Encoder
 from skyloop.errors import UnsupportedError
 from skyloop.vehicles.ardrone.emulator.video import MP4_360P
 from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame
+from skyloop.vehicles.emulation.encoders import Encoder
 from tests.drivers.ardrone.video_ports import LONG, SHORT, Digest, digest, frames, pieces, recording, true_pictures
 
 NAMES = st.sampled_from((LONG, SHORT))

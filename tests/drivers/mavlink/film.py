@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.emulators.encoders import Encoded, Encoder, Format
 from skyloop.vehicles.ardrone.wire.pave import Codec
+from skyloop.vehicles.emulation.encoders import Encoded, Encoder, Format
 
 BITS, STRIPE, HEIGHT = 12, 16, 64
 WIDTH = BITS * STRIPE

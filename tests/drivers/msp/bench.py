@@ -11,13 +11,13 @@ from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.messages import Attitude, Feedback
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
+from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
 from skyloop.vehicles.msp.emulator.board import Board
 from skyloop.vehicles.msp.emulator.settings import RACER, BoardSettings
 from skyloop.vehicles.msp.options import MspOptions, options_of

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skyloop.drivers.backlog import Coded
 from skyloop.drivers.uri import parse_uri
-from skyloop.emulators.video import OneCamera
+from skyloop.vehicles.emulation.video import OneCamera
 from skyloop.vehicles.tello.emulator.emulator import GROUP, TelloPacker
 from skyloop.vehicles.tello.emulator.settings import FRONT
 from skyloop.vehicles.tello.video import TelloVideo, cameras_of, intrinsics_for

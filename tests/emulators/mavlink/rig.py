@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import VehicleParameters, with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
+from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
 from skyloop.vehicles.mavlink.emulator import Kind
 from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
 from skyloop.vehicles.mavlink.emulator.places import geodetic

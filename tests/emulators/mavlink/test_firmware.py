@@ -11,11 +11,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from skyloop.emulators.loop import Loop
 from skyloop.errors import LinkError, UsageError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import PATIENCE_S
+from skyloop.vehicles.emulation.loop import Loop
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.vehicles.mavlink.emulator.streams import Streams
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message

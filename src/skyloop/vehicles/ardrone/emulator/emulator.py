@@ -7,11 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.emulators.datagrams import Address, DatagramPort
-from skyloop.emulators.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
-from skyloop.emulators.encoders import require_encoder
-from skyloop.emulators.vehicle import SimulatedVehicle
-from skyloop.emulators.video import Packer, Piece, VideoEncoding
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.host import Report, SimHost
@@ -24,6 +19,11 @@ from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, ta
 from skyloop.vehicles.ardrone.emulator.video import CAMERAS, PavePacker, UvlcPacker
 from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.ports import STANDARD, Ports
+from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
+from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.vehicles.emulation.encoders import require_encoder
+from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
+from skyloop.vehicles.emulation.video import Packer, Piece, VideoEncoding
 
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.emulators.vehicle import Vehicle
 from skyloop.messages import (
     Attitude,
     EmergencyStop,
@@ -29,6 +28,7 @@ from skyloop.vehicles.ardrone.emulator.configuration import Configuration
 from skyloop.vehicles.ardrone.emulator.setpoints import NO_PROGRESS, Progress, set_point
 from skyloop.vehicles.ardrone.wire.at import Ref
 from skyloop.vehicles.ardrone.wire.navdata import State
+from skyloop.vehicles.emulation.vehicle import Vehicle
 
 HOVER_AFTER_S: Final = 0.25  #: of silence: Developer Guide, general:com_watchdog (recalled, not read again)
 LOST_AFTER_S: Final = 2.0  #: of silence the link counts as lost

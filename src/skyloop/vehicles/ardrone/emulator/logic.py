@@ -11,7 +11,6 @@ from functools import partial
 from typing import Final
 
 from skyloop.clock import Clock, seconds
-from skyloop.emulators.vehicle import Vehicle
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.vehicles.ardrone.emulator.configuration import Configuration, Ids
 from skyloop.vehicles.ardrone.emulator.flight import LOST_AFTER_S, FlightControl
@@ -20,6 +19,7 @@ from skyloop.vehicles.ardrone.emulator.setpoints import Progress, limits_of
 from skyloop.vehicles.ardrone.wire.at import AtCommand, Ctrl, parse_commands, to_float
 from skyloop.vehicles.ardrone.wire.keys import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.navdata import State
+from skyloop.vehicles.emulation.vehicle import Vehicle
 
 WATCHDOG_S: Final = 0.05  #: of silence: Developer Guide, 7.1.2
 
@@ -55,12 +55,12 @@ class VideoSettings:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """See :class:`skyloop.emulators.video.VideoSettings`."""
+        """See :class:`skyloop.vehicles.emulation.video.VideoSettings`."""
         return _CAMERAS[self.channel]
 
     @property
     def inset(self) -> tuple[int, int]:
-        """See :class:`skyloop.emulators.video.VideoSettings`."""
+        """See :class:`skyloop.vehicles.emulation.video.VideoSettings`."""
         return _INSETS.get(self.channel, (0, 0))
 
 

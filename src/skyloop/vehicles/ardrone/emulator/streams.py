@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from skyloop.emulators.datagrams import Address, bound
-from skyloop.emulators.loop import Loop
+from skyloop.vehicles.emulation.datagrams import Address, bound
+from skyloop.vehicles.emulation.loop import Loop
 
 MOST_CLIENTS: Final = 8
 MOST_BACKLOG: Final = 256 * 1024  #: bytes for one client beyond what the system holds

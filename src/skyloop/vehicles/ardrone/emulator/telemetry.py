@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from skyloop.emulators.video import NOTHING_SENT, VideoStatus
 from skyloop.messages import FlightState
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.reports import VehicleFeedback
@@ -20,6 +19,7 @@ from skyloop.vehicles.ardrone.emulator.setpoints import NO_PROGRESS, Progress
 from skyloop.vehicles.ardrone.wire import options as o
 from skyloop.vehicles.ardrone.wire.keys import NAVDATA_OPTIONS_USUAL, VideoChannel
 from skyloop.vehicles.ardrone.wire.navdata import ControlState
+from skyloop.vehicles.emulation.video import NOTHING_SENT, VideoStatus
 
 STANDARD_PRESSURE_PA: Final = 101_325
 PRESSURE_PA_PER_M: Final = 12.0  #: near the ground, international standard atmosphere

@@ -10,14 +10,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.emulators.encoders import Encoder, Format
-from skyloop.emulators.video import Piece
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 from skyloop.vehicles.ardrone.emulator import uvlc
 from skyloop.vehicles.ardrone.emulator.clock import DroneClock
 from skyloop.vehicles.ardrone.emulator.logic import VideoSettings
 from skyloop.vehicles.ardrone.wire.keys import VideoCodec
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, build_header
+from skyloop.vehicles.emulation.encoders import Encoder, Format
+from skyloop.vehicles.emulation.video import Piece
 
 _DIAGONAL_1_PX: Final = math.hypot(176, 144)
 _FOCAL_1_PX: Final = BOTTOM_CAMERA.fx * _DIAGONAL_1_PX / math.hypot(BOTTOM_CAMERA.width, BOTTOM_CAMERA.height)

@@ -6,9 +6,9 @@ import math
 from dataclasses import replace
 from typing import ClassVar, Final
 
-from skyloop.emulators.flight import GO_M_S, SINK_M_S, Speeds
-from skyloop.emulators.vehicle import Vehicle
 from skyloop.messages.geometry import turned, wrap_angle
+from skyloop.vehicles.emulation.flight import GO_M_S, SINK_M_S, Speeds
+from skyloop.vehicles.emulation.vehicle import Vehicle
 from skyloop.vehicles.mavlink.emulator import parameters
 from skyloop.vehicles.mavlink.emulator.autopilot import (
     ACCEPTED,

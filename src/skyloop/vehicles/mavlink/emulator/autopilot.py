@@ -10,10 +10,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Final
 
-from skyloop.emulators.flight import FlightControl
-from skyloop.emulators.vehicle import Vehicle
 from skyloop.messages import FlightState
 from skyloop.sim.host import Report
+from skyloop.vehicles.emulation.flight import FlightControl
+from skyloop.vehicles.emulation.vehicle import Vehicle
 from skyloop.vehicles.mavlink.emulator.links import Port
 from skyloop.vehicles.mavlink.emulator.manoeuvres import Manoeuvres
 from skyloop.vehicles.mavlink.emulator.parameters import ParameterTable

@@ -7,13 +7,13 @@ from functools import partial
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from skyloop.emulators.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
-from skyloop.emulators.loop import Loop
-from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
 from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
 from skyloop.vehicles.mavlink.emulator.autopilot import Autopilot
 from skyloop.vehicles.mavlink.emulator.links import Port, TcpPort, UdpPort

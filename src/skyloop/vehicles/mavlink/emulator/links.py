@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Final, Protocol
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.emulators.byte_server import ByteServer
-from skyloop.emulators.datagrams import Address, DatagramPort
-from skyloop.emulators.loop import Loop
+from skyloop.vehicles.emulation.byte_server import ByteServer
+from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
+from skyloop.vehicles.emulation.loop import Loop
 from skyloop.vehicles.mavlink.emulator.settings import Settings
 from skyloop.vehicles.mavlink.emulator.streams import Streams
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message

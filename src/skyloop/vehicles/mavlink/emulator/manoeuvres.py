@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final
 
-from skyloop.emulators.flight import USUAL, YAW_GAIN_PER_S, FlightControl, Speeds
 from skyloop.messages.geometry import clamped, wrap_angle
+from skyloop.vehicles.emulation.flight import USUAL, YAW_GAIN_PER_S, FlightControl, Speeds
 from skyloop.vehicles.mavlink.emulator.setpoints import AttitudeTarget, Target
 from skyloop.vehicles.mavlink.wire.axes import Vector
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Final
 
-from skyloop.emulators.flight import USUAL, Speeds
-from skyloop.emulators.vehicle import Vehicle
+from skyloop.vehicles.emulation.flight import USUAL, Speeds
+from skyloop.vehicles.emulation.vehicle import Vehicle
 from skyloop.vehicles.mavlink.emulator import parameters
 from skyloop.vehicles.mavlink.emulator.autopilot import (
     ACCEPTED,

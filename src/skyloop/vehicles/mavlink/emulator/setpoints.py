@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.emulators.flight import USUAL, FlightControl, Speeds
+from skyloop.vehicles.emulation.flight import USUAL, FlightControl, Speeds
 from skyloop.vehicles.mavlink.emulator.places import on_earth, place_of
 from skyloop.vehicles.mavlink.wire.axes import Vector, angles_of, flip, from_wire, swap, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Message

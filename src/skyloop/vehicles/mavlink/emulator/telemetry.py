@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable
 from typing import ClassVar, Final, Protocol
 
-from skyloop.emulators.flight import FlightControl
 from skyloop.messages import FlightState
 from skyloop.messages.geometry import in_16_bits, quaternion_from_euler
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2
+from skyloop.vehicles.emulation.flight import FlightControl
 from skyloop.vehicles.mavlink.emulator.places import ORIGIN, geodetic
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Message

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.emulators.encoders import GROUP
-from skyloop.emulators.video import OneCamera, VideoEncoding
 from skyloop.errors import MissingExtraError
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
+from skyloop.vehicles.emulation.encoders import GROUP
+from skyloop.vehicles.emulation.video import OneCamera, VideoEncoding
 
 if TYPE_CHECKING:
     from av.container import OutputContainer

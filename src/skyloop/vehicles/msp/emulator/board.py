@@ -10,10 +10,10 @@ from collections.abc import Callable
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.emulators.flight import FlightControl
-from skyloop.emulators.vehicle import Vehicle
 from skyloop.messages.earth import EarthOrigin
 from skyloop.sim.host import Report
+from skyloop.vehicles.emulation.flight import FlightControl
+from skyloop.vehicles.emulation.vehicle import Vehicle
 from skyloop.vehicles.msp.emulator.settings import (
     BOXES,
     CELLS,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from skyloop.emulators.byte_server import ByteServer
-from skyloop.emulators.emulator import Emulator, RunningEmulator
-from skyloop.emulators.loop import Loop
-from skyloop.emulators.vehicle import SimulatedVehicle
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.vehicles.emulation.byte_server import ByteServer
+from skyloop.vehicles.emulation.emulator import Emulator, RunningEmulator
+from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
 from skyloop.vehicles.msp.emulator.board import Board
 from skyloop.vehicles.msp.emulator.settings import PORT, BoardSettings
 from skyloop.vehicles.msp.wire.frames import Parser, encode

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.emulators.datagrams import Address, DatagramPort
-from skyloop.emulators.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
-from skyloop.emulators.encoders import Encoder, Format, require_encoder
-from skyloop.emulators.vehicle import SimulatedVehicle
-from skyloop.emulators.video import OneCamera, Piece, VideoEncoding
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.host import Report, SimHost
 from skyloop.vehicles.ardrone.wire.pave import Codec
+from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
+from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.vehicles.emulation.encoders import Encoder, Format, require_encoder
+from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
+from skyloop.vehicles.emulation.video import OneCamera, Piece, VideoEncoding
 from skyloop.vehicles.tello.emulator.logic import TelloLogic
 from skyloop.vehicles.tello.emulator.pads import MOST
 from skyloop.vehicles.tello.emulator.settings import BOTTOM, FRONT, LIMITS, Settings

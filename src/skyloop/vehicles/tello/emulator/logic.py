@@ -13,11 +13,11 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from skyloop.clock import Clock, nanoseconds
-from skyloop.emulators.datagrams import Address
-from skyloop.emulators.vehicle import Vehicle
 from skyloop.messages import EmergencyStop, FlightState, Hover, ResetEmergency, Velocity
 from skyloop.sim.host import Report
 from skyloop.sim.world import Vec3
+from skyloop.vehicles.emulation.datagrams import Address
+from skyloop.vehicles.emulation.vehicle import Vehicle
 from skyloop.vehicles.tello.emulator import telemetry
 from skyloop.vehicles.tello.emulator.manoeuvres import OK, Flipping, Going, Job, Landing, Rising, Turning
 from skyloop.vehicles.tello.emulator.pads import Sighting, seen

@@ -9,9 +9,9 @@ from functools import partial
 from typing import Final
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.emulators.loop import Loop
 from skyloop.errors import LinkError
 from skyloop.faults import FaultInjector, Faults
+from skyloop.vehicles.emulation.loop import Loop
 
 Address = tuple[str, int]
 

@@ -10,13 +10,13 @@ from typing import Any, Final, Generic, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.emulators.loop import Loop
-from skyloop.emulators.video import VideoEncoding
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence
+from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.emulation.video import VideoEncoding
 
 _log = logging.getLogger(__name__)
 

@@ -6,8 +6,8 @@ import socket
 from collections.abc import Callable
 from typing import Final
 
-from skyloop.emulators.datagrams import Address, bound
-from skyloop.emulators.loop import Loop
+from skyloop.vehicles.emulation.datagrams import Address, bound
+from skyloop.vehicles.emulation.loop import Loop
 
 _BUFFER: Final = 1 << 16
 

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.emulators.vehicle import Vehicle
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Hover, Land, ResetEmergency, Takeoff
 from skyloop.messages import Velocity as VelocityAction
 from skyloop.messages.geometry import clamped, turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits
+from skyloop.vehicles.emulation.vehicle import Vehicle
 from skyloop.vehicles.mavlink.wire.axes import Vector
 
 LIFT_M: Final = 0.3  #: what the simulated vehicle's own take-off does, before these loops go on
