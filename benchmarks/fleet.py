@@ -45,7 +45,7 @@ from skyloop.host.fleet import VehicleSettings
 from skyloop.host.host import Host
 from skyloop.host.serve import SWITCH_INTERVAL_S
 from skyloop.messages import AnyAction
-from skyloop.transport.fabric import FabricSettings
+from skyloop.network import FabricSettings
 from skyloop.transport.local.directory import DIRECTORY_VARIABLE
 
 _AHEAD_NS: Final = 200_000_000

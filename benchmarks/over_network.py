@@ -21,9 +21,9 @@ from skyloop.client.core import Access
 from skyloop.errors import LinkError, SkyloopError, UnknownNameError
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.messages.video import VideoRequest
+from skyloop.network import FabricServer, FabricSettings
+from skyloop.network.settings import LEASE_S
 from skyloop.transport.base import TransportServer
-from skyloop.transport.fabric import FabricServer, FabricSettings
-from skyloop.transport.fabric.settings import LEASE_S
 
 JPEG: Final = VideoOptions(encoding="jpeg", quality=80)
 _JPEGS: Final = 50

@@ -16,9 +16,9 @@ from skyloop.bench import CAMERA
 from skyloop.client import Drone, Frame
 from skyloop.client.channels import VideoOptions
 from skyloop.messages import CameraInfo
+from skyloop.network import FabricServer
+from skyloop.network.settings import LEASE_S as DEFAULT_LEASE_S
 from skyloop.transport.base import TransportServer
-from skyloop.transport.fabric import FabricServer
-from skyloop.transport.fabric.settings import LEASE_S as DEFAULT_LEASE_S
 
 FPS: Final = 30.0
 NO_VIDEO: Final = "no video"

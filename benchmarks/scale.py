@@ -25,9 +25,9 @@ from benchmarks.measuring.workers import Pipe, Worker, Workers
 from skyloop.bench import CAMERA, Machine
 from skyloop.errors import LinkError, NoAnswerError
 from skyloop.files import MAX_RESULTS, read_json
-from skyloop.transport.fabric import FabricSettings
-from skyloop.transport.fabric.config import DEFAULT_PORT, Part
-from skyloop.transport.fabric.session import acquire, release
+from skyloop.network import FabricSettings
+from skyloop.network.config import DEFAULT_PORT, Part
+from skyloop.network.session import acquire, release
 
 COUNTS: Final = (1, 2, 5, 10, 20, 50)
 FRAME_PERIOD_S: Final = 0.1

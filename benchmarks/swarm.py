@@ -21,7 +21,7 @@ from benchmarks.measuring.workers import Worker, Workers
 from benchmarks.swarming import Step
 from skyloop.bench import Machine, Spread, spread
 from skyloop.files import MAX_RESULTS, read_json
-from skyloop.transport.fabric.config import DEFAULT_PORT, free_port
+from skyloop.network.config import DEFAULT_PORT, free_port
 
 STOPPED_S: Final = 1.2  #: longer than ``failsafe.hover_after_s``, and shorter than ``failsafe.land_after_s``
 #: A step of the ladder is looked for so long after it was caused; 0.5 s of it are the rule.

@@ -13,9 +13,9 @@ from skyloop.control import Controller
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import AuthorityError, LinkError, NoAnswerError
 from skyloop.messages import Applied, Failsafe, Feedback, FlightState, Velocity
+from skyloop.network import FabricServer, FabricSettings
 from skyloop.proxy import Proxy
 from skyloop.sim.host import SimHost
-from skyloop.transport.fabric import FabricServer, FabricSettings
 from skyloop.vehicles.sim import SimDriver, options_of
 
 #: Small pictures: what is measured is not how fast this machine draws.

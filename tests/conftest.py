@@ -108,7 +108,7 @@ def traced() -> Iterator[None]:
     if hook is None:
         yield
         return
-    from skyloop.transport.fabric.session import Session
+    from skyloop.network.session import Session
 
     plain = Session.callback
 

@@ -10,9 +10,9 @@ from benchmarks.measuring.ours import Listening, proxy_name
 from benchmarks.measuring.ours import Vehicle as NearVehicle
 from skyloop.bench import CAMERA, BenchVehicle
 from skyloop.client import connect
+from skyloop.network import FabricServer, FabricSettings
+from skyloop.network.config import free_port
 from skyloop.proxy import Proxy
-from skyloop.transport.fabric import FabricServer, FabricSettings
-from skyloop.transport.fabric.config import free_port
 
 _HOST = "127.0.0.1"
 

@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from skyloop.transport.fabric.config import free_port
+from skyloop.network.config import free_port
 from tests.chaos.judge import Verdict
 from tests.chaos.lanes import LOCAL, NETWORK, Fault, Lane, disk_full, foreign_clock, torment
 from tests.chaos.mavlink_lanes import HANDS, MAVLINK, MavlinkLane, PageLane

@@ -17,7 +17,7 @@ from skyloop.errors import SkyloopError
 from skyloop.host.control import AddNamed, Remove, Status, ask
 from skyloop.host.vehicle import Condition
 from skyloop.messages import Hello, ListParameters, Ping, Request, Role, encode
-from skyloop.transport.fabric.config import free_port
+from skyloop.network.config import free_port
 from skyloop.transport.local import packets
 from skyloop.transport.local.directory import PROXY, find_directory
 
@@ -81,8 +81,8 @@ def requests(path: str) -> None:
 
 def network_requests(name: str, network: str) -> None:
     """Several observers on the network that ask for much; to be stopped as they do."""
-    from skyloop.transport.fabric import FabricSettings
-    from skyloop.transport.fabric import dial as fabric_dial
+    from skyloop.network import FabricSettings
+    from skyloop.network import dial as fabric_dial
 
     class Ignoring:
         def __getattr__(self, _: str) -> object:

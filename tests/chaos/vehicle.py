@@ -118,7 +118,7 @@ def main() -> None:
     make_end = None
     if listen:
         from skyloop.cli.network import server_ends
-        from skyloop.transport.fabric import FabricSettings
+        from skyloop.network import FabricSettings
 
         make_end = server_ends(FabricSettings(listen=(listen[0],), multicast=False), None)
     setattr(serving, "make_driver", lambda uri: JournalledVehicle(folder, name))  # noqa: B010  (it is imported there)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.keys import Lab, load
-from skyloop.keys.identity import make_identity
+from skyloop.network.keys import Lab, load
+from skyloop.network.keys.identity import make_identity
 from tests.cli.conftest import Run
 
 DAY = timedelta(days=1)

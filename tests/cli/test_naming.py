@@ -102,7 +102,7 @@ def test_a_wrong_network_is_refused_without_a_library_s_paths(run: Run, where: s
 
 
 def test_errors_of_the_network_s_library_lose_the_places_in_its_sources() -> None:
-    from skyloop.transport.fabric.session import reason_of
+    from skyloop.network.session import reason_of
 
     text = (
         "Can not create a new TCP listener bound to tcp/1.2.3.4:7447?rel=1: [1.2.3.4:7447: Cannot assign requested "

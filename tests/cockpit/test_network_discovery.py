@@ -14,9 +14,9 @@ pytest.importorskip("zenoh", reason="needs Zenoh: skyloop install network")
 
 import skyloop
 from skyloop.cockpit.discovery import Found, LocalFinder, NetworkFinder
+from skyloop.network import FabricServer, FabricSettings
+from skyloop.network.config import free_port
 from skyloop.transport.composite import CompositeServer
-from skyloop.transport.fabric import FabricServer, FabricSettings
-from skyloop.transport.fabric.config import free_port
 from skyloop.transport.local import LocalServer
 from skyloop.transport.testing import ServerLog, wait_until
 from tests.processes.conftest import Process
@@ -86,9 +86,9 @@ def test_two_searches_at_once_share_a_session(monkeypatch: pytest.MonkeyPatch) -
         return opened[-1]
 
     released: list[object] = []
-    monkeypatch.setattr("skyloop.transport.fabric.session.acquire", acquire)
-    monkeypatch.setattr("skyloop.transport.fabric.session.release", released.append)
-    monkeypatch.setattr("skyloop.transport.fabric.discovery.runs", lambda session: [("bravo", "run")])
+    monkeypatch.setattr("skyloop.network.session.acquire", acquire)
+    monkeypatch.setattr("skyloop.network.session.release", released.append)
+    monkeypatch.setattr("skyloop.network.discovery.runs", lambda session: [("bravo", "run")])
     finder = NetworkFinder(LocalFinder(), FabricSettings(multicast=False))
     found: list[Found] = []
     threads = [threading.Thread(target=lambda: found.extend(finder())) for _ in range(2)]

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
+from skyloop.network import FabricServer, FabricSettings, dial
+from skyloop.network.client import FabricClient
+from skyloop.network.config import free_port
 from skyloop.transport.base import FEEDBACK, Peer
-from skyloop.transport.fabric import FabricServer, FabricSettings, dial
-from skyloop.transport.fabric.client import FabricClient
-from skyloop.transport.fabric.config import free_port
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 
 

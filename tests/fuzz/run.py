@@ -10,7 +10,7 @@ import sys
 #: What a target runs through, instrumented before it is imported.
 PACKAGES = {
     "samples": ["skyloop.messages"],
-    "packets": ["skyloop.messages", "skyloop.transport.local.packets", "skyloop.transport.fabric.packets"],
+    "packets": ["skyloop.messages", "skyloop.transport.local.packets", "skyloop.network.packets"],
     "proxy": ["skyloop.messages", "skyloop.proxy"],
     "ardrone": ["skyloop.vehicles.ardrone.wire"],
     "tello": ["skyloop.vehicles.tello.wire"],

@@ -29,7 +29,7 @@ def samples(data: bytes) -> None:
 
 def packets(data: bytes) -> None:
     """The packets that the ends of a transport exchange between themselves."""
-    from skyloop.transport.fabric import packets as fabric
+    from skyloop.network import packets as fabric
     from skyloop.transport.local import packets as local
 
     for parse in (

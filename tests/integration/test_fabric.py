@@ -16,10 +16,10 @@ from skyloop.client.connection import Scheduler
 from skyloop.client.drone import open_drone
 from skyloop.errors import UsageError
 from skyloop.messages import Applied, FlightState, Velocity
+from skyloop.network import FabricServer, FabricSettings, dial
+from skyloop.network.config import free_port
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import Dialer, TransportServer
-from skyloop.transport.fabric import FabricServer, FabricSettings, dial
-from skyloop.transport.fabric.config import free_port
 from skyloop.transport.memory import MemoryServer
 from tests.integration.fake_vehicle import FakeVehicle
 

@@ -17,11 +17,11 @@ from skyloop.client.drone import open_drone
 from skyloop.clock import monotonic_ns
 from skyloop.errors import NoAnswerError, UsageError
 from skyloop.messages import Feedback, FlightState, LinkState, Overview
+from skyloop.network import FabricServer, FabricSettings
+from skyloop.network import dial as dial_fabric
+from skyloop.network.config import free_port
 from skyloop.proxy import Proxy
 from skyloop.transport.base import FEEDBACK, OVERVIEW, Dialer, TransportServer
-from skyloop.transport.fabric import FabricServer, FabricSettings
-from skyloop.transport.fabric import dial as dial_fabric
-from skyloop.transport.fabric.config import free_port
 from skyloop.transport.local import LocalServer
 from skyloop.transport.local import dial as dial_local
 from skyloop.transport.memory import MemoryServer

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.keys import Lab
-from skyloop.keys.identity import make_identity
+from skyloop.network.keys import Lab
+from skyloop.network.keys.identity import make_identity
 
 NOW = datetime(2030, 5, 1, 12, tzinfo=UTC)
 

@@ -9,9 +9,9 @@ import msgspec
 import pytest
 
 from skyloop.errors import LinkError
-from skyloop.keys import KeyRing, Lab, load
-from skyloop.keys.agreement import Agreement, Proof
-from skyloop.keys.identity import make_identity
+from skyloop.network.keys import KeyRing, Lab, load
+from skyloop.network.keys.agreement import Agreement, Proof
+from skyloop.network.keys.identity import make_identity
 from tests.keys.conftest import NOW
 
 TERMS = ("alpha", "run", "jane", "id")

@@ -14,9 +14,9 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ed25519
 
 from skyloop.errors import FileFormatError, UsageError
-from skyloop.keys import Lab, load
-from skyloop.keys.credentials import expiry_warning
-from skyloop.keys.identity import make_identity
+from skyloop.network.keys import Lab, load
+from skyloop.network.keys.credentials import expiry_warning
+from skyloop.network.keys.identity import make_identity
 from tests.keys.conftest import NOW
 
 DAY = timedelta(days=1)
@@ -150,8 +150,8 @@ def test_an_older_roster_is_no_news_and_a_false_one_is_an_error(lab: Lab, jane: 
 
 
 def test_a_roster_of_another_format_is_told(lab: Lab, jane: Path) -> None:
-    from skyloop.keys import roster as rosters
-    from skyloop.keys.roster import Roster
+    from skyloop.network.keys import roster as rosters
+    from skyloop.network.keys.roster import Roster
 
     content = rosters.encode(Roster(9, lab.authority.name, format=2), lab.authority)
     (jane / "roster.json").write_bytes(content)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.errors import UsageError
-from skyloop.keys.files import make_directory, write
+from skyloop.network.keys.files import make_directory, write
 
 
 def test_a_directory_that_cannot_be_made(tmp_path: Path) -> None:

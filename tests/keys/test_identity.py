@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
-from skyloop.keys.identity import MAX_PATTERNS, KeyRole, make_identity, parse_drones
+from skyloop.network.keys.identity import MAX_PATTERNS, KeyRole, make_identity, parse_drones
+from skyloop.network.layout import check_identity
 from skyloop.transport.base import NAME
-from skyloop.transport.fabric.layout import check_identity
 
 NAMES = st.from_regex(NAME, fullmatch=True)
 

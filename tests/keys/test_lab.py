@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
-from skyloop.keys import KeyRole, Lab, Roster, load
-from skyloop.keys.identity import make_identity
+from skyloop.network.keys import KeyRole, Lab, Roster, load
+from skyloop.network.keys.identity import make_identity
 from tests.keys.conftest import NOW
 
 DAY = timedelta(days=1)

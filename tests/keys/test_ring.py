@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.keys import KeyRing, Lab, load
-from skyloop.keys.identity import make_identity
+from skyloop.network.keys import KeyRing, Lab, load
+from skyloop.network.keys.identity import make_identity
 from tests.keys.conftest import NOW
 
 DAY, HOUR = timedelta(days=1), timedelta(hours=1)

@@ -7,8 +7,8 @@ import re
 import msgspec
 import pytest
 
+from skyloop.network import delivery, frames, layout, packets, registry, sealing, settings
 from skyloop.transport.base import MAX_TOPIC
-from skyloop.transport.fabric import delivery, frames, layout, packets, registry, sealing, settings
 from tests.messages.test_codec import PACKETS
 from tests.messages.test_wire_format import FABRIC
 

@@ -13,10 +13,10 @@ from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.metrics import fleet_sources
 from skyloop.messages import EventKind, LinkState, Role, Velocity
 from skyloop.metrics import FAMILIES, Reading, client_readings, proxy_readings, router_readings
+from skyloop.network import FabricServer, FabricSettings
+from skyloop.network.config import free_port
+from skyloop.network.session import Session
 from skyloop.transport.composite import CompositeServer
-from skyloop.transport.fabric import FabricServer, FabricSettings
-from skyloop.transport.fabric.config import free_port
-from skyloop.transport.fabric.session import Session
 from skyloop.transport.testing import header, picture
 from tests.client.scripted import WAIT_S, scripted
 from tests.proxy.fake import Bench

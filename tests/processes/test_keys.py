@@ -13,10 +13,10 @@ import pytest
 
 import skyloop
 from skyloop.errors import AuthorityError, UnknownNameError
-from skyloop.keys import Lab
-from skyloop.keys.identity import make_identity
 from skyloop.messages import EventKind
-from skyloop.transport.fabric.config import free_port
+from skyloop.network.config import free_port
+from skyloop.network.keys import Lab
+from skyloop.network.keys.identity import make_identity
 from tests.processes.conftest import Process, eventually
 
 pytestmark = pytest.mark.process

@@ -16,8 +16,8 @@ import skyloop
 from skyloop.cli.listing import running
 from skyloop.errors import UnknownNameError
 from skyloop.messages import EventKind, LinkState
-from skyloop.transport.fabric import FabricSettings
-from skyloop.transport.fabric.config import free_port
+from skyloop.network import FabricSettings
+from skyloop.network.config import free_port
 from tests.processes.conftest import Process, eventually
 
 pytestmark = pytest.mark.process

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.transport.fabric.config import free_port
+from skyloop.network.config import free_port
 from tests.processes.conftest import Process
 
 pytest.importorskip("zenoh")

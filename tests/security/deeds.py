@@ -11,7 +11,6 @@ import numpy as np
 import zenoh
 
 from skyloop.errors import LinkError
-from skyloop.keys.agreement import Agreement
 from skyloop.messages import (
     Command,
     EmergencyStop,
@@ -29,12 +28,13 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.config import ParameterValue
+from skyloop.network import discovery, layout, packets
+from skyloop.network.admission import JoinRequest
+from skyloop.network.config import Part
+from skyloop.network.keys.agreement import Agreement
+from skyloop.network.sealing import Seal
+from skyloop.network.session import Session, acquire, release
 from skyloop.transport.base import EVENTS, FEEDBACK
-from skyloop.transport.fabric import discovery, layout, packets
-from skyloop.transport.fabric.admission import JoinRequest
-from skyloop.transport.fabric.config import Part
-from skyloop.transport.fabric.sealing import Seal
-from skyloop.transport.fabric.session import Session, acquire, release
 from tests.security.rig import DRONE, Intruder, Rig
 
 LIAR = "f" * 16  #: RUN of a proxy that is none

@@ -15,17 +15,17 @@ from typing import Any
 import zenoh
 
 from skyloop.errors import DecodeError
-from skyloop.keys import KeyRing, Lab, load
-from skyloop.keys.identity import make_identity
 from skyloop.messages import AnyRequest, Hello, Request, Role, Sample, encode
+from skyloop.network import FabricServer, FabricSettings, layout, packets
+from skyloop.network import dial as fabric_dial
+from skyloop.network.admission import Admission, JoinRequest
+from skyloop.network.client import FabricClient
+from skyloop.network.config import free_port
+from skyloop.network.keys import KeyRing, Lab, load
+from skyloop.network.keys.identity import make_identity
+from skyloop.network.sealing import Open
+from skyloop.network.settings import secured
 from skyloop.transport.base import Dialer
-from skyloop.transport.fabric import FabricServer, FabricSettings, layout, packets
-from skyloop.transport.fabric import dial as fabric_dial
-from skyloop.transport.fabric.admission import Admission, JoinRequest
-from skyloop.transport.fabric.client import FabricClient
-from skyloop.transport.fabric.config import free_port
-from skyloop.transport.fabric.sealing import Open
-from skyloop.transport.fabric.settings import secured
 from tests.proxy.fake import App, Bench
 
 DRONE = "alpha"

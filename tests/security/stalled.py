@@ -13,10 +13,10 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
-from skyloop.keys import KeyRing, load
 from skyloop.messages import AnyRequest, Hello, ListParameters, Ping, Request, Role, encode
-from skyloop.transport.fabric import layout, packets
-from skyloop.transport.fabric.admission import Admission, JoinRequest
+from skyloop.network import layout, packets
+from skyloop.network.admission import Admission, JoinRequest
+from skyloop.network.keys import KeyRing, load
 from tests.security.rig import third_party
 
 LISTS, PINGS = 16, 200

@@ -11,8 +11,6 @@ import pytest
 import zenoh
 
 from skyloop.errors import LinkError, UnknownNameError, UsageError
-from skyloop.keys import Lab
-from skyloop.keys.identity import make_identity
 from skyloop.messages import (
     AnyRequest,
     Command,
@@ -25,11 +23,13 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
+from skyloop.network import FabricServer, FabricSettings, layout
+from skyloop.network import dial as fabric_dial
+from skyloop.network.access import access_control
+from skyloop.network.config import free_port
+from skyloop.network.keys import Lab
+from skyloop.network.keys.identity import make_identity
 from skyloop.transport.base import COMMANDS
-from skyloop.transport.fabric import FabricServer, FabricSettings, layout
-from skyloop.transport.fabric import dial as fabric_dial
-from skyloop.transport.fabric.access import access_control
-from skyloop.transport.fabric.config import free_port
 from skyloop.transport.testing import ClientLog, wait_until
 from tests.security.rig import DRONE, Intruder, Rig, keys_of, make_lab, third_party
 

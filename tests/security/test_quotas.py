@@ -11,8 +11,8 @@ import zenoh
 
 from skyloop.errors import DecodeError
 from skyloop.messages import EventKind, Velocity
-from skyloop.transport.fabric import layout, packets
-from skyloop.transport.fabric.admission import (
+from skyloop.network import layout, packets
+from skyloop.network.admission import (
     FOR_PILOTS,
     MAX_CLIENTS,
     PER_KEY,
@@ -22,8 +22,8 @@ from skyloop.transport.fabric.admission import (
     Tokens,
     no_place_reason,
 )
-from skyloop.transport.fabric.config import MAX_MESSAGE_UP
-from skyloop.transport.fabric.discovery import RUNS_PER_NAME, _oldest_of_each, list_proxies
+from skyloop.network.config import MAX_MESSAGE_UP
+from skyloop.network.discovery import RUNS_PER_NAME, _oldest_of_each, list_proxies
 from skyloop.transport.testing import wait_until
 from tests.security.rig import DRONE, Intruder, Rig, make_lab, third_party
 

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 
 from skyloop.messages import Command, EmergencyStop, EventKind, Hover, Refusal, Role, Velocity, encode
+from skyloop.network import FabricServer, FabricSettings
+from skyloop.network import dial as fabric_dial
+from skyloop.network.config import free_port
+from skyloop.network.delivery import RECENT_PACKETS
 from skyloop.transport.base import Dialer, TransportServer
-from skyloop.transport.fabric import FabricServer, FabricSettings
-from skyloop.transport.fabric import dial as fabric_dial
-from skyloop.transport.fabric.config import free_port
-from skyloop.transport.fabric.delivery import RECENT_PACKETS
 from skyloop.transport.local import LocalServer
 from skyloop.transport.local import dial as local_dial
 from skyloop.transport.memory import MemoryServer

@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 
 from skyloop.errors import SkyloopError, UnknownNameError
-from skyloop.keys import Lab, load
 from skyloop.messages import Command, EmergencyStop, Velocity, encode
 from skyloop.messages.codec import SIGNATURE
+from skyloop.network import FabricSettings, layout, packets, sealing
+from skyloop.network import dial as fabric_dial
+from skyloop.network.config import Part, free_port
+from skyloop.network.discovery import runs
+from skyloop.network.keys import Lab, load
+from skyloop.network.session import Session, acquire, release, renewed
+from skyloop.network.settings import secured
 from skyloop.transport.base import FEEDBACK
-from skyloop.transport.fabric import FabricSettings, layout, packets, sealing
-from skyloop.transport.fabric import dial as fabric_dial
-from skyloop.transport.fabric.config import Part, free_port
-from skyloop.transport.fabric.discovery import runs
-from skyloop.transport.fabric.session import Session, acquire, release, renewed
-from skyloop.transport.fabric.settings import secured
 from skyloop.transport.testing import ClientLog, wait_until
 from tests.security.deeds import DEEDS
 from tests.security.rig import DRONE, Rig, keys_of, make_lab
@@ -198,7 +198,7 @@ def test_a_connection_ends_with_its_key_though_a_router_lies_between(rig: Rig, m
         def now(cls, tz: object = None) -> datetime:  # type: ignore[override]
             return datetime.now(UTC) + timedelta(days=31)
 
-    monkeypatch.setattr("skyloop.transport.fabric.registry.datetime", Later)
+    monkeypatch.setattr("skyloop.network.registry.datetime", Later)
     assert "expired" in rig.wendy.closed_by.get(timeout=10.0)
 
 

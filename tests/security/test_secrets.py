@@ -29,9 +29,9 @@ from skyloop.host.fleet import encode_handed, parse_fleet
 from skyloop.host.host import Host
 from skyloop.host.own_process import OwnProcessVehicle
 from skyloop.messages import Capabilities, EventKind, GetParameter, LinkState, Role, Severity
+from skyloop.network.packets import Key
 from skyloop.proxy import Proxy
 from skyloop.proxy.audit import AuditTrail
-from skyloop.transport.fabric.packets import Key
 from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.mavlink.options import options_of as mavlink_options
 from skyloop.vehicles.replay.options import options_of as replay_options

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.keys import Lab
-from skyloop.keys.identity import make_identity
 from skyloop.messages import Applied, Event, EventKind
-from skyloop.transport.fabric.config import free_port
+from skyloop.network.config import free_port
+from skyloop.network.keys import Lab
+from skyloop.network.keys.identity import make_identity
 from tests.processes.conftest import Process, eventually, sockets, start
 
 __all__ = ["sockets", "start"]  # fixtures

@@ -10,16 +10,16 @@ import pytest
 
 from skyloop.errors import LinkError
 from skyloop.messages import LogEntry, encode
+from skyloop.network import FabricServer, FabricSettings, dial, layout, packets
+from skyloop.network import server as fabric_server
+from skyloop.network.client import FabricClient
+from skyloop.network.config import free_port
+from skyloop.network.delivery import Outgoing
+from skyloop.network.publishing import Publisher
+from skyloop.network.sealing import PLAIN
+from skyloop.network.session import Session, release
 from skyloop.transport.base import FEEDBACK, Dialer, TransportServer
 from skyloop.transport.conformance import TransportSuite
-from skyloop.transport.fabric import FabricServer, FabricSettings, dial, layout, packets
-from skyloop.transport.fabric import server as fabric_server
-from skyloop.transport.fabric.client import FabricClient
-from skyloop.transport.fabric.config import free_port
-from skyloop.transport.fabric.delivery import Outgoing
-from skyloop.transport.fabric.publishing import Publisher
-from skyloop.transport.fabric.sealing import PLAIN
-from skyloop.transport.fabric.session import Session, release
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 
 _numbers = itertools.count(1)

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 import zenoh
 
-from skyloop.keys import Lab, load
-from skyloop.keys.identity import make_identity
-from skyloop.transport.fabric import layout
-from skyloop.transport.fabric.access import EGRESS, INGRESS, access_control
-from skyloop.transport.fabric.settings import FabricSettings, secured
+from skyloop.network import layout
+from skyloop.network.access import EGRESS, INGRESS, access_control
+from skyloop.network.keys import Lab, load
+from skyloop.network.keys.identity import make_identity
+from skyloop.network.settings import FabricSettings, secured
 
 LAB = [
     make_identity("jane", "pilot", "alpha*"),

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from skyloop.transport.fabric.delivery import (
+from skyloop.network.delivery import (
     AGAIN_AT_MOST_S,
     AGAIN_S,
     DEPTH,
@@ -17,8 +17,8 @@ from skyloop.transport.fabric.delivery import (
     Incoming,
     Outgoing,
 )
-from skyloop.transport.fabric.handler_queue import IN_A_ROW, HandlerQueue
-from skyloop.transport.fabric.registry import STALLED_S
+from skyloop.network.handler_queue import IN_A_ROW, HandlerQueue
+from skyloop.network.registry import STALLED_S
 
 
 @pytest.mark.parametrize("seed", range(8))

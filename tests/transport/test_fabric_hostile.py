@@ -14,15 +14,15 @@ import pytest
 import zenoh
 
 from skyloop.messages import Command, Hello, ReleaseAuthority, Request, Takeoff, encode
+from skyloop.network import FabricServer, FabricSettings, dial, layout, packets
+from skyloop.network.client import STALLED_S as CLIENT_STALLED_S
+from skyloop.network.client import FabricClient
+from skyloop.network.config import free_port
+from skyloop.network.connection import ServerConnection
+from skyloop.network.delivery import Outgoing
+from skyloop.network.registry import STALLED_S
+from skyloop.network.settings import LEASE_S
 from skyloop.transport.base import FEEDBACK, MAX_PACKET, Peer, results, video
-from skyloop.transport.fabric import FabricServer, FabricSettings, dial, layout, packets
-from skyloop.transport.fabric.client import STALLED_S as CLIENT_STALLED_S
-from skyloop.transport.fabric.client import FabricClient
-from skyloop.transport.fabric.config import free_port
-from skyloop.transport.fabric.connection import ServerConnection
-from skyloop.transport.fabric.delivery import Outgoing
-from skyloop.transport.fabric.registry import STALLED_S
-from skyloop.transport.fabric.settings import LEASE_S
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 
 LOCAL = "127.0.0.1"
@@ -232,7 +232,7 @@ def test_whoever_speaks_another_revision_is_told(scene: Scene) -> None:
 
 
 def test_whoever_joins_and_shows_no_token_is_let_go(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("skyloop.transport.fabric.registry.CONFIRM_S", 0.1)
+    monkeypatch.setattr("skyloop.network.registry.CONFIRM_S", 0.1)
     wish = packets.encode_own(packets.Join(packets.REVISION, scene.server._run))
     (reply,) = scene.intruder.get(layout.join("alpha", "anyone", layout.new_id()), payload=wish, timeout=2)
     assert reply.ok is not None

@@ -10,11 +10,11 @@ import pytest
 pytest.importorskip("zenoh", reason="needs the extra network: skyloop install network")
 
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError
-from skyloop.transport.fabric import client, discovery, layout, packets
-from skyloop.transport.fabric.admission import JoinRequest
-from skyloop.transport.fabric.joining import ProxyWatch, join
-from skyloop.transport.fabric.session import Session
-from skyloop.transport.fabric.settings import FabricSettings
+from skyloop.network import client, discovery, layout, packets
+from skyloop.network.admission import JoinRequest
+from skyloop.network.joining import ProxyWatch, join
+from skyloop.network.session import Session
+from skyloop.network.settings import FabricSettings
 from skyloop.transport.testing import ClientLog
 
 RUN, OTHER = "1" * 16, "2" * 16

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.keys import Identity, KeyRole
 from skyloop.messages import (
     AnyRequest,
     Command,
@@ -19,8 +18,9 @@ from skyloop.messages import (
     decode,
     encode,
 )
-from skyloop.transport.fabric import layout
-from skyloop.transport.fabric.layout import ASK, COMMAND, ORDER, refusal_reply, way_of
+from skyloop.network import layout
+from skyloop.network.keys import Identity, KeyRole
+from skyloop.network.layout import ASK, COMMAND, ORDER, refusal_reply, way_of
 
 OLGA = Identity("olga", KeyRole.OBSERVER)
 HOVER = encode(Command(1, 1, 1, 1, Hover()))

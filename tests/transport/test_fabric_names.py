@@ -10,8 +10,7 @@ import pytest
 import zenoh
 
 from skyloop.errors import LinkError, NameTakenError, UnknownNameError, UsageError
-from skyloop.transport.base import FEEDBACK, Dialer
-from skyloop.transport.fabric import (
+from skyloop.network import (
     FabricServer,
     FabricSettings,
     dial,
@@ -21,8 +20,9 @@ from skyloop.transport.fabric import (
     packets,
     session,
 )
-from skyloop.transport.fabric.config import Part, free_port
-from skyloop.transport.fabric.discovery import renew
+from skyloop.network.config import Part, free_port
+from skyloop.network.discovery import renew
+from skyloop.transport.base import FEEDBACK, Dialer
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 from tests.transport.test_fabric_hostile import stranger
 
@@ -114,7 +114,7 @@ def test_a_proxy_that_appears_while_it_is_looked_for_is_found() -> None:
 
 
 def test_a_proxy_that_is_full_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("skyloop.transport.fabric.registry.MAX_CLIENTS", 1)
+    monkeypatch.setattr("skyloop.network.registry.MAX_CLIENTS", 1)
     at = place()
     with serving("alpha", at) as (_, log):
         dialer: Dialer = dial("alpha", calling(at))

@@ -9,14 +9,14 @@ import pytest
 
 pytest.importorskip("zenoh", reason="needs the extra network: skyloop install network")
 
+from skyloop.network import packets
+from skyloop.network.admission import Admission
+from skyloop.network.connection import ServerConnection
+from skyloop.network.delivery import ACKNOWLEDGE_AFTER, SLOW_S, STANDS_S, AckPolicy, Pace
+from skyloop.network.publishing import Publisher
+from skyloop.network.sealing import PLAIN
+from skyloop.network.session import Session
 from skyloop.transport.base import EVENTS, FEEDBACK, Peer
-from skyloop.transport.fabric import packets
-from skyloop.transport.fabric.admission import Admission
-from skyloop.transport.fabric.connection import ServerConnection
-from skyloop.transport.fabric.delivery import ACKNOWLEDGE_AFTER, SLOW_S, STANDS_S, AckPolicy, Pace
-from skyloop.transport.fabric.publishing import Publisher
-from skyloop.transport.fabric.sealing import PLAIN
-from skyloop.transport.fabric.session import Session
 
 PERIOD_S = 1 / 32
 

@@ -31,8 +31,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.config import AnyRequest
 from skyloop.messages.video import FrameFilter, VideoRequest
-from skyloop.transport.base import MAX_TOPIC
-from skyloop.transport.fabric import (
+from skyloop.network import (
     FabricServer,
     FabricSettings,
     TlsFiles,
@@ -43,10 +42,11 @@ from skyloop.transport.fabric import (
     layout,
     packets,
 )
-from skyloop.transport.fabric.config import Part
-from skyloop.transport.fabric.delivery import ACKNOWLEDGE_AFTER, ACKNOWLEDGE_EVERY_S, AckPolicy, RecentPackets
-from skyloop.transport.fabric.discovery import FORGET_S, UnreachablePeers
-from skyloop.transport.fabric.session import _Pool
+from skyloop.network.config import Part
+from skyloop.network.delivery import ACKNOWLEDGE_AFTER, ACKNOWLEDGE_EVERY_S, AckPolicy, RecentPackets
+from skyloop.network.discovery import FORGET_S, UnreachablePeers
+from skyloop.network.session import _Pool
+from skyloop.transport.base import MAX_TOPIC
 from skyloop.transport.testing import header
 
 TOPICS = st.text(min_size=1, max_size=MAX_TOPIC).filter(lambda text: text.isprintable())
@@ -470,8 +470,8 @@ def test_a_process_may_end_while_a_session_is_being_closed() -> None:
     """``skyloop watch`` ended with exit code 134 and "FATAL: exception not rethrown" (issue 28, C11)."""
     pytest.importorskip("zenoh", reason="needs the extra network: skyloop install network")
     program = (
-        "from skyloop.transport.fabric import FabricSettings, session\n"
-        "from skyloop.transport.fabric.config import Part\n"
+        "from skyloop.network import FabricSettings, session\n"
+        "from skyloop.network.config import Part\n"
         "one = session.acquire(FabricSettings(multicast=False), Part.APP)\n"
         "session.retire(one)\n"
         "session.release(one)\n"

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.transport.fabric.sealing import (
+from skyloop.network.sealing import (
     GENERATIONS,
     PLAIN,
     SWITCH_S,

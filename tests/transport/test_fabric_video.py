@@ -11,8 +11,8 @@ import pytest
 from skyloop.clock import ManualClock
 from skyloop.messages import Encoding, FrameHeader, Intrinsics
 from skyloop.messages.video import VideoRequest
+from skyloop.network.frames import LOST_NS, WINDOW, FramePublisher, Variant
 from skyloop.transport import frame_encoding
-from skyloop.transport.fabric.frames import LOST_NS, WINDOW, FramePublisher, Variant
 from skyloop.transport.testing import header, picture, wait_until
 
 cv2 = pytest.importorskip("cv2", reason="encoded video needs the extra 'network'")

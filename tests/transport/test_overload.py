@@ -155,8 +155,8 @@ def test_a_stalled_proxy_lands_and_refuses_nothing_for_its_age(
 
 
 def test_over_the_network_too() -> None:
-    from skyloop.transport.fabric import FabricServer, FabricSettings, config
-    from skyloop.transport.fabric import dial as dial_fabric
+    from skyloop.network import FabricServer, FabricSettings, config
+    from skyloop.network import dial as dial_fabric
 
     place = (f"127.0.0.1:{config.free_port('127.0.0.1')}",)
     server = FabricServer("late", FabricSettings(listen=place, multicast=False))

@@ -14,13 +14,14 @@ from skyloop.cli.text import columns
 from skyloop.files import expand
 
 if TYPE_CHECKING:
-    from skyloop.keys import Entry
+    from skyloop.network.keys import Entry
 
 keys = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 _EXAMPLE: Final = "Example: skyloop keys "
 Directory = Annotated[
-    Path | None, typer.Option("--dir", metavar="DIR", help="The lab's folder", show_default="~/.config/skyloop/keys")
+    Path | None,
+    typer.Option("--dir", metavar="DIR", help="The lab's folder", show_default="~/.config/skyloop/network/keys"),
 ]
 
 
@@ -38,7 +39,7 @@ def init(
     days: Annotated[int, typer.Option(metavar="N", help="How long it, and so the lab, is valid")] = 1825,
 ) -> None:
     """Make a lab's certificate authority. Who has its folder can make any key: keep it on one machine, with a copy."""
-    from skyloop.keys import Lab
+    from skyloop.network.keys import Lab
 
     lab = Lab.make(_place(directory), days)
     typer.echo(f"{lab.authority.name}: {lab.directory}, valid until {_day(lab.authority.expires)}")
@@ -58,8 +59,8 @@ def issue(
     directory: Directory = None,
 ) -> None:
     """Make a key and a certificate, and the folder that its holder is given. An old key of that name stays valid."""
-    from skyloop.keys import Lab
-    from skyloop.keys.identity import make_identity
+    from skyloop.network.keys import Lab
+    from skyloop.network.keys.identity import make_identity
 
     lab = Lab.open(_place(directory))
     entry = lab.issue(make_identity(name, role, drones), days)
@@ -77,7 +78,7 @@ def show(
 
     Keys that expire within a week, or have expired, are listed on standard error as well.
     """
-    from skyloop.keys.credentials import expiry_warning, read_public
+    from skyloop.network.keys.credentials import expiry_warning, read_public
 
     authority, roster = read_public(_place(directory))
     now = datetime.now(UTC)
@@ -102,7 +103,7 @@ def revoke(
     directory: Directory = None,
 ) -> None:
     """Take an identity off the roster. Its key opens nothing wherever the new roster is in use."""
-    from skyloop.keys import Lab
+    from skyloop.network.keys import Lab
 
     lab = Lab.open(_place(directory))
     entry = lab.revoke(name)

@@ -17,7 +17,7 @@ from skyloop.errors import SkyloopError
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.messages import Feedback, VehicleOverview
-    from skyloop.transport.fabric import FabricSettings
+    from skyloop.network import FabricSettings
 
 ANSWER_WITHIN_S = 1.0
 
@@ -146,7 +146,7 @@ def with_state(row: Row, vehicle: str, uri: str, seen: Feedback | VehicleOvervie
 
 def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
     """Return these proxies with those of the network; one that is reached both ways has one row."""
-    from skyloop.transport.fabric import list_proxies as far
+    from skyloop.network import list_proxies as far
 
     rows = {(row.host, row.pid, row.name): row for row in near}
     for proxy in far(settings):

@@ -13,9 +13,9 @@ from skyloop.cli.naming import MULTICAST
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
+    from skyloop.network import FabricSettings
     from skyloop.proxy.serve import Beside
     from skyloop.transport.base import TransportServer
-    from skyloop.transport.fabric import FabricSettings
 
 MetricsOption = Annotated[
     str | None,
@@ -87,7 +87,7 @@ def places(
     Raises:
         UsageError: An address or the folder is not valid, or no place is named.
     """
-    from skyloop.transport.fabric.environment import serving
+    from skyloop.network.environment import serving
 
     return serving(network, listen=tuple(listen or ()), connect=tuple(connect or ()), multicast=multicast, keys=keys)
 
@@ -103,8 +103,8 @@ def server_ends(settings: FabricSettings | None, group: str | None = None) -> Ma
 
     if settings is None:
         return lambda name, _: LocalServer(name, group=group)
+    from skyloop.network import FabricServer
     from skyloop.transport.composite import CompositeServer
-    from skyloop.transport.fabric import FabricServer
 
     return lambda name, vehicle: CompositeServer(
         [LocalServer(name, group=group), FabricServer(name, settings, vehicle=vehicle)]

@@ -50,9 +50,9 @@ def router(
 
     Each of them connects to a router that it can reach; routers connect to each other.
     """
-    from skyloop.transport.fabric import config
-    from skyloop.transport.fabric.config import Part
-    from skyloop.transport.fabric.session import Session, acquire, release, renewed
+    from skyloop.network import config
+    from skyloop.network.config import Part
+    from skyloop.network.session import Session, acquire, release, renewed
 
     everywhere = f"{config.all_interfaces()}:{PORT}"
     chosen = places(network, listen or [everywhere], connect, multicast, keys)

@@ -24,7 +24,7 @@ from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check
 from skyloop.warmth import PERIOD_S
 
 if TYPE_CHECKING:
-    from skyloop.transport.fabric.settings import FabricSettings
+    from skyloop.network.settings import FabricSettings
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: for a private proxy and its vehicle
@@ -256,7 +256,7 @@ def network_settings(network: NetworkChoice = None, keys: Path | str | None = No
         return network_settings(address, keys)
     if network is False or (network is None and keys is None and not os.environ.get(NETWORK_VARIABLE)):
         return None  # without importing the network's packages
-    from skyloop.transport.fabric.environment import choose
+    from skyloop.network.environment import choose
 
     return choose(network, keys)
 
@@ -278,7 +278,7 @@ def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
     settings = network_settings(network)
     if settings is None:
         return _hinting(_local(name))
-    from skyloop.transport.fabric import dial
+    from skyloop.network import dial
 
     far = dial(name, settings)
     if sys.platform != "linux":
@@ -416,6 +416,6 @@ def running_names(network: NetworkChoice = None) -> list[str]:
     settings = network_settings(network)
     if settings is None:
         return sorted(near)
-    from skyloop.transport.fabric import list_proxies
+    from skyloop.network import list_proxies
 
     return sorted(near | {about.name for about in list_proxies(settings)})

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from skyloop.transport.base import Dialer
 
 if TYPE_CHECKING:
-    from skyloop.transport.fabric import FabricSettings
-    from skyloop.transport.fabric.session import Session
+    from skyloop.network import FabricSettings
+    from skyloop.network.session import Session
 
 
 class Found(NamedTuple):
@@ -111,7 +111,7 @@ class NetworkFinder:
             self._wanted |= {name}
 
     def __call__(self) -> list[Found]:
-        from skyloop.transport.fabric.discovery import runs
+        from skyloop.network.discovery import runs
 
         found = {one.name: one for one in self._local()}
         for name, _ in sorted(runs(self._open())):
@@ -120,7 +120,7 @@ class NetworkFinder:
         return [found[name] for name in sorted(found)]
 
     def close(self) -> None:
-        from skyloop.transport.fabric.session import release
+        from skyloop.network.session import release
 
         with self._lock:
             session, self._session = self._session, None
@@ -128,8 +128,8 @@ class NetworkFinder:
             release(session)
 
     def _open(self) -> Session:
-        from skyloop.transport.fabric.config import Part
-        from skyloop.transport.fabric.session import acquire, release
+        from skyloop.network.config import Part
+        from skyloop.network.session import acquire, release
 
         with self._lock:
             current = self._settings.current()
@@ -142,7 +142,7 @@ class NetworkFinder:
             return self._session
 
     def _found(self, name: str) -> Found:
-        from skyloop.transport.fabric import dial
+        from skyloop.network import dial
 
         with self._lock:
             if name not in self._known:

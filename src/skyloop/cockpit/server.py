@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from skyloop.cockpit.discovery import Finder
     from skyloop.cockpit.sessions import SessionFile
     from skyloop.messages.world import WorldGeometry
-    from skyloop.transport.fabric import FabricSettings
+    from skyloop.network import FabricSettings
 
 NICENESS = 10  #: of the serving thread and of those that it starts: programs that fly come first
 RECORDINGS = Path("recordings")  #: where recordings go by default
@@ -159,14 +159,14 @@ def with_certificate(access: Access, directory: Path) -> Access:
 
     Args:
         access: Without a certificate.
-        directory: Where certificates and their authority are kept (:mod:`skyloop.keys.pages`).
+        directory: Where certificates and their authority are kept (:mod:`skyloop.network.keys.pages`).
 
     Raises:
         UsageError: There is a certificate already, the address can't be certified, or a file can't be used.
         MissingExtraError: The extra ``network`` is not installed.
     """
     from skyloop.cockpit.security import bind_address
-    from skyloop.keys.pages import page_certificate
+    from skyloop.network.keys.pages import page_certificate
 
     if access.tls_cert is not None:
         raise UsageError("--https makes a certificate, and --tls-cert names one: give one of them")

@@ -38,8 +38,8 @@ def serve(settings: VehicleSettings) -> None:
     driver = make_driver(settings.address)
     end: TransportServer = LocalServer(settings.name, group=settings.group)
     if network is not None:
+        from skyloop.network import FabricServer
         from skyloop.transport.composite import CompositeServer
-        from skyloop.transport.fabric import FabricServer
 
         end = CompositeServer([end, FabricServer(settings.name, network, vehicle=str(driver.uri))])
     proxy = Proxy(driver, end, name=settings.name)

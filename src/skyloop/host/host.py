@@ -28,7 +28,7 @@ from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
 
 if TYPE_CHECKING:
-    from skyloop.transport.fabric import FabricSettings
+    from skyloop.network import FabricSettings
 
 LAND_WITHIN_S: Final = 20.0
 FEW: Final = 8  #: vehicles of which one that is flown alone leaves the code of commands cold

@@ -31,7 +31,7 @@ from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
 
 if TYPE_CHECKING:
-    from skyloop.transport.fabric import FabricSettings
+    from skyloop.network import FabricSettings
 
 OPEN_S: Final = 10.0  #: how long a driver may take to open or to close before its vehicle is given up
 _log = logging.getLogger(__name__)
@@ -189,8 +189,8 @@ class SharedVehicle(HostedVehicle):
     def _end(self, address: str) -> TransportServer:
         if self._network is None:
             return self.server
+        from skyloop.network import FabricServer
         from skyloop.transport.composite import CompositeServer
-        from skyloop.transport.fabric import FabricServer
 
         return CompositeServer([self.server, FabricServer(self.settings.name, self._network, vehicle=address)])
 
@@ -268,7 +268,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
     """
     if settings.network is None:
         return None
-    from skyloop.transport.fabric.environment import serving
+    from skyloop.network.environment import serving
 
     keys = expand(settings.keys) if settings.keys is not None else None
     return serving(settings.network, listen=settings.listen, multicast=settings.multicast, keys=keys)

@@ -16,8 +16,8 @@ from skyloop.metrics.endpoint import Endpoint, Source, serve
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
+    from skyloop.network.session import Session
     from skyloop.proxy import Proxy
-    from skyloop.transport.fabric.session import Session
 
 #: Metrics that are one of the proxy's counters: absent ones are 0, except those of a network that is not served.
 _COUNTERS: Final = {

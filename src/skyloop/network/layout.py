@@ -36,7 +36,7 @@ from skyloop.messages.codec import KINDS
 from skyloop.transport.base import FEEDBACK, NAME
 
 if TYPE_CHECKING:
-    from skyloop.keys import Identity
+    from skyloop.network.keys import Identity
 
 ROOT: Final = "skyloop/1"
 ANYONE: Final = "anyone"  #: WHO without keys

@@ -6,10 +6,10 @@ it each function here raises :class:`MissingExtraError`.
 
 from __future__ import annotations
 
-from skyloop.transport.fabric.client import dial
-from skyloop.transport.fabric.discovery import list_proxies
-from skyloop.transport.fabric.packets import ProxyInfo
-from skyloop.transport.fabric.server import FabricServer
-from skyloop.transport.fabric.settings import FabricSettings, TlsFiles
+from skyloop.network.client import dial
+from skyloop.network.discovery import list_proxies
+from skyloop.network.packets import ProxyInfo
+from skyloop.network.server import FabricServer
+from skyloop.network.settings import FabricSettings, TlsFiles
 
 __all__ = ["FabricServer", "FabricSettings", "ProxyInfo", "TlsFiles", "dial", "list_proxies"]

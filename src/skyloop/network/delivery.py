@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.transport.fabric import packets
+from skyloop.network import packets
 
 DEPTH: Final = 256  #: packets to an end that are not acknowledged yet, before further ones are refused
 MAX_BYTES: Final = 1 << 20  #: the same in bytes

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, Protocol
 
 from skyloop.errors import DecodeError
+from skyloop.network import packets
 from skyloop.transport.base import MAX_PACKET
-from skyloop.transport.fabric import packets
 
 if TYPE_CHECKING:
     import zenoh

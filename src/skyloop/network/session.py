@@ -15,9 +15,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import LinkError, MissingExtraError
-from skyloop.transport.fabric import config
-from skyloop.transport.fabric.config import Part
-from skyloop.transport.fabric.settings import FabricSettings
+from skyloop.network import config
+from skyloop.network.config import Part
+from skyloop.network.settings import FabricSettings
 
 if TYPE_CHECKING:
     import zenoh

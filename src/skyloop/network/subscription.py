@@ -11,12 +11,12 @@ import numpy as np
 
 from skyloop.errors import DecodeError
 from skyloop.messages import FrameHeader
+from skyloop.network import layout, packets
+from skyloop.network.delivery import ACKNOWLEDGE_EVERY_S, DEPTH, AckPolicy, RecentPackets
+from skyloop.network.frames import WINDOW
+from skyloop.network.sealing import Opener, contents
+from skyloop.network.session import Session
 from skyloop.transport.base import ClientHandler, video
-from skyloop.transport.fabric import layout, packets
-from skyloop.transport.fabric.delivery import ACKNOWLEDGE_EVERY_S, DEPTH, AckPolicy, RecentPackets
-from skyloop.transport.fabric.frames import WINDOW
-from skyloop.transport.fabric.sealing import Opener, contents
-from skyloop.transport.fabric.session import Session
 
 if TYPE_CHECKING:
     import zenoh

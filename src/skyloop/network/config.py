@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import Any, Final
 
 from skyloop.errors import LinkError, UsageError
-from skyloop.transport.fabric.settings import FabricSettings
+from skyloop.network.settings import FabricSettings
 
 DEFAULT_PORT: Final = 7447  #: Zenoh's
 #: An address that does not answer for so long is given up, and the next one of the same peer is tried.

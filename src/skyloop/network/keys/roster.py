@@ -16,8 +16,8 @@ from typing import Final
 import msgspec
 
 from skyloop.errors import FileFormatError, UsageError
-from skyloop.keys.certificates import Authority
-from skyloop.keys.identity import Identity, KeyRole
+from skyloop.network.keys.certificates import Authority
+from skyloop.network.keys.identity import Identity, KeyRole
 
 FORMAT: Final = 1
 _PURPOSE: Final = b"skyloop roster\n"  # what is signed begins with it: no signature of anything else fits

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from skyloop.errors import DecodeError, LinkError, NoAnswerError, UnknownNameError
-from skyloop.transport.fabric import discovery, layout, packets
-from skyloop.transport.fabric.admission import Admission, JoinRequest
-from skyloop.transport.fabric.session import Session, host_name, load
+from skyloop.network import discovery, layout, packets
+from skyloop.network.admission import Admission, JoinRequest
+from skyloop.network.session import Session, host_name, load
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,6 +10,16 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import DecodeError, LinkError, NoAnswerError, UnknownNameError
+from skyloop.network import layout, packets
+from skyloop.network.admission import Admission
+from skyloop.network.config import Part
+from skyloop.network.delivery import DEPTH, Outgoing, Receiver
+from skyloop.network.discovery import SYNC_S, proxy_reached, renew
+from skyloop.network.joining import ProxyWatch, join
+from skyloop.network.sealing import contents
+from skyloop.network.session import Session, acquire, load, release, retire, undeclare
+from skyloop.network.settings import FabricSettings
+from skyloop.network.subscription import Subscription
 from skyloop.transport.base import (
     MAX_PACKET,
     ClientHandler,
@@ -19,16 +29,6 @@ from skyloop.transport.base import (
     check_packet,
     check_topic,
 )
-from skyloop.transport.fabric import layout, packets
-from skyloop.transport.fabric.admission import Admission
-from skyloop.transport.fabric.config import Part
-from skyloop.transport.fabric.delivery import DEPTH, Outgoing, Receiver
-from skyloop.transport.fabric.discovery import SYNC_S, proxy_reached, renew
-from skyloop.transport.fabric.joining import ProxyWatch, join
-from skyloop.transport.fabric.sealing import contents
-from skyloop.transport.fabric.session import Session, acquire, load, release, retire, undeclare
-from skyloop.transport.fabric.settings import FabricSettings
-from skyloop.transport.fabric.subscription import Subscription
 
 if TYPE_CHECKING:
     import zenoh

@@ -17,9 +17,9 @@ from typing import Final
 
 from skyloop.errors import UsageError
 from skyloop.files import expand
-from skyloop.keys import files
-from skyloop.keys import roster as rosters
-from skyloop.keys.certificates import (
+from skyloop.network.keys import files
+from skyloop.network.keys import roster as rosters
+from skyloop.network.keys.certificates import (
     Authority,
     Certificate,
     PrivateKey,
@@ -31,8 +31,8 @@ from skyloop.keys.certificates import (
     read_certificate,
     read_key,
 )
-from skyloop.keys.identity import Identity, KeyRole
-from skyloop.keys.roster import Roster
+from skyloop.network.keys.identity import Identity, KeyRole
+from skyloop.network.keys.roster import Roster
 
 AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"

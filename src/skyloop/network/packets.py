@@ -88,7 +88,7 @@ class Join(msgspec.Struct, frozen=True, array_like=True):
     host: str = ""  #: for people
     pid: int = 0  #: for people
     program: str = ""  #: for people
-    proof: bytes = b""  #: with keys: whose it is, see :mod:`skyloop.keys.agreement`
+    proof: bytes = b""  #: with keys: whose it is, see :mod:`skyloop.network.keys.agreement`
 
 
 class Welcome(msgspec.Struct, frozen=True, array_like=True):

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.errors import UsageError
-from skyloop.keys import certificates, files
-from skyloop.keys.certificates import Authority
+from skyloop.network.keys import certificates, files
+from skyloop.network.keys.certificates import Authority
 
 FOLDER: Final = "pages"  #: in the lab's folder
 AUTHORITY_DAYS: Final = 1825

@@ -13,19 +13,19 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from skyloop.errors import DecodeError, LinkError
+from skyloop.network import layout, packets
+from skyloop.network.admission import MAX_CLIENTS, Admission, Tokens, admit, no_place_reason
+from skyloop.network.connection import Sender, ServerConnection
+from skyloop.network.handler_queue import HandlerQueue
+from skyloop.network.publishing import Publisher
+from skyloop.network.sealing import Seal, TopicSeal
+from skyloop.network.session import load
 from skyloop.transport.base import NOBODY, Peer, ServerHandler
-from skyloop.transport.fabric import layout, packets
-from skyloop.transport.fabric.admission import MAX_CLIENTS, Admission, Tokens, admit, no_place_reason
-from skyloop.transport.fabric.connection import Sender, ServerConnection
-from skyloop.transport.fabric.handler_queue import HandlerQueue
-from skyloop.transport.fabric.publishing import Publisher
-from skyloop.transport.fabric.sealing import Seal, TopicSeal
-from skyloop.transport.fabric.session import load
 
 if TYPE_CHECKING:
     import zenoh
 
-    from skyloop.keys import KeyRing
+    from skyloop.network.keys import KeyRing
 
 CONFIRM_S: Final = 3.0  #: how long an application may take to show its token after it was let in
 #: An application that acknowledges nothing of what is sent to it for so long is disconnected. Its end of the transport

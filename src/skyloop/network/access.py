@@ -4,7 +4,7 @@ A node applies it on each of its links to the node at the other end, by the comm
 that identity may *publish* passes inward (ingress), what it may *subscribe* to passes outward (egress), and nothing
 else passes. So each end protects itself and relies on nobody else's configuration. A router may publish and subscribe
 to everything, and applies the rules to its own neighbours; what it passes on is sealed besides, so that it cannot forge
-anything (:mod:`skyloop.transport.fabric.sealing`).
+anything (:mod:`skyloop.network.sealing`).
 
 The two directions mirror each other: what an application publishes, proxies subscribe to. Declarations and queries
 count as messages in the direction in which they travel: the declaration of a subscriber is published.
@@ -15,8 +15,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
-from skyloop.keys.identity import ALL_DRONES, Identity, KeyRole
-from skyloop.transport.fabric import layout
+from skyloop.network import layout
+from skyloop.network.keys.identity import ALL_DRONES, Identity, KeyRole
 
 INGRESS: Final = "ingress"
 EGRESS: Final = "egress"

@@ -8,13 +8,13 @@ from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Final
 
 from skyloop.messages import FrameHeader, encode
+from skyloop.network import layout, packets
+from skyloop.network.connection import ServerConnection
+from skyloop.network.delivery import Pace
+from skyloop.network.frames import FramePublisher, Variant
+from skyloop.network.sealing import Sealer
+from skyloop.network.session import Session, load
 from skyloop.transport.base import MAX_SUBSCRIPTIONS, Pixels, results, stream, too_many_topics, video
-from skyloop.transport.fabric import layout, packets
-from skyloop.transport.fabric.connection import ServerConnection
-from skyloop.transport.fabric.delivery import Pace
-from skyloop.transport.fabric.frames import FramePublisher, Variant
-from skyloop.transport.fabric.sealing import Sealer
-from skyloop.transport.fabric.session import Session, load
 
 if TYPE_CHECKING:
     import zenoh

@@ -9,13 +9,13 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from skyloop.errors import DecodeError, LinkError
-from skyloop.transport.fabric import layout, packets
-from skyloop.transport.fabric.sealing import PLAIN, TRAILER, Open, Opener, Seal, Sealer
+from skyloop.network import layout, packets
+from skyloop.network.sealing import PLAIN, TRAILER, Open, Opener, Seal, Sealer
 
 if TYPE_CHECKING:
     from datetime import datetime
 
-    from skyloop.keys import Identity, KeyRing
+    from skyloop.network.keys import Identity, KeyRing
 
 MAX_CLIENTS: Final = 256  #: connections in all: each costs memory, and its share of the thread that calls the handler
 #: Of one key. A program has one connection to a drone; a lab's cockpit and its recorders and workers share a key.
@@ -62,7 +62,7 @@ def admit(
     """
     if ring is None or topics is None:
         return Admission(packets.encode_own(packets.Welcome(packets.REVISION, run)))
-    from skyloop.keys.agreement import Agreement
+    from skyloop.network.keys.agreement import Agreement
 
     proof, agreed = Agreement(ring, *_terms(name, run, sender)).answer(request.proof)
     identity = agreed.identity
@@ -94,7 +94,7 @@ class JoinRequest:
         self._sender = sender
         self.proof = b""
         if ring is not None:
-            from skyloop.keys.agreement import Agreement
+            from skyloop.network.keys.agreement import Agreement
 
             self._agreement = Agreement(ring, *_terms(name, run, sender))
             self.proof = self._agreement.offer()

@@ -16,11 +16,11 @@ from typing import Any, Final
 import msgspec
 
 from skyloop.errors import DecodeError
-from skyloop.transport.fabric import config, layout, packets
-from skyloop.transport.fabric.config import Part
-from skyloop.transport.fabric.packets import ProxyInfo
-from skyloop.transport.fabric.session import Session, acquire, configure, load, release, retire
-from skyloop.transport.fabric.settings import FabricSettings
+from skyloop.network import config, layout, packets
+from skyloop.network.config import Part
+from skyloop.network.packets import ProxyInfo
+from skyloop.network.session import Session, acquire, configure, load, release, retire
+from skyloop.network.settings import FabricSettings
 
 #: How long after it was opened a session has found who can be found at once: by multicast, or at the addresses given.
 SETTLE_S: Final = 0.6

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.errors import DecodeError, FileFormatError, MissingExtraError, UsageError
-from skyloop.keys.identity import Identity, KeyRole, make_identity
+from skyloop.network.keys.identity import Identity, KeyRole, make_identity
 
 try:
     from cryptography import x509

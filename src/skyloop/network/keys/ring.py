@@ -8,9 +8,9 @@ from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from skyloop.errors import UsageError
-from skyloop.keys.credentials import Credentials
-from skyloop.keys.identity import Identity
-from skyloop.keys.roster import Roster
+from skyloop.network.keys.credentials import Credentials
+from skyloop.network.keys.identity import Identity
+from skyloop.network.keys.roster import Roster
 
 AGAIN: Final = timedelta(hours=1)  #: how often an expiry that is near is announced
 

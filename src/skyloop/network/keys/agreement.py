@@ -21,9 +21,9 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from skyloop.errors import DecodeError, LinkError, UsageError
-from skyloop.keys import certificates
-from skyloop.keys.identity import Identity
-from skyloop.keys.ring import KeyRing
+from skyloop.network.keys import certificates
+from skyloop.network.keys.identity import Identity
+from skyloop.network.keys.ring import KeyRing
 
 SECRET_BYTES: Final = 32
 _PURPOSE: Final = "fabric connection 1"  # what is signed begins with it: no signature of anything else fits

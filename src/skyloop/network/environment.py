@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.errors import Hint, UsageError
-from skyloop.transport.fabric import config
-from skyloop.transport.fabric.settings import LEASE_S, MAX_LEASE_S, FabricSettings, secured
+from skyloop.network import config
+from skyloop.network.settings import LEASE_S, MAX_LEASE_S, FabricSettings, secured
 
 _log = logging.getLogger(__name__)
 
@@ -128,7 +128,7 @@ def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
     Raises:
         UsageError: The folder is not valid, or an address does not go with keys.
     """
-    from skyloop.keys import load  # with keys only: it needs cryptography
+    from skyloop.network.keys import load  # with keys only: it needs cryptography
 
     found = secured(plain, load(folder))
     config.endpoints_of((*found.listen, *found.connect), found)  # not all that are good without keys are with them

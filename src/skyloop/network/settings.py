@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import LinkError, UsageError
-from skyloop.transport.fabric.layout import ANYONE, check_identity
+from skyloop.network.layout import ANYONE, check_identity
 
 if TYPE_CHECKING:
-    from skyloop.keys import Credentials, Identity, KeyRing
+    from skyloop.network.keys import Credentials, Identity, KeyRing
 
 LEASE_S: Final = 0.7  #: without a sign of life for so long a peer is gone, if it asks for nothing else
 MAX_LEASE_S: Final = 10.0
@@ -92,8 +92,8 @@ class FabricSettings:
 
 def secured(settings: FabricSettings, credentials: Credentials) -> FabricSettings:
     """Return these settings with a key: mutual TLS over QUIC, and access control by the roster that came with it."""
-    from skyloop.keys import KeyRing  # with keys only: these need cryptography
-    from skyloop.transport.fabric.access import access_control
+    from skyloop.network.access import access_control
+    from skyloop.network.keys import KeyRing  # with keys only: these need cryptography
 
     return replace(
         settings,

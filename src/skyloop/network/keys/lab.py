@@ -18,12 +18,12 @@ from typing import Final
 import msgspec
 
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.keys import certificates, files
-from skyloop.keys import roster as rosters
-from skyloop.keys.certificates import Authority
-from skyloop.keys.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, ROSTER_FILE
-from skyloop.keys.identity import Identity
-from skyloop.keys.roster import Entry, Roster
+from skyloop.network.keys import certificates, files
+from skyloop.network.keys import roster as rosters
+from skyloop.network.keys.certificates import Authority
+from skyloop.network.keys.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, ROSTER_FILE
+from skyloop.network.keys.identity import Identity
+from skyloop.network.keys.roster import Entry, Roster
 
 AUTHORITY_DAYS: Final = 1825  #: how long a lab's authority is valid by default
 IDENTITY_DAYS: Final = 30.0  #: how long an identity is
