@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from skyloop.drivers.camera_source import source_of
+from skyloop.drivers.h264 import PPS, SPS, START, unit_type, units
 from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.recording_sink import RecordingSink, SeenPicture
 from skyloop.errors import UsageError
@@ -21,7 +22,6 @@ from skyloop.pyav import new_decoder
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.ardrone.wire.pave import Codec
 from skyloop.vehicles.emulation.encoders import Encoded, Encoder, Format
-from skyloop.wire.h264 import PPS, SPS, START, unit_type, units
 from tests.drivers.mavlink.film import FPS, GROUP, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
 from tests.drivers.mavlink.rtsp_server import HOST, RtpPacker, RtspServer
 

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.drivers.backlog import Coded
+from skyloop.drivers.h264 import SPS, START, Inspector, unit_type, units
 from skyloop.drivers.live_container import HOPELESS_S, STRICT_S, LiveDecoder, Piece
 from skyloop.errors import UnsupportedError
 from skyloop.vehicles.ardrone.wire.pave import Codec
 from skyloop.vehicles.emulation.encoders import Encoder, Format
-from skyloop.wire.h264 import SPS, START, Inspector, unit_type, units
 from tests.drivers.mavlink.film import FPS, GROUP, HEIGHT, WIDTH, Film
 
 av = pytest.importorskip("av")

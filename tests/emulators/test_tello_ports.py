@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from skyloop.drivers.h264 import parse_sequence, units
 from skyloop.errors import LinkError, UsageError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
@@ -17,7 +18,6 @@ from skyloop.vehicles.tello.emulator import Faults, TelloFirmware, with_tellos
 from skyloop.vehicles.tello.emulator.emulator import FULL_KBPS, LEAST_KBPS, automatic_kbps
 from skyloop.vehicles.tello.wire.state import parse
 from skyloop.vehicles.tello.wire.video import PIECE, AccessUnit, Assembly
-from skyloop.wire.h264 import parse_sequence, units
 from tests.drivers.tello.addresses import Addresses
 
 pytest.importorskip("av")

@@ -90,9 +90,9 @@ def ardrone(data: bytes) -> None:
 
 def tello(data: bytes) -> None:
     """What a Tello sends."""
+    from skyloop.drivers import h264
     from skyloop.vehicles.tello.wire import commands, state
     from skyloop.vehicles.tello.wire.video import Assembly
-    from skyloop.wire import h264
 
     with suppress(DecodeError):
         state.parse(data)
@@ -142,7 +142,7 @@ def vrpn(data: bytes) -> None:
     """What a motion capture server sends by VRPN, or whoever pretends to be one; what comes out goes on as frames."""
     from skyloop.motion_capture.pose import plausible
     from skyloop.motion_capture.vrpn import SensorSelection
-    from skyloop.wire.vrpn import Decoder
+    from skyloop.motion_capture.vrpn_wire import Decoder
 
     decoder, selection = Decoder(), SensorSelection(["Tracker"])
     with suppress(DecodeError):

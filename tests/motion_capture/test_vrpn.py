@@ -19,9 +19,9 @@ from skyloop.motion_capture import vrpn as client
 from skyloop.motion_capture.capture import MAX_UNKNOWN, MotionCapture
 from skyloop.motion_capture.source import ChildSource
 from skyloop.motion_capture.vrpn import SETTLE_S, SensorSelection, split_name
+from skyloop.motion_capture.vrpn_wire import COOKIE, TrackerPose
 from skyloop.motion_capture.worker import RawFrame
 from skyloop.transport.testing import wait_until
-from skyloop.wire.vrpn import COOKIE, TrackerPose
 from tests.motion_capture import vrpn as server
 from tests.motion_capture.moving import BODIES, pose
 from tests.processes.conftest import Process

@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from skyloop.drivers.h264 import START, unit_type, units
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.logfile.reader import Recording
 from skyloop.recording.review import stream_copy
 from skyloop.recording.review.stream_copy import contents, numbered
 from skyloop.recording.review.video import Videos, export_mp4
-from skyloop.wire.h264 import START, unit_type, units
 from tests.cli.conftest import Ended
 from tests.recording.streams import GROUP, STEP_NS, Unit, film, write_film
 

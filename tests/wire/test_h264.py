@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyloop.drivers.h264 import PPS, SPS, START, Inspector, Sequence, Unit, parse_sequence, unit_type, units
 from skyloop.errors import DecodeError
-from skyloop.wire.h264 import PPS, SPS, START, Inspector, Sequence, Unit, parse_sequence, unit_type, units
 
 av = pytest.importorskip("av")
 KEYS = "keyint=6:min-keyint=6:scenecut=0:repeat-headers=1"

@@ -16,13 +16,13 @@ import numpy as np
 
 from skyloop.clock import Clock, nanoseconds
 from skyloop.drivers.backlog import Coded
+from skyloop.drivers.h264 import Inspector, Unit
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.live_video import Decoded
 from skyloop.errors import UnsupportedError
 from skyloop.messages.encoded import H264
 from skyloop.pyav import new_decoder
 from skyloop.vehicles.ardrone.pave_decoder import av, limit_memory
-from skyloop.wire.h264 import Inspector, Unit
 
 if TYPE_CHECKING:
     from av.container import InputContainer

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyloop.drivers.h264 import START, Slice, parse_sequence, parse_slice, units
 from skyloop.errors import DecodeError
 from skyloop.vehicles.tello.wire.video import MAX_PICTURE, PIECE, AccessUnit, Assembly, pieces
-from skyloop.wire.h264 import START, Slice, parse_sequence, parse_slice, units
 
 #: Of a real Tello.
 SPS = bytes.fromhex("674d402895a03c05b9")

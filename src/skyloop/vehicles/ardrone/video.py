@@ -20,6 +20,7 @@ import numpy as np
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.backlog import Coded
 from skyloop.drivers.base import Sink
+from skyloop.drivers.h264 import Unit
 from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.live_video import Decoded, Decoder, LiveVideo, Picture, Stream, VideoEvent
@@ -30,7 +31,6 @@ from skyloop.messages import CameraInfo, Intrinsics
 from skyloop.messages.encoded import H264
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame, PaveParser
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture, is_intra, is_p264
-from skyloop.wire.h264 import Unit
 
 # Cameras -------------------------------------------------------------------------------------------------------------
 

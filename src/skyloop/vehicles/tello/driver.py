@@ -7,6 +7,7 @@ from typing import Final
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.backlog import Coded
 from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.h264 import Unit
 from skyloop.drivers.live_video import LiveVideo, Picture, VideoEvent
 from skyloop.drivers.stream_relay import StreamRelay
 from skyloop.drivers.uri import VehicleUri
@@ -20,7 +21,6 @@ from skyloop.vehicles.tello.parameters import DroneSettings
 from skyloop.vehicles.tello.protocol import TelloSession
 from skyloop.vehicles.tello.video import TelloVideo, VideoStream, cameras_of, intrinsics_for
 from skyloop.vehicles.tello.wire.video import AccessUnit
-from skyloop.wire.h264 import Unit
 
 ACTIONS: Final = frozenset(
     {"idle", "takeoff", "hover", "land", "velocity", "attitude", "emergency_stop", "reset_emergency"}

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
+from skyloop.drivers.h264 import Unit
 from skyloop.drivers.live_container import Units
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages.encoded import H264
 from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder, av, limit_memory
 from skyloop.vehicles.ardrone.wire.pave import Codec, PaveFrame, PaveParser
-from skyloop.wire.h264 import Unit
 
 if TYPE_CHECKING:
     from av.container import InputContainer

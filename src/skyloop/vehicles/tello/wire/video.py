@@ -9,10 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from skyloop.drivers.h264 import (
+    IDR,
+    PPS,
+    SLICE,
+    SPS,
+    START,
+    Sequence,
+    Slice,
+    missing_between,
+    parse_sequence,
+    parse_slice,
+)
+from skyloop.drivers.h264 import unit_type as type_of
+from skyloop.drivers.h264 import units as units_of
 from skyloop.errors import DecodeError
-from skyloop.wire.h264 import IDR, PPS, SLICE, SPS, START, Sequence, Slice, missing_between, parse_sequence, parse_slice
-from skyloop.wire.h264 import unit_type as type_of
-from skyloop.wire.h264 import units as units_of
 
 PIECE: Final = 1460  #: bytes of every datagram of a picture but its last
 MAX_PICTURE: Final = 1 << 19  #: bytes; real ones have a fiftieth of that
