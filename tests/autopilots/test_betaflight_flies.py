@@ -131,7 +131,7 @@ def _comes_back_after_its_death(drone: skyloop.Drone, folder: Path) -> None:
 
 
 def _survives_a_cut(drone: skyloop.Drone) -> None:
-    """It goes on level, sinking a little, and is flown on: as set up by ``skyloop.vehicles.sim.firmware.betaflight.SETTINGS``."""
+    """It goes on level, sinking a little, and is flown on: as set up by ``SETTINGS`` of Betaflight's coupling."""
     climb_to(drone, 2.2)
     drone.hover()
     drone.config["sim.link"] = False

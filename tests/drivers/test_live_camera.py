@@ -20,7 +20,6 @@ from skyloop.errors import UsageError
 from skyloop.messages import EventKind, Intrinsics
 from skyloop.pyav import new_decoder
 from skyloop.transport.testing import wait_until
-from skyloop.vehicles.ardrone.wire.pave import Codec
 from skyloop.vehicles.emulation.encoders import Encoded, Encoder, Format
 from tests.drivers.mavlink.film import FPS, GROUP, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
 from tests.drivers.mavlink.rtsp_server import HOST, RtpPacker, RtspServer
@@ -323,7 +322,7 @@ def test_a_stream_without_keys_is_left_to_ffmpeg_after_a_while_and_that_is_told(
 
 def test_another_size_is_shown_and_handed_on_from_its_key_on() -> None:
     small = Film()
-    small._encoder = Encoder(Format(Codec.MPEG4_AVC, WIDTH // 2, HEIGHT // 2, 0), FPS, 2000, group=GROUP)
+    small._encoder = Encoder(Format("h264", WIDTH // 2, HEIGHT // 2, 0), FPS, 2000, group=GROUP)
     sink = RecordingSink(record=True)
     with RtspServer(Film().next().payload) as server, camera(server.address, sink):
         with Projector(server.send):

@@ -16,7 +16,6 @@ from skyloop.drivers.backlog import Coded
 from skyloop.drivers.h264 import SPS, START, Inspector, unit_type, units
 from skyloop.drivers.live_container import HOPELESS_S, STRICT_S, LiveDecoder, Piece
 from skyloop.errors import UnsupportedError
-from skyloop.vehicles.ardrone.wire.pave import Codec
 from skyloop.vehicles.emulation.encoders import Encoder, Format
 from tests.drivers.mavlink.film import FPS, GROUP, HEIGHT, WIDTH, Film
 
@@ -122,7 +121,7 @@ def test_cut_parameters_are_those_of_before() -> None:
 
 
 def test_another_size_is_shown_from_its_key_on() -> None:
-    small = Encoder(Format(Codec.MPEG4_AVC, WIDTH // 2, HEIGHT // 2, 0), FPS, 500, group=GROUP)
+    small = Encoder(Format("h264", WIDTH // 2, HEIGHT // 2, 0), FPS, 500, group=GROUP)
     other = []
     for number in range(GROUP + 2):
         encoded = small.encode(right()[number])

@@ -16,7 +16,6 @@ from skyloop.messages.encoded import H264
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.output import RecordingFile
 from skyloop.recording.translation import Picture, Translator
-from skyloop.vehicles.ardrone.wire.pave import Codec
 from skyloop.vehicles.emulation.encoders import Encoder, Format
 
 MS = 1_000_000
@@ -46,7 +45,7 @@ class Unit:
 @cache
 def film(count: int = 20, width: int = 64, height: int = 48, first: int = 1, seed: int = 1) -> tuple[Unit, ...]:
     """A moving bar over noise; a key every five pictures."""
-    encoder = Encoder(Format(Codec.MPEG4_AVC, width, height, 0), 25.0, 500, group=GROUP)
+    encoder = Encoder(Format("h264", width, height, 0), 25.0, 500, group=GROUP)
     picture = np.random.default_rng(seed).integers(0, 255, (height, width, 3), np.uint8)
     units = []
     for n in range(count):

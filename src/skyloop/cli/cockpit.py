@@ -70,8 +70,8 @@ def cockpit(
 
     It is open to programs of the same user on this machine only, unless tokens or certificates let others in.
     """
-    from skyloop.client.connect import network_settings
     from skyloop.cockpit import Access, serve_cockpit, with_certificate
+    from skyloop.network.environment import choose
 
     access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()), pair)
     if https:
@@ -82,7 +82,7 @@ def cockpit(
         port=port,
         access=access,
         recordings=recordings,
-        network=network_settings(),
+        network=choose(),
         world=world,
         metrics=metrics,
     )

@@ -138,11 +138,12 @@ def _chosen(
     if names or others:
         raise UsageError("--all is every drone: give it alone, or names")
     from skyloop.cli.listing import none_runs
-    from skyloop.client.connect import network_settings, running_names
+    from skyloop.client.connect import running_names
+    from skyloop.network.environment import choose
 
     found = running_names()
     if not found:
-        raise LinkError(f"no drone is found. {none_runs(network_settings())}")
+        raise LinkError(f"no drone is found. {none_runs(choose())}")
     return found
 
 

@@ -49,10 +49,10 @@ def list_proxies(
 
     Those of this host, and with --network those that can be reached over the network.
     """
-    from skyloop.client.connect import network_settings
+    from skyloop.network.environment import choose
 
     join_network(network, keys)
-    settings = network_settings()
+    settings = choose()
     rows = running(settings)
     if json:
         typer.echo(msgspec.json.encode(rows).decode())
@@ -158,9 +158,9 @@ def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
 
 def describe(name: str) -> Row:
     """Return what the proxy with this name reports of itself, on this host or the network."""
-    from skyloop.client.connect import network_settings
+    from skyloop.network.environment import choose
 
-    return described(Row(name, transport=""), network_settings())
+    return described(Row(name, transport=""), choose())
 
 
 def described(row: Row, settings: FabricSettings | None) -> Row:

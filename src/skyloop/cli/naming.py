@@ -111,9 +111,9 @@ def join_network(network: str | None, keys: Path | None) -> None:
     """
     if network is None and keys is None:
         return
-    from skyloop.client.connect import network_settings
+    from skyloop.network.environment import choose
 
-    network_settings(network, keys)  # refuses what is not valid
+    choose(network, keys)  # refuses what is not valid
     for variable, value in ((NETWORK_VARIABLE, network), (KEYS_VARIABLE, keys)):
         if value is not None:
             os.environ[variable] = str(value)

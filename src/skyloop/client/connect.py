@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import wraps
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar, Unpack
+from typing import Any, Final, Literal, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar, Unpack
 
 from skyloop.client.authority import Authority, check_seconds
 from skyloop.client.connection import Scheduler
@@ -19,17 +19,16 @@ from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
 from skyloop.client.swarm import OnError, Swarm, check_policy, in_parallel
 from skyloop.client.warm_up import keeper
-from skyloop.errors import Hint, LinkError, SwarmError, UnknownNameError, UsageError
+from skyloop.errors import Hint, LinkError, MissingExtraError, SwarmError, UnknownNameError, UsageError
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 from skyloop.warmth import PERIOD_S
-
-if TYPE_CHECKING:
-    from skyloop.network.settings import FabricSettings
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: for a private proxy and its vehicle
 #: Entry points by the scheme of an address: functions that take the address and return a :class:`Connector`, or None.
 CONNECTORS: Final = "skyloop.connectors"
+#: Entry points of what reaches proxies beyond this host: a module as :class:`NetworkTransport`.
+NETWORKS: Final = "skyloop.networks"
 
 
 P = ParamSpec("P")
@@ -55,7 +54,28 @@ class Network:
     keys: Path | str | None = None
 
 
-NetworkChoice: TypeAlias = "Network | FabricSettings | bool | str | None"
+class NetworkSettings(Protocol):
+    """How the network is reached: made, and understood, by the :class:`NetworkTransport` alone."""
+
+    @property
+    def reach(self) -> str:
+        """Where proxies are searched for, for people."""
+
+
+class NetworkTransport(Protocol):
+    """What a package brings that carries connections beyond this host; :mod:`skyloop.network` is one."""
+
+    def choose(self, network: bool | str | NetworkSettings | None, keys: Path | str | None) -> NetworkSettings | None:
+        """Return how the network is reached; None to stay on this host. Raises :class:`UsageError`."""
+
+    def dial(self, name: str, settings: NetworkSettings) -> Dialer:
+        """Return a dialer of the proxy with this name."""
+
+    def list_proxies(self, settings: NetworkSettings) -> Iterable[Any]:
+        """Return what runs now: each has a ``name``."""
+
+
+NetworkChoice: TypeAlias = "Network | NetworkSettings | bool | str | None"
 
 
 class ConnectOptions(TypedDict, total=False):
@@ -239,7 +259,7 @@ class Connector(Protocol):
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 
 
-def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
+def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> NetworkSettings | None:
     """Return how to search the network; None if it is not to be searched.
 
     Args:
@@ -256,9 +276,14 @@ def network_settings(network: NetworkChoice = None, keys: Path | str | None = No
         return network_settings(address, keys)
     if network is False or (network is None and keys is None and not os.environ.get(NETWORK_VARIABLE)):
         return None  # without importing the network's packages
-    from skyloop.network.environment import choose
+    return _network().choose(network, keys)
 
-    return choose(network, keys)
+
+def _network() -> NetworkTransport:
+    for entry in entry_points(group=NETWORKS):
+        transport: NetworkTransport = entry.load()
+        return transport
+    raise MissingExtraError("the network", "network", cause="no package brings a transport for it")
 
 
 def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
@@ -278,9 +303,7 @@ def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
     settings = network_settings(network)
     if settings is None:
         return _hinting(_local(name))
-    from skyloop.network import dial
-
-    far = dial(name, settings)
+    far = _network().dial(name, settings)
     if sys.platform != "linux":
         return far
     near = _local(name)
@@ -416,6 +439,4 @@ def running_names(network: NetworkChoice = None) -> list[str]:
     settings = network_settings(network)
     if settings is None:
         return sorted(near)
-    from skyloop.network import list_proxies
-
-    return sorted(near | {about.name for about in list_proxies(settings)})
+    return sorted(near | {about.name for about in _network().list_proxies(settings)})

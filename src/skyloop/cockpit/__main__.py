@@ -11,10 +11,10 @@ import threading
 from pathlib import Path
 
 from skyloop.child_process import on_parent_end
-from skyloop.client.connect import network_settings
 from skyloop.cockpit.addresses import DEFAULT_PORT
 from skyloop.cockpit.server import RECORDINGS, serve_cockpit
 from skyloop.errors import SkyloopError
+from skyloop.network.environment import choose
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
             recordings=given.recordings,
             on_ready=lambda address: print(address, flush=True),
             stop=stop,
-            network=network_settings(),
+            network=choose(),
         )
     except SkyloopError as error:
         print(f"cockpit: {error}", file=sys.stderr)

@@ -19,10 +19,14 @@ from skyloop.drivers.backlog import Coded
 from skyloop.drivers.h264 import Inspector, Unit
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.live_video import Decoded
-from skyloop.errors import UnsupportedError
+from skyloop.errors import MissingExtraError, UnsupportedError
 from skyloop.messages.encoded import H264
-from skyloop.pyav import new_decoder
-from skyloop.vehicles.ardrone.pave_decoder import av, limit_memory
+from skyloop.pyav import limit_memory, new_decoder
+
+try:
+    import av
+except ImportError as error:
+    raise MissingExtraError("video://", "video", cause=str(error)) from error
 
 if TYPE_CHECKING:
     from av.container import InputContainer

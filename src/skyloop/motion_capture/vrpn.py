@@ -10,9 +10,9 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import DecodeError, LinkError, UsageError
+from skyloop.motion_capture import vrpn_wire as vrpn
 from skyloop.motion_capture.address import System
 from skyloop.motion_capture.worker import RawFrame, Seen
-from skyloop.wire import vrpn
 
 CONNECT_S: Final = 1.0  #: how long a server may take to accept
 AGAIN_S: Final = 0.5  #: pause before the next attempt to connect

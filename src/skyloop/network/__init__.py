@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from skyloop.network.client import dial
 from skyloop.network.discovery import list_proxies
+from skyloop.network.environment import choose
 from skyloop.network.packets import ProxyInfo
 from skyloop.network.server import FabricServer
 from skyloop.network.settings import FabricSettings, TlsFiles
 
-__all__ = ["FabricServer", "FabricSettings", "ProxyInfo", "TlsFiles", "dial", "list_proxies"]
+__all__ = ["FabricServer", "FabricSettings", "ProxyInfo", "TlsFiles", "choose", "dial", "list_proxies"]

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.vehicles.ardrone.wire.pave import Codec
 from skyloop.vehicles.emulation.encoders import Encoded, Encoder, Format
 
 BITS, STRIPE, HEIGHT = 12, 16, 64
@@ -38,7 +37,7 @@ class Film:
     """Encodes the next picture."""
 
     def __init__(self) -> None:
-        self._encoder = Encoder(Format(Codec.MPEG4_AVC, WIDTH, HEIGHT, 0), FPS, 2000, group=GROUP)
+        self._encoder = Encoder(Format("h264", WIDTH, HEIGHT, 0), FPS, 2000, group=GROUP)
         self.number = 0
 
     def next(self) -> Encoded:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, Literal
 
 from skyloop.errors import MissingExtraError
-from skyloop.pyav import limit_memory, new_decoder
+from skyloop.pyav import new_decoder
 from skyloop.vehicles.ardrone.wire.pave import Codec, PaveFrame
 
 try:
@@ -17,7 +17,7 @@ except ImportError as error:
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
-__all__ = ["PaveDecoder", "av", "limit_memory"]
+__all__ = ["PaveDecoder", "av"]
 
 _DECODERS: Final[dict[int, Literal["mpeg4", "h264"]]] = {Codec.MPEG4_VISUAL: "mpeg4", Codec.MPEG4_AVC: "h264"}
 # FFmpeg refuses an MPEG-4 frame now and then that is padded by a single bit, unless the sequence's end follows.

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import MissingExtraError
-from skyloop.vehicles.ardrone.wire.pave import Codec
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
@@ -28,7 +27,7 @@ _X264: Final = {"preset": "ultrafast", "tune": "zerolatency"}
 class Format:
     """Format of a stream, as the header of its frames has it."""
 
-    codec: Codec
+    codec: Literal["h264", "mpeg4"]
     width: int
     height: int
     stream_id: int
@@ -72,7 +71,7 @@ class Encoder:
         require_encoder()
         import av
 
-        name: Literal["libx264", "mpeg4"] = "libx264" if form.codec is Codec.MPEG4_AVC else "mpeg4"
+        name: Literal["libx264", "mpeg4"] = "libx264" if form.codec == "h264" else "mpeg4"
         context: VideoCodecContext = av.CodecContext.create(name, "w")
         context.width, context.height, context.pix_fmt = form.width, form.height, "yuv420p"
         context.framerate = Fraction(fps).limit_denominator(1000)
@@ -112,7 +111,7 @@ class Encoder:
         data = b"".join(bytes(packet) for packet in packets)
         if not data:
             return None
-        if self._form.codec is Codec.MPEG4_AVC:
+        if self._form.codec == "h264":
             return as_the_drone_does(data)
         return Encoded(data, any(packet.is_keyframe for packet in packets))
 

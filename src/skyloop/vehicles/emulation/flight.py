@@ -11,8 +11,8 @@ from skyloop.messages import Velocity as VelocityAction
 from skyloop.messages.geometry import clamped, turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits
+from skyloop.sim.world import Vec3
 from skyloop.vehicles.emulation.vehicle import Vehicle
-from skyloop.vehicles.mavlink.wire.axes import Vector
 
 LIFT_M: Final = 0.3  #: what the simulated vehicle's own take-off does, before these loops go on
 LIMITS: Final = Limits(
@@ -52,8 +52,8 @@ class FlightControl:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
-        self.place: Vector = (0.0, 0.0, 0.0)
-        self.velocity: Vector = (0.0, 0.0, 0.0)  #: east, north, up
+        self.place: Vec3 = (0.0, 0.0, 0.0)
+        self.velocity: Vec3 = (0.0, 0.0, 0.0)  #: east, north, up
         self.yaw = 0.0
         self._home: tuple[float, float] | None = None
         self._sinking = 0.0  # climb rate under a collective thrust
@@ -138,7 +138,7 @@ class FlightControl:
         """Fly a velocity in levelled body axes [m/s], with a yaw rate, counter-clockwise [rad/s]."""
         self._fly(VelocityAction(forward, left, up, yaw_rate))
 
-    def go(self, place: Vector, speeds: Speeds = USUAL, *, yaw_rate: float = 0.0) -> None:
+    def go(self, place: Vec3, speeds: Speeds = USUAL, *, yaw_rate: float = 0.0) -> None:
         """Fly towards a position, slower as it comes near.
 
         Args:

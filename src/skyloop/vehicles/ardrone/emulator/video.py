@@ -45,9 +45,10 @@ BOTTOM_1: Final = replace(
 CAMERAS: Final = {1: (FRONT_1, BOTTOM_1), 2: (FRONT_2, BOTTOM_2)}  #: front and bottom, by version
 
 
-MP4_360P: Final = Format(Codec.MPEG4_VISUAL, 640, 360, 0)
-H264_360P: Final = Format(Codec.MPEG4_AVC, 640, 360, 1)
-H264_720P: Final = Format(Codec.MPEG4_AVC, 1280, 720, 2)
+_PAVE: Final = {"h264": Codec.MPEG4_AVC, "mpeg4": Codec.MPEG4_VISUAL}  #: the codecs in the headers of frames
+MP4_360P: Final = Format("mpeg4", 640, 360, 0)
+H264_360P: Final = Format("h264", 640, 360, 1)
+H264_720P: Final = Format("h264", 1280, 720, 2)
 #: What is sent live for each value of ``video:video_codec``.
 FORMATS: Final = {
     VideoCodec.MP4_360P: MP4_360P,
@@ -96,7 +97,7 @@ class PavePacker:
             timestamp_ms=self._clock.milliseconds(captured_ns),
             width=form.width,
             height=form.height,
-            codec=form.codec,
+            codec=_PAVE[form.codec],
             stream_id=form.stream_id,
             position=self._position,
             sps_size=encoded.sps_size,

@@ -2,7 +2,8 @@
 
 The drone sends one picture a datagram from its UDP port 5555, with no header around it: 16-line groups of 16x16
 macroblocks, 4:2:0, of 8x8 cosine-transformed blocks, each a 10-bit mean and run and level codes
-(:mod:`skyloop.vehicles.ardrone.wire.uvlc_codes`). No recording of this video is public; this decoder is written from these:
+(:mod:`skyloop.vehicles.ardrone.wire.uvlc_codes`). No recording of this video is public; this decoder is written
+from these:
 
 * the **Developer Guide** of the AR.Drone SDK 1.7, and **uvlc.txt** in the Parrot SDK 1.8 and 2.0: layout and codes;
 * the **Parrot SDK** itself (ARDroneLib, VLIB; its licence forbids copying code), whose encoder ran in the drone;

@@ -1,8 +1,8 @@
 """Numbers of the AR.Drone 1's UVLC video format that both its ends need.
 
-Sources, by the names used in :mod:`skyloop.vehicles.ardrone.wire.uvlc`: the Parrot SDK (headers and ``uvlc.txt`` of ARDroneLib)
-and the Developer Guide for the layout; venthur/python-ardrone, which showed the video of real drones, for the order of
-the coefficients and for the steps at quantiser 31.
+Sources, by the names used in :mod:`skyloop.vehicles.ardrone.wire.uvlc`: the Parrot SDK (headers and ``uvlc.txt`` of
+ARDroneLib) and the Developer Guide for the layout; venthur/python-ardrone, which showed the video of real drones, for
+the order of the coefficients and for the steps at quantiser 31.
 """
 
 from __future__ import annotations

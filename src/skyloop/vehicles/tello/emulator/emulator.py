@@ -13,7 +13,6 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.host import Report, SimHost
-from skyloop.vehicles.ardrone.wire.pave import Codec
 from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
 from skyloop.vehicles.emulation.encoders import Encoder, Format, require_encoder
@@ -53,7 +52,7 @@ class TelloPacker:
         width, height = self.size
         wanted = width, height, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:
-            form = Format(Codec.MPEG4_AVC, width, height, 0)
+            form = Format("h264", width, height, 0)
             encoder = Encoder(form, settings.fps, settings.bitrate_kbps, group=GROUP, profile="Main", buffer_s=BUFFER_S)
             self._made = wanted, encoder
         encoded = self._made[1].encode(picture)
