@@ -4,8 +4,8 @@
     python scripts/house.py --budgets   # its part of scripts/budgets.toml, with today's numbers
     python scripts/house.py --check     # holds them against scripts/budgets.toml: `make check`
 
-A room is a folder of the package; ``drivers`` and ``vehicles`` have one for each vehicle besides, ``transport`` has
-``transport/fabric``, and ``(top)`` is the modules in no folder. *core* is the rooms of ``CORE`` together, *house* all.
+A room is a folder of the package, of ``vehicles`` each folder, and ``(top)`` is the modules in no folder. *core* is the
+rooms of ``CORE`` together, *house* all.
 
 - *files*, *lines*: of ``*.py``, all of them, empty ones too.
 - *code*: lines that are not blank, not a comment alone, and not of a docstring.
@@ -62,7 +62,7 @@ class Module:
 def room_of(path: Path) -> str:
     """Return the room of a file, by its path in the package."""
     parts = path.parts[:-1] or ("(top)",)
-    return "/".join(parts[:2] if parts[0] in ("drivers", "vehicles") or parts[1:2] == ("fabric",) else parts[:1])
+    return "/".join(parts[:2] if parts[0] == "vehicles" else parts[:1])
 
 
 def measure(package: Path) -> dict[str, Module]:

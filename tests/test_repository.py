@@ -81,11 +81,11 @@ def test_a_module_of_the_core_below_its_floor(floor: ModuleType) -> None:
 
 
 def test_an_exception_is_let_pass_until_it_is_none(floor: ModuleType) -> None:
-    exceptions = {"keys/files.py": "a reason"}
-    assert floor.failures(report(95.0, keys__files=80.0), exceptions) == []
-    assert floor.obsolete(report(95.0, keys__files=80.0), exceptions) == []
-    assert floor.failures(report(95.0, keys__files=91.0), exceptions) == []
-    assert floor.obsolete(report(95.0, keys__files=91.0), exceptions) == ["keys/files.py"]
+    exceptions = {"network/keys/files.py": "a reason"}
+    assert floor.failures(report(95.0, network__keys__files=80.0), exceptions) == []
+    assert floor.obsolete(report(95.0, network__keys__files=80.0), exceptions) == []
+    assert floor.failures(report(95.0, network__keys__files=91.0), exceptions) == []
+    assert floor.obsolete(report(95.0, network__keys__files=91.0), exceptions) == ["network/keys/files.py"]
 
 
 def test_exceptions_are_modules_that_exist(floor: ModuleType) -> None:
@@ -135,9 +135,10 @@ def test_what_is_measured_of_a_module(gauge: ModuleType) -> None:
         ("errors.py", "(top)"),
         ("proxy/core/flight.py", "proxy"),
         ("drivers/base.py", "drivers"),
-        ("drivers/msp/link.py", "drivers/msp"),
+        ("vehicles/msp/link.py", "vehicles/msp"),
+        ("vehicles/msp/wire/frames.py", "vehicles/msp"),
         ("transport/local/client.py", "transport"),
-        ("transport/fabric/client.py", "transport/fabric"),
+        ("network/keys/lab.py", "network"),
     ],
 )
 def test_rooms(gauge: ModuleType, path: str, room: str) -> None:
@@ -179,8 +180,8 @@ def test_each_path_is_seen_to_its_end() -> None:
     command = [sys.executable, str(ROOT / "scripts" / "paths.py"), "--json"]
     paths = json.loads(subprocess.run(command, check=True, capture_output=True, text=True, timeout=100).stdout)
     assert {name: {file.split("/")[0] for _, file, _ in each["path"]} for name, each in paths.items()} == {
-        "velocity": {"client", "clock.py", "drivers", "messages", "proxy", "sim", "transport", "zones.py"},
-        "frame": {"client", "drivers", "messages", "proxy", "sim", "transport"},
+        "velocity": {"client", "clock.py", "drivers", "messages", "proxy", "sim", "transport", "vehicles", "zones.py"},
+        "frame": {"client", "messages", "proxy", "sim", "transport", "vehicles"},
         "parameter": {
             "client",
             "clock.py",

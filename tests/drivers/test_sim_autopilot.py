@@ -24,7 +24,7 @@ from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
 from skyloop.vehicles.sim import SimDriver, options_of
-from skyloop.vehicles.sim.firmware import FirmwareFlight, _InnerSink
+from skyloop.vehicles.sim.firmware_flight import FirmwareFlight, _InnerSink
 from skyloop.vehicles.sim.firmware.ardupilot import VARIABLE
 from skyloop.vehicles.sim.telemetry import truth_at
 from tests.autopilots.rig import program

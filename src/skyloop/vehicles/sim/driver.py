@@ -37,7 +37,7 @@ from skyloop.vehicles.sim.telemetry import feedback_of
 
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera
-    from skyloop.vehicles.sim.firmware import FirmwareFlight
+    from skyloop.vehicles.sim.firmware_flight import FirmwareFlight
 
 _OCCURRENCES: Final = {
     OccurrenceKind.COLLISION: (EventKind.COLLISION, Severity.WARNING),
@@ -85,7 +85,7 @@ class SimDriver(Driver):
         self._world: World | None = None
         self._firmware: FirmwareFlight | None = None  # None: the built-in autopilot flies
         if self.options.autopilot is not None:
-            from skyloop.vehicles.sim.firmware import FirmwareFlight
+            from skyloop.vehicles.sim.firmware_flight import FirmwareFlight
 
             self._firmware = FirmwareFlight(self.options, firmware_options(uri))
 

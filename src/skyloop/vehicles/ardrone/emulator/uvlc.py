@@ -2,8 +2,8 @@
 
 The format, and what is known about it from where, stands at the decoder, :mod:`skyloop.vehicles.ardrone.wire.uvlc`,
 with which this shares the tables and nothing else. As the Parrot SDK's encoder does, it sends complete pictures only,
-codes every macroblock, cuts levels towards zero, writes levels beyond 127, the last in the Developer Guide's table, by the
-rule of that table, and ends a picture with zeros up to a whole word.
+codes every macroblock, cuts levels towards zero, writes levels beyond 127, the last in the Developer Guide's table, by
+the rule of that table, and ends a picture with zeros up to a whole word.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Runs a flight firmware as its only child, and ends it when whoever started this process ends.
 
 ``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …``: the
-firmware's process id is written to standard output; what the firmware writes is appended to LOG. With ``--prompt`` it is
-woken before others, with ``--apart`` it gets a network of its own (:mod:`skyloop.vehicles.sim.firmware.apart`).
+firmware's process id is written to standard output; what the firmware writes is appended to LOG. With ``--prompt`` it
+is woken before others, with ``--apart`` it gets a network of its own (:mod:`skyloop.vehicles.sim.firmware.apart`).
 Exits with the firmware's code, with 128 and the number of the signal that ended it, as a shell does.
 """
 
