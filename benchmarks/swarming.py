@@ -16,7 +16,8 @@ from skyloop.messages import Applied, Failsafe, Feedback, FlightState, Velocity
 from skyloop.network import FabricServer, FabricSettings
 from skyloop.proxy import Proxy
 from skyloop.sim.host import SimHost
-from skyloop.vehicles.sim import SimDriver, options_of
+from skyloop.vehicles.sim.driver import SimDriver
+from skyloop.vehicles.sim.options import options_of
 
 #: Small pictures: what is measured is not how fast this machine draws.
 VEHICLES: Final = "sim://?world=empty&cameras=front&width=160&height=120&fps=5"

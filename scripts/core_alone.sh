@@ -4,17 +4,19 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 copy=build/core
-rm -rf "$copy/src" "$copy/tests"
+rm -rf "$copy/src" "$copy/tests" "$copy/docs"
 mkdir -p "$copy/src/skyloop" "$copy/tests"
 cp src/skyloop/*.py src/skyloop/*.pyi src/skyloop/py.typed "$copy/src/skyloop"
 rm "$copy/src/skyloop/"{bench,ray}.py
 cp -r src/skyloop/{messages,transport,proxy,client,aio,drivers} "$copy/src/skyloop"
 cp pyproject.toml README.md LICENSE "$copy"
 cp tests/{__init__,conftest}.py "$copy/tests"
-cp -r tests/{messages,transport,proxy,client} "$copy/tests"
-# Tests of what plugs into the core, beside those of the core.
-rm "$copy"/tests/transport/test_{fabric*,overload}.py "$copy/tests/messages/test_wire_format_fabric.py"
-rm "$copy"/tests/client/test_{connect,end_of_flight,preflight}.py "$copy"/tests/proxy/test_safety.py
+cp -r tests/{messages,transport,proxy,client,data} "$copy/tests"
+cp -r docs "$copy"
+# Tests of what plugs into the core, and those that need SciPy, PyAV or what stands beside the package.
+rm "$copy"/tests/transport/test_{fabric*,overload}.py "$copy"/tests/messages/test_{geometry,wire_format_fabric}.py
+rm "$copy"/tests/client/test_{connect,end_of_flight,preflight,worker}.py
+rm "$copy"/tests/proxy/test_{safety,h264_encoder,stream_rate}.py
 if ! [[ -e $copy/venv/installed && $copy/venv/installed -nt pyproject.toml ]]; then
   "${PYTHON:-python3}" -m venv "$copy/venv"
   "$copy/venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$copy" \

@@ -187,7 +187,7 @@ def test_a_process_that_simulates_makes_room_for_commands(run: Run, monkeypatch:
 @pytest.mark.parametrize(("cameras", "cores"), [("front", "1"), ("none", "OpenCV is not imported")])
 def test_it_does_so_by_the_lock_and_by_opencv(cameras: str, cores: str) -> None:
     code = (
-        "import sys; from skyloop.cli.simulating import settle; from skyloop.vehicles.sim import options_of;"
+        "import sys; from skyloop.cli.simulating import settle; from skyloop.vehicles.sim.options import options_of;"
         "from skyloop.drivers.uri import parse_uri;"
         f"settle(options_of(parse_uri('sim://?cameras={cameras}')));"
         "print(sys.getswitchinterval());"

@@ -39,7 +39,7 @@ def test_drivers_of_one_scheme_are_looked_up_once(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("skyloop.drivers.registry.entry_points", counted)
     assert len({type(make_driver(f"mavlink://udpin:127.0.0.1:{port}")) for port in range(20_000, 20_020)}) == 1
     assert len(calls) == 1
-    install(site, "later_drone", "laterdrone = skyloop.vehicles.sim:SimDriver")
+    install(site, "later_drone", "laterdrone = skyloop.vehicles.sim.driver:SimDriver")
     assert driver_class("laterdrone") is driver_class("sim"), "one that is installed meanwhile is found"
 
 
@@ -95,5 +95,7 @@ def test_one_package_found_through_two_folders_is_no_contest(tmp_path: Path, mon
     for folder in ("one", "two"):
         install(tmp_path / folder, "same_drone", "samedrone = same_module:SameDriver")
         monkeypatch.syspath_prepend(str(tmp_path / folder))
-    (tmp_path / "one" / "same_module.py").write_text("from skyloop.vehicles.video import VideoDriver as SameDriver\n")
+    (tmp_path / "one" / "same_module.py").write_text(
+        "from skyloop.vehicles.video.driver import VideoDriver as SameDriver\n"
+    )
     assert driver_class("samedrone").__name__ == "VideoDriver"

@@ -42,7 +42,7 @@ from skyloop.messages import (
     Severity,
     Velocity,
 )
-from skyloop.vehicles.replay import ReplayDriver
+from skyloop.vehicles.replay.driver import ReplayDriver
 from skyloop.vehicles.replay.options import KNOWN
 from skyloop.vehicles.replay.publisher import ReplayPublisher
 from skyloop.vehicles.replay.source import ReplaySource, Timeline

@@ -30,7 +30,7 @@ from skyloop.messages import (
 from skyloop.sim import load_world, pacing
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
-from skyloop.vehicles.sim import SimDriver
+from skyloop.vehicles.sim.driver import SimDriver
 
 CALM = "wind=0&noise=0&seed=1"
 

@@ -23,9 +23,10 @@ from skyloop.messages import EventKind, Feedback, Hover, Land, LinkState, Takeof
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
-from skyloop.vehicles.sim import SimDriver, options_of
-from skyloop.vehicles.sim.firmware_flight import FirmwareFlight, _InnerSink
+from skyloop.vehicles.sim.driver import SimDriver
 from skyloop.vehicles.sim.firmware.ardupilot import VARIABLE
+from skyloop.vehicles.sim.firmware_flight import FirmwareFlight, _InnerSink
+from skyloop.vehicles.sim.options import options_of
 from skyloop.vehicles.sim.telemetry import truth_at
 from tests.autopilots.rig import program
 

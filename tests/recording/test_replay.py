@@ -26,7 +26,7 @@ from skyloop.proxy.proxy import Proxy
 from skyloop.recording.review.compare import compare
 from skyloop.stepping.replay import SteppedReplay, connector
 from skyloop.transport.memory import MemoryServer
-from skyloop.vehicles.replay import ReplayDriver
+from skyloop.vehicles.replay.driver import ReplayDriver
 from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, Plan, write_flight
 
 WAIT_S = 10.0

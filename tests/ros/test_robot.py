@@ -16,7 +16,7 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Encoding, FlightState, Hover, Idle, Land, LinkState, Takeoff, Velocity
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.vehicles.ros2 import Ros2Driver
+from skyloop.vehicles.ros2.driver import Ros2Driver
 from skyloop.vehicles.ros2.options import Options, options_of
 from skyloop.vehicles.ros2.protocol import ANSWER_S, RobotSession
 from skyloop.vehicles.ros2.telemetry import CaptureClock, battery_of, state_of

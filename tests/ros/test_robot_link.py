@@ -11,7 +11,7 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError
 from skyloop.messages import Land, LinkState, Takeoff, Velocity
-from skyloop.vehicles.ros2 import Ros2Driver
+from skyloop.vehicles.ros2.driver import Ros2Driver
 from tests.ros.fake_rclpy import Fake, Node
 from tests.ros.test_robot import image, odometry
 

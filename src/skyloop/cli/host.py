@@ -150,7 +150,7 @@ def _prepare(fleet: Fleet) -> None:
     from skyloop.cli.network import warn_if_open
     from skyloop.cli.simulating import settle
     from skyloop.host.vehicle import network_of
-    from skyloop.vehicles.sim import options_of
+    from skyloop.vehicles.sim.options import options_of
 
     opened = [vehicle.name for vehicle in fleet.vehicles if (net := network_of(vehicle)) and net.tls is None]
     for vehicle in fleet.vehicles:

@@ -51,7 +51,7 @@ def proxy(
     vehicle = parse_uri((handed_over() if parent_fd is not None else None) or uri)
     if vehicle.scheme == "sim":
         from skyloop.cli.simulating import settle
-        from skyloop.vehicles.sim import options_of
+        from skyloop.vehicles.sim.options import options_of
 
         settle(options_of(vehicle))
     warn_if_open(settings, [name])

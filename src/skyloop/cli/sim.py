@@ -171,7 +171,7 @@ def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
     Raises:
         UsageError: An option is not valid, or the drones can't share a world.
     """
-    from skyloop.vehicles.sim import options_of
+    from skyloop.vehicles.sim.options import options_of
 
     if len(uris) > drones:
         raise UsageError(f"--autopilot is given {len(uris)} times for --drones {drones}: give one for each at most")
@@ -192,7 +192,7 @@ def _serve_proxies(
     from skyloop.proxy import Proxy
     from skyloop.proxy.serve import run
     from skyloop.sim.host import SimHost
-    from skyloop.vehicles.sim import SimDriver
+    from skyloop.vehicles.sim.driver import SimDriver
 
     host = SimHost(options, len(names))
     drivers = [SimDriver(uri, host=host, drone=n) for n, uri in zip(range(len(names)), cycle(uris), strict=False)]

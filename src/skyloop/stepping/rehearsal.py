@@ -35,7 +35,8 @@ from skyloop.stepping.executor import StepExecutor
 from skyloop.stepping.host import SteppedHost
 from skyloop.stepping.scheduler import StepScheduler
 from skyloop.stepping.transport import SteppedServer
-from skyloop.vehicles.sim import SimDriver, options_of
+from skyloop.vehicles.sim.driver import SimDriver
+from skyloop.vehicles.sim.options import options_of
 
 _BEGIN_NS: Final = 10 * NS_PER_S
 _CONNECT_S: Final = 20.0

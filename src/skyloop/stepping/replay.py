@@ -19,7 +19,7 @@ from skyloop.stepping.executor import StepExecutor
 from skyloop.stepping.scheduler import StepScheduler
 from skyloop.stepping.transport import SteppedServer
 from skyloop.transport.base import Dialer
-from skyloop.vehicles.replay import ReplayDriver
+from skyloop.vehicles.replay.driver import ReplayDriver
 
 LEAD_NS: Final = NS_PER_S  #: time before the recording starts: for connecting, which takes a few ticks
 

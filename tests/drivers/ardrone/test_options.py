@@ -8,8 +8,7 @@ from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, ParameterError, UsageError
 from skyloop.messages import Hover
-from skyloop.vehicles.ardrone import ArdroneDriver
-from skyloop.vehicles.ardrone.driver import ACTIONS
+from skyloop.vehicles.ardrone.driver import ACTIONS, ArdroneDriver
 from skyloop.vehicles.ardrone.options import ArdroneOptions, options_of
 from skyloop.vehicles.ardrone.wire.ports import Ports
 

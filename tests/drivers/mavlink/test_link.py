@@ -28,7 +28,7 @@ from skyloop.messages import EmergencyStop, FlightState, Land, LinkState, Takeof
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
-from skyloop.vehicles.mavlink import MavlinkDriver
+from skyloop.vehicles.mavlink.driver import MavlinkDriver
 from skyloop.vehicles.mavlink.emulator import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.vehicles.mavlink.link import MavlinkLink, TcpClient
 from skyloop.vehicles.mavlink.protocol import MavlinkSession

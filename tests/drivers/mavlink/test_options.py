@@ -8,7 +8,7 @@ import pytest
 
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
-from skyloop.vehicles.mavlink import MavlinkDriver
+from skyloop.vehicles.mavlink.driver import MavlinkDriver
 from skyloop.vehicles.mavlink.options import ConnectionKind, MavlinkOptions, options_of
 
 

@@ -21,7 +21,7 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind
 from skyloop.transport.testing import wait_until
-from skyloop.vehicles.mavlink import MavlinkDriver
+from skyloop.vehicles.mavlink.driver import MavlinkDriver
 from skyloop.vehicles.mavlink.emulator import Kind, Ports, video
 from skyloop.vehicles.mavlink.emulator.video import TransportStream
 from tests.drivers.ardrone.video_ports import TcpPort

@@ -10,7 +10,7 @@ from skyloop.drivers.base import ExternalPose
 from skyloop.errors import DriverError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
-from skyloop.vehicles.msp import MspDriver
+from skyloop.vehicles.msp.driver import MspDriver
 from skyloop.vehicles.msp.emulator import BetaflightFirmware, with_racers
 
 POSE_S = 0.01

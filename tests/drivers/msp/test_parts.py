@@ -13,7 +13,7 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, ParameterError, UnknownNameError, UsageError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, LinkState, ResetEmergency, Takeoff
-from skyloop.vehicles.msp import MspDriver
+from skyloop.vehicles.msp.driver import MspDriver
 from skyloop.vehicles.msp.firmware import Setup, hindrances
 from skyloop.vehicles.msp.motion import MotionEstimate
 from skyloop.vehicles.msp.options import options_of

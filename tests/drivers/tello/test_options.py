@@ -6,7 +6,7 @@ import pytest
 
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
-from skyloop.vehicles.tello import TelloDriver
+from skyloop.vehicles.tello.driver import TelloDriver
 from skyloop.vehicles.tello.options import TelloOptions, VelocityAxes, options_of
 
 

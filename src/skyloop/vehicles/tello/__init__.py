@@ -1,5 +1,1 @@
 """``tello://HOST``: the Ryze Tello, by its text protocol."""
-
-from skyloop.vehicles.tello.driver import TelloDriver
-
-__all__ = ["TelloDriver"]
