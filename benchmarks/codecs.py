@@ -27,7 +27,7 @@ from skyloop.vehicles.ardrone.emulator.video import H264_360P
 from skyloop.vehicles.ardrone.video import PaveVideo
 from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.options import LAYOUTS
-from skyloop.vehicles.ardrone.wire.pave import FrameType, PaveFrame
+from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
 from skyloop.vehicles.emulation.encoders import GROUP, Encoder
 
@@ -156,7 +156,7 @@ def h264(pictures: Sequence[Image]) -> list[PaveFrame]:
         stamp_ms = round(number * 1e3 / FPS)
         frames.append(
             PaveFrame(
-                form.codec, kind, number, stamp_ms, form.width, form.height, form.stream_id, encoded.payload, False
+                Codec.MPEG4_AVC, kind, number, stamp_ms, form.width, form.height, form.stream_id, encoded.payload, False
             )
         )
     return frames
