@@ -306,6 +306,46 @@ def test_what_a_connection_holds_when_it_is_closed_is_not_delivered_later(peer: 
     assert not ended
 
 
+def test_a_peer_that_reads_no_more_is_left_with_few_set_points(peer: socket.socket) -> None:
+    """They filled the system's buffers, megabytes of them, and were followed one after the other when it went on."""
+    clock = ManualClock()
+    with closing(TcpStream("127.0.0.1", peer.getsockname()[1], clock)) as stream:
+        connection, _ = peer.accept()
+        for _ in range(100):
+            stream.write(bytes(1000))
+            clock.advance(0.02)
+        assert stream.dropped > 50
+        stream.write(b"land", Rank.COMMAND)
+    came, _ = received(connection)
+    assert len(came) < 40_000
+
+
+def test_set_points_wait_for_a_network_that_is_out_for_no_longer_than_a_moment(
+    peer: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """TCP delivers all of them when it is back; a packet or two that are sent again do not end the connection."""
+    clock, out = ManualClock(), False
+    with closing(TcpStream("127.0.0.1", peer.getsockname()[1], clock)) as stream:
+        peer.accept()[0].close()
+        sent: list[bytes] = []
+
+        def write(data: bytes) -> int:
+            sent.append(data)
+            return len(data)
+
+        monkeypatch.setattr(stream, "_write", write)
+        monkeypatch.setattr(stream, "_waiting", lambda: 50 * len(sent) if out else 0)
+        for tick in range(250):
+            if tick in (50, 100):
+                out = tick == 50
+                sent.clear()
+            stream.write(bytes(50))
+            clock.advance(0.02)
+            if tick == 99:
+                assert len(sent) <= 17, "of a third of a second"
+        assert len(sent) == 150, "all, once it is back"
+
+
 def test_the_last_words_of_a_connection_are_delivered(peer: socket.socket) -> None:
     stream = TcpStream("127.0.0.1", peer.getsockname()[1])
     connection, _ = peer.accept()
@@ -321,7 +361,7 @@ def test_the_last_words_may_be_lost_once(peer: socket.socket, monkeypatch: pytes
     connection, _ = peer.accept()
     stream.write(b"stop", Rank.STOP)
     acknowledged_s = time.monotonic() + 0.3
-    monkeypatch.setattr(stream, "_unacknowledged", lambda: 4 * (time.monotonic() < acknowledged_s))
+    monkeypatch.setattr(stream, "_waiting", lambda: 4 * (time.monotonic() < acknowledged_s))
     stream.drain_s = END_S if last else stream.drain_s
     stream.close()
     assert received(connection)[1] is last
@@ -338,7 +378,7 @@ def test_a_connection_that_is_gone_is_not_waited_for(peer: socket.socket) -> Non
     assert select.select([stream], [], [], 5.0)[0]
     with pytest.raises(ConnectionError):
         stream.read()
-    assert stream._unacknowledged() == 0
+    assert stream._waiting() == 0
     stream.close()
 
 

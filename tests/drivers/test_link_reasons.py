@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from skyloop.drivers.link_reasons import serial_trouble, trouble_of
-from skyloop.drivers.name_lookup import NameLookup
+from skyloop.drivers.vehicle_link import NameLookup
 
 DENIED = OSError(errno.EACCES, "Permission denied")
 
@@ -106,12 +106,12 @@ def test_a_name_that_takes_long_keeps_nobody_waiting(monkeypatch: pytest.MonkeyP
         return [(0, 0, 0, "", ("10.0.0.7", 0))]
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    monkeypatch.setattr("skyloop.drivers.name_lookup.WAIT_S", 0.001)
+    monkeypatch.setattr("skyloop.drivers.vehicle_link.NAME_WAIT_S", 0.001)
     lookup = NameLookup()
     for _ in range(2):
         with pytest.raises(OSError, match="the name drone is still being looked up"):
             lookup.address("drone")
-    monkeypatch.setattr("skyloop.drivers.name_lookup.WAIT_S", 10.0)
+    monkeypatch.setattr("skyloop.drivers.vehicle_link.NAME_WAIT_S", 10.0)
     known.set()
     assert lookup.address("drone") == "10.0.0.7"
 
@@ -122,7 +122,7 @@ def test_a_name_that_nobody_knows(monkeypatch: pytest.MonkeyPatch, error: Except
         raise error
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    monkeypatch.setattr("skyloop.drivers.name_lookup.WAIT_S", 10.0)
+    monkeypatch.setattr("skyloop.drivers.vehicle_link.NAME_WAIT_S", 10.0)
     lookup = NameLookup()
     for _ in range(2):  # it is asked anew each time
         with pytest.raises(OSError, match=r"not known|no name of a host"):

@@ -8,7 +8,6 @@ import socket
 import struct
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
@@ -26,6 +25,7 @@ _DRAIN_S: Final = 0.1  # that closing a connection may take, while a new one is 
 END_S: Final = 0.5  #: the same for good: a TCP packet that is lost is sent again 0.2 s later
 _UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection ends: nothing older is delivered
 _OVERDUE_NS: Final = nanoseconds(0.1)  # a line is stalled if bytes wait so long after it should have carried them
+_TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and sends what was lost again by then
 #: Size of the longest frame of MAVLink and MSP [bytes]. Parsers of flight controllers read as many bytes as a frame
 #: announces and don't look for another frame among them, so a frame that may be cut is filled up before a stop.
 _LONGEST: Final = 280
@@ -54,9 +54,11 @@ class LinePace:
 
     Args:
         bytes_per_s: Of the line; None: it is as fast as needed.
+        overdue_ns: How late what was written may be before the line counts as stalled.
     """
 
-    def __init__(self, bytes_per_s: float | None) -> None:
+    def __init__(self, bytes_per_s: float | None, overdue_ns: int = _OVERDUE_NS) -> None:
+        self._overdue_ns = overdue_ns
         self._ns_per_byte = 0.0 if bytes_per_s is None else 1e9 / bytes_per_s
         self._free_ns = 0  # when all that was written has been carried
         self._written = 0  # bytes
@@ -76,7 +78,7 @@ class LinePace:
         if not size:
             self._due_ns = None
         elif self._due_ns is None or self._written - size >= self._mark:
-            self._mark, self._due_ns = self._written, self._free_ns + _OVERDUE_NS
+            self._mark, self._due_ns = self._written, self._free_ns + self._overdue_ns
         self._free_ns = max(self._free_ns, now_ns + round(size * self._ns_per_byte))
 
     def on_written(self, size: int, now_ns: int) -> None:
@@ -92,7 +94,8 @@ class ByteStream(ABC):
     """An open connection. Not thread-safe.
 
     ``dropped`` counts the packets that were not sent, because the line was behind or stalled, or had no room. Drivers
-    repeat each, or send a newer one.
+    repeat each, or send a newer one. What the far end's own buffer holds is seen by none of this, nor is a
+    pseudo-terminal's, whose size the system gives as 0: sessions hold set-points back where nothing is heard.
 
     Args:
         pace: Of the line.
@@ -104,6 +107,7 @@ class ByteStream(ABC):
         self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for what was written to leave
         self._pace = pace
         self._clock = clock
+        self._stuck_ns = STUCK_NS
         self._full_ns: int | None = None  # since when there is no room, or the line is stalled
         self._whole = _LONGEST  # bytes written since a frame may have been cut
         self._cleared = False  # a full buffer was emptied for a stop, and nothing shows whether it is read since
@@ -172,7 +176,7 @@ class ByteStream(ABC):
             self._full_ns = None
         elif self._full_ns is None:
             self._full_ns = now_ns
-        elif now_ns - self._full_ns >= STUCK_NS:
+        elif now_ns - self._full_ns >= self._stuck_ns:
             raise ConnectionError(_NOT_READ)
 
     def _waiting(self) -> int:
@@ -183,14 +187,14 @@ class ByteStream(ABC):
         """Empty the output buffer, which may cut a frame; return whether it did, as far as that is known."""
         return False
 
-    def _drain(self, waiting: Callable[[], int]) -> bool:
+    def _drain(self) -> bool:
         """Wait a moment for what was written to leave; return whether it did."""
         until_s = time.monotonic() + self.drain_s
         # On a line that carries nothing only a stop is waited for: it emptied the buffer, and may leave yet.
-        patient = self._full_ns is None or self._cleared or waiting() > self._after_stop
-        while patient and (waiting() or self._cleared) and time.monotonic() < until_s:
+        patient = self._full_ns is None or self._cleared or self._waiting() > self._after_stop
+        while patient and (self._waiting() or self._cleared) and time.monotonic() < until_s:
             time.sleep(0.005)
-        return patient and not (waiting() or self._cleared)
+        return patient and not (self._waiting() or self._cleared)
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
@@ -214,7 +218,8 @@ class TcpStream(ByteStream):
     """
 
     def __init__(self, host: str, port: int, clock: Clock = monotonic_ns) -> None:
-        super().__init__(LinePace(None), clock)
+        super().__init__(LinePace(None, _TCP_OVERDUE_NS), clock)
+        self._stuck_ns = nanoseconds(_UNACKNOWLEDGED_MS / 1000)  # a packet that is lost twice takes 0.6 s
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # not on macOS
@@ -244,12 +249,12 @@ class TcpStream(ByteStream):
 
     def close(self) -> None:
         """Close the connection. What was not received is discarded: the system would go on sending it for minutes."""
-        if not self._drain(self._unacknowledged):
+        if not self._drain():
             with suppress(OSError):
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
 
-    def _unacknowledged(self) -> int:
+    def _waiting(self) -> int:
         with suppress(Exception):  # not available, or the connection is gone
             import fcntl
             import termios
@@ -323,7 +328,7 @@ class SerialStream(ByteStream):
 
     def close(self) -> None:
         """Close the port. What nobody reads is thrown away: the system would wait for it, with some ports for 30 s."""
-        if not self._drain(self._waiting):
+        if not self._drain():
             self._discard()
         self._port.close()
 

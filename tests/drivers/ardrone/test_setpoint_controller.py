@@ -25,7 +25,8 @@ from tests.drivers.ardrone.scripted import ns
 
 GROUND = Condition(State(0), ControlState.LANDED)
 AIR = Condition(State.FLYING, ControlState.HOVERING)
-LANDING = Condition(State.FLYING, ControlState.LANDING)
+LANDING = Condition(State.FLYING, ControlState.LANDING, 1.0)
+TOUCHING_DOWN = Condition(State.FLYING, ControlState.LANDING, 0.2)
 EMERGENCY = Condition(State.EMERGENCY, ControlState.DEFAULT)
 PERIOD_S = 0.03
 
@@ -155,6 +156,34 @@ def test_a_landing_of_ours_can_be_broken_off() -> None:
     assert cockpit.ref() == Ref.TAKEOFF
     cockpit.hears(AIR)
     assert cockpit.ref() == Ref.TAKEOFF
+
+
+@pytest.mark.parametrize("action", [Hover(), Attitude(pitch=0.1)])
+@pytest.mark.parametrize("low", [TOUCHING_DOWN, Condition(State.FLYING, ControlState.LANDING)])
+def test_a_landing_is_not_broken_off_where_the_drone_touches_down(low: Condition, action: AnyAction) -> None:
+    """Navdata are a moment old: the bit reached a drone that stood by then, and it took off again."""
+    cockpit = at(AIR)
+    cockpit.take(Land())
+    cockpit.hears(low)
+    cockpit.take(action)
+    assert cockpit.ref() == Ref(0)
+    assert cockpit.pcmd()[0] == 0
+    for condition in (Condition(State.FLYING, ControlState.LANDED, 0.0), GROUND):
+        cockpit.hears(condition)
+        cockpit.take(action)
+        assert cockpit.ref() == Ref(0)
+
+
+def test_a_landing_that_is_broken_off_too_late_for_the_drone_to_hear_it_is_completed() -> None:
+    """The bit was sent on until navdata no longer showed it flying, which is later than it stands."""
+    cockpit = at(AIR)
+    cockpit.take(Land())
+    cockpit.hears(LANDING)
+    cockpit.take(Hover())
+    assert cockpit.ref() == Ref.TAKEOFF
+    for condition in (TOUCHING_DOWN, Condition(State.FLYING, ControlState.LANDED, 0.0), GROUND):
+        cockpit.hears(condition)
+        assert cockpit.ref() == Ref(0)
 
 
 def test_a_landing_that_was_given_up_and_shows_all_the_same_is_not_broken_off() -> None:

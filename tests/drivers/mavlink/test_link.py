@@ -110,8 +110,8 @@ def test_a_name_that_does_not_resolve_keeps_no_other_link_waiting(monkeypatch: p
     driver.open(RecordingSink(watch=set()))
     (link,) = given
     assert isinstance(link, MavlinkLink)
-    monkeypatch.setattr("skyloop.drivers.name_lookup.socket.getaddrinfo", resolver)
-    monkeypatch.setattr("skyloop.drivers.name_lookup.WAIT_S", PATIENCE_S)
+    monkeypatch.setattr("skyloop.drivers.vehicle_link.socket.getaddrinfo", resolver)
+    monkeypatch.setattr("skyloop.drivers.vehicle_link.NAME_WAIT_S", PATIENCE_S)
     begun_s = time.monotonic()
     for _ in range(3):
         link.serve(readable=False)

@@ -731,6 +731,23 @@ def test_a_vehicle_that_no_longer_reads_gets_no_set_points_before_it_has_answere
     assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
 
 
+@pytest.mark.parametrize("way", ["udpin:127.0.0.1:14540", "tcp:127.0.0.1:5760"])
+def test_a_vehicle_that_stands_still_is_left_with_few_set_points(way: str) -> None:
+    """Sockets took all that were sent in 2.5 s, and it followed them one after the other when it went on."""
+    bench = Bench(Vehicle(ARDUPILOT), options(f"mavlink://{way}?parameters=no")).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(1.0)
+    bench.said.clear()
+    for _ in range(20):
+        bench.apply(Velocity(forward=0.5))
+        bench.go_on(0.1, silent=True)
+    assert len(bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")) <= 26, "of half a second"
+    bench.go_on(0.1)
+    bench.apply(Hover())
+    bench.go_on(0.2)
+    assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
+
+
 def test_a_vehicle_whose_only_answer_was_lost_is_asked_again() -> None:
     """It told its version, so nothing more was asked, and no set-point was ever sent again."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")

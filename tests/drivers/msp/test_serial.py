@@ -22,6 +22,8 @@ from skyloop.messages import Attitude, EmergencyStop, Idle, LinkState, ResetEmer
 from skyloop.vehicles.msp.driver import MspDriver
 from skyloop.vehicles.msp.emulator import BetaflightFirmware
 from skyloop.vehicles.msp.link import MspLink
+from skyloop.vehicles.msp.wire.frames import Parser
+from skyloop.vehicles.msp.wire.messages import Function
 from tests.drivers.msp.bench import Bench
 from tests.drivers.msp.rig import world
 
@@ -54,6 +56,15 @@ class Wire(threading.Thread):
             with suppress(BlockingIOError):
                 while True:
                     os.write(self._slave, b"x")
+
+    def stall(self) -> None:
+        """Carry nothing any more, as a process that stands still: what is sent waits in the system."""
+        self._ending.set()
+        self.join()
+
+    def waiting(self) -> bytes:
+        """Return what waits there."""
+        return os.read(self._master, 65_536) if select.select([self._master], [], [], 0)[0] else b""
 
     def cut(self) -> None:
         self._ending.set()
@@ -102,6 +113,24 @@ def test_a_serial_port_that_is_no_longer_read_stops_nobody(firmware: BetaflightF
             driver.apply(action)
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, 10.0), sink.links
         driver.apply(EmergencyStop())
+    finally:
+        driver.close()
+        wire.cut()
+
+
+def test_a_flight_controller_that_stands_still_finds_few_old_sticks(firmware: BetaflightFirmware) -> None:
+    """The system tells of no byte that waits in a pseudo-terminal: only that no answer comes shows it."""
+    pytest.importorskip("serial")
+    wire = Wire(firmware.port)
+    wire.start()
+    driver, sink = MspDriver(parse_uri(f"msp://{wire.path}?baud=10000000")), RecordingSink()
+    driver.open(sink)
+    try:
+        assert sink.wait(lambda: sink.link_state is LinkState.UP, 20.0), sink.links
+        wire.stall()
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, 10.0), sink.links
+        old = [frame for frame in Parser().feed(wire.waiting()) if frame.function == Function.SET_RAW_RC]
+        assert len(old) <= 4 + 10 + 3
     finally:
         driver.close()
         wire.cut()

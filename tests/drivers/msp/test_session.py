@@ -436,6 +436,63 @@ def test_sticks_are_held_back_while_none_is_acknowledged() -> None:
     assert sent <= 21, "not the 25 of a healthy link: what waits would be obeyed late"
 
 
+def sticks(bench: Bench) -> list[list[int]]:
+    """What was sent of them."""
+    return [channels(frame.payload) for frame in bench.sent if frame.function == Function.SET_RAW_RC]
+
+
+def test_a_flight_controller_that_stands_still_is_left_with_few_sticks() -> None:
+    """A pseudo-terminal or a socket took them all, and it obeyed seconds of old ones when it went on."""
+    bench = Bench()
+    bench.take_off()
+    bench.fly(pitch=0.3)
+    bench.run(0.3)
+    bench.sent.clear()
+    bench.deaf = True
+    for _ in range(20):
+        bench.fly(pitch=0.3)
+        bench.run(0.5)
+    assert bench.sink.link_state is LinkState.LOST
+    assert len(sticks(bench)) <= 4 + 9 + 3, "four, then ten a second until it is lost, then three"
+    assert sticks(bench)[-1][:2] == [1500, 1500], "what is obeyed last is level"
+
+
+def test_nothing_but_questions_and_stops_is_sent_while_the_link_is_lost() -> None:
+    bench = Bench()
+    bench.take_off()
+    bench.deaf = True
+    bench.until(lambda: bench.sink.link_state is LinkState.LOST, 2.0)
+    bench.run(0.4)
+    bench.sent.clear()
+    for _ in range(30):
+        with suppress(DriverError):
+            bench.session.command(Attitude(pitch=0.3, climb=0.5), bench.clock.now_ns)
+        bench.run(0.1)
+    assert not sticks(bench)
+    assert len(bench.sent) >= 6, "it is still asked"
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.tick()
+    assert sticks(bench)
+    bench.deaf = False
+    bench.until(lambda: bench.sink.link_state is LinkState.UP, 3.0)
+    assert bench.feedback.state in (FlightState.EMERGENCY, FlightState.LANDED)
+
+
+def test_what_is_found_again_gets_no_sticks_before_it_has_told_its_state() -> None:
+    """Another pilot may have it by then, or it may stand: sticks of before the loss are not for it."""
+    bench = Bench()
+    bench.take_off()
+    bench.deaf = True
+    bench.until(lambda: bench.sink.link_state is LinkState.LOST, 2.0)
+    bench.run(0.4)
+    bench.sent.clear()
+    bench.deaf, bench.unanswered = False, {Function.STATUS_EX, Function.MULTIPLE}
+    bench.run(1.0)
+    assert not sticks(bench)
+    bench.unanswered = set()
+    bench.until(lambda: bool(sticks(bench)), 1.0)
+
+
 @pytest.mark.parametrize("function", [Function.BOXNAMES, Function.MODE_RANGES, Function.RX_MAP])
 def test_what_is_found_again_in_flight_is_not_steered_by_guesses(function: Function) -> None:
     """One lost answer made its arm switch or its order of sticks unknown: it was disarmed in the air."""
@@ -512,6 +569,16 @@ def test_a_stop_reaches_what_does_not_tell_its_settings(function: Function, sile
     assert bench.board.armed
     bench.session.command(EmergencyStop(), bench.clock.now_ns)
     bench.until(lambda: not bench.board.armed, 0.1)
+
+
+def test_a_stop_waits_for_no_settings() -> None:
+    """A new proxy had to read nine answers first."""
+    bench = Bench()
+    bench.take_off()
+    bench.reconnect()
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.run(0.03)
+    assert not bench.board.armed
 
 
 def test_a_stop_of_what_is_just_being_found_in_flight_is_not_undone_by_taking_it_over() -> None:

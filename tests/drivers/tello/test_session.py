@@ -512,6 +512,55 @@ def test_a_hover_that_nobody_decided_leaves_a_drone_alone_whose_stop_was_given_u
     rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
 
 
+def test_a_drone_whose_stop_was_given_up_is_not_asked_who_it_is() -> None:
+    """The question, as any command, kept it in the air for another 15 s, and for ever where it was not answered."""
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.on = False
+    rig.run(2.0)
+    rig.do(EmergencyStop())
+    rig.run(10.4)
+    rig.take_said()
+    rig.on = True
+    rig.until(lambda: rig.sink.link_state is LinkState.DEGRADED, 1.0)
+    rig.until(lambda: rig.bench.flight is FlightState.LANDING, 3.0)
+    assert not rig.take_said()
+    rig.do(Hover())
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
+
+
+def test_what_another_program_left_in_the_air_lands_by_itself() -> None:
+    """A question every 4 s kept it there until its battery was empty."""
+    rig = Rig()
+    rig.ready()
+    rig.bench.logic.receive(b"takeoff", PILOT)
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.run(1.0)
+    rig.take_said()
+    rig.until(lambda: rig.state is FlightState.LANDED, 25.0)
+    assert not rig.said
+    rig.run(5.0)
+    assert set(rig.said) == {"wifi?"}, "on the ground it is kept awake"
+
+
+def test_what_is_found_in_the_air_and_does_not_answer_is_not_asked_for_ever() -> None:
+    rig = Rig()
+    rig.on = False
+    for text in (b"command", b"takeoff"):
+        rig.bench.logic.receive(text, PILOT)
+    rig.until(lambda: rig.bench.truth.state is FlightState.HOVERING, 5.0)
+    rig.on = rig.deaf = True
+    rig.run(6.0)
+    assert "sdk?" in rig.take_said()
+    rig.run(5.0)
+    assert not rig.take_said()
+    rig.deaf = False
+    rig.do(Hover())
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
+
+
 def test_a_drone_that_was_started_again_is_set_up_again() -> None:
     rig = Rig(TelloOptions("drone", video=False, pads=True))
     rig.ready()

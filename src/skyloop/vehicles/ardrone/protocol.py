@@ -175,7 +175,7 @@ class ArdroneSession(VehicleSession):
         demo = navdata.get(Demo)
         self._detect_break(state, now_ns)
         self._state, self._received_ns = state, now_ns
-        condition = Condition(state, control_state(demo) if demo is not None else None)
+        condition = Condition(state) if demo is None else Condition(state, control_state(demo), demo.altitude / 1000)
         self.setpoints.on_condition(condition, now_ns, self.reception.passed_ns)
         if self.configurator.on_acknowledge(bool(state & State.COMMAND_ACK)):
             self.due_ns = 0

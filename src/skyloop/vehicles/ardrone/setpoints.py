@@ -115,12 +115,17 @@ RISES_NS: Final = nanoseconds(3.0)  #: so long after a take-off was sent what ri
 TOGGLE_NS: Final = nanoseconds(0.5)
 
 
+#: A landing is completed below this: navdata are up to 0.25 s old, and what stands by now rises by the take-off bit.
+BREAK_OFF_M: Final = 0.5
+
+
 @dataclass(frozen=True, slots=True)
 class Condition:
     """What the newest navdata say of the flight."""
 
     state: State
     control: ControlState | None = None
+    altitude_m: float | None = None  #: above what is below; None: not known
 
     @property
     def flying(self) -> bool:
@@ -131,6 +136,12 @@ class Condition:
     def emergency(self) -> bool:
         """Whether the motors are cut."""
         return bool(self.state & State.EMERGENCY)
+
+    @property
+    def touches_down(self) -> bool:
+        """Whether a landing is at its end, or may be."""
+        low = self.altitude_m is None or self.altitude_m < BREAK_OFF_M
+        return self.control is ControlState.LANDED or (self.control is ControlState.LANDING and low)
 
 
 #: After so long without navdata a drone may stand that flew: it lands by itself where it hears nothing for 2 s.
@@ -267,9 +278,11 @@ class SetpointController:
         return applied
 
     def _remain(self, stick: Stick | None) -> None:
-        self._stick = stick
-        if self._decision is Decision.LAND:
+        if self._landing_is_ours and self.condition is not None and self.condition.touches_down:
+            self._decision, stick = Decision.LAND, None
+        elif self._decision is Decision.LAND:
             self._decision = Decision.STAY
+        self._stick = stick
 
     # What is received ---------------------------------------------------------------------------------------------
 
@@ -379,4 +392,5 @@ class SetpointController:
         if self.condition.flying and max(self._late_ns, now_ns - self._received_ns) >= SILENT_NS:
             return None  # as one that stands would take off
         by_itself = self.condition.control is ControlState.LANDING and not self._landing_is_ours
-        return Ref.TAKEOFF if self.condition.flying and not by_itself else Ref(0)
+        lands = by_itself or (self._landing_is_ours and self.condition.touches_down)
+        return Ref.TAKEOFF if self.condition.flying and not lands else Ref(0)

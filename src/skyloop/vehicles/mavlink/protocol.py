@@ -36,6 +36,7 @@ TICK_NS: Final = nanoseconds(0.02)
 REST_NS: Final = nanoseconds(0.1)  #: the same while nothing is under way: for silence, heartbeats and requests
 HEARTBEAT_NS: Final = nanoseconds(1.0)
 UNHEARD_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: the autopilots' own failsafes act after 5 or 10 s without one
+QUIET_NS: Final = nanoseconds(0.5)  #: of silence: set-points may wait where nobody reads, and be followed later
 DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
 LOST_NS: Final = nanoseconds(2.5)
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle without any data by then is reported as lost
@@ -357,7 +358,7 @@ class MavlinkSession(VehicleSession):
         messages = (
             self.setpoints.messages(vehicle, now_ns) if self.setpoints is not None and vehicle is not None else []
         )
-        if not self._heard_by_it:
+        if not self._heard_by_it or now_ns - (self._received_ns or 0) >= QUIET_NS:
             messages = []  # they would wait somewhere, and be followed when somebody reads again
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 

@@ -32,7 +32,8 @@ LOST_NS: Final = nanoseconds(1.0)
 FIRST_WORD_NS: Final = nanoseconds(2.0)
 IDLE_NS: Final = nanoseconds(0.05)  #: the latest next poll
 MOST_STICKS: Final = 4  #: frames of sticks that may be without an acknowledgement
-STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older one is taken for lost
+STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older one is taken for lost once something newer was heard
+LAST_STICKS: Final = 3  #: frames of sticks, level or disarming, that end what is sent to one that is not heard any more
 COUNT_NS: Final = nanoseconds(1.0)  #: over which acknowledged sticks are counted
 LEAST_STICKS_HZ: Final = 25.0  #: fewer are warned of
 BUNDLING_API: Final = (1, 42)  #: of Betaflight: it knows MULTIPLE
@@ -75,10 +76,10 @@ class MspSession(VehicleSession):
         self._known = False  # who it is was asked since it was found
         self._refused_variant = ""
         self._unread = ""  # what it did not tell of its settings
-        self._partly = False  # what it did tell was kept, for a stop
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns
         self._sticks: deque[int] = deque()  # when those without an acknowledgement were sent
+        self._last_sticks = 0  # so many more are sent to one that is not heard
         self._acknowledged = 0
         self._counted_ns = now_ns
         self._slow = False
@@ -309,20 +310,35 @@ class MspSession(VehicleSession):
 
     def _due_sticks(self, now_ns: int) -> bytes:
         self.urgent = urgent = self._step_stop(now_ns)
-        known = self.setup is not None or (urgent and self._partly)
+        if urgent and self.setup is None:
+            self._keep_part()
+        known = self.setup is not None or (urgent and not self._refused_variant)  # a stop waits for no settings
         if not known or not (urgent or (self._may_steer and now_ns >= self._sticks_due_ns)):
             return b""
-        while self._sticks and now_ns - self._sticks[0] >= STICKS_LOST_NS:
-            self._sticks.popleft()
         period = nanoseconds(1 / self.options.rate_hz)
         self._sticks_due_ns = max(self._sticks_due_ns + period, now_ns + period // 2)
         self._count(now_ns)
         self.setpoints.on_motion(self.motion.at(now_ns))
         made = self._stick_frame(now_ns)
-        if len(self._sticks) >= MOST_STICKS and not urgent:
-            return b""  # it is behind: what is sent now would be obeyed late
+        if not urgent and self._holds_back(now_ns):
+            return b""
         self._sticks.append(now_ns)
         return made
+
+    def _holds_back(self, now_ns: int) -> bool:
+        """Return whether sticks that are sent now might wait in a buffer and be obeyed late, or are somebody else's.
+
+        One that stands still goes on as if no time had passed, and obeys all that came meanwhile: nothing but its
+        answers shows that it reads. Until it is lost a few keep the failsafe of what only can't be heard from acting.
+        """
+        heard_ns = self._received_ns
+        while self._sticks and self._sticks[0] < (heard_ns or 0) and now_ns - self._sticks[0] >= STICKS_LOST_NS:
+            self._sticks.popleft()
+        soon = bool(self._sticks) and now_ns - self._sticks[-1] < STICKS_LOST_NS
+        if heard_ns is not None:
+            return self.reported.status is None or (len(self._sticks) >= MOST_STICKS and soon)
+        self._last_sticks -= not soon
+        return soon or self._last_sticks < 0
 
     def _step_stop(self, now_ns: int) -> bool:
         """Go on with an emergency stop; return whether its sticks are due."""
@@ -410,7 +426,6 @@ class MspSession(VehicleSession):
         identification = self._identification
         if self.setup is None and identification and identification.setup.identity.variant in SUPPORTED:
             self.setpoints.set_up(identification.setup, "its settings were not read")
-            self._partly = True
 
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events()
@@ -420,7 +435,7 @@ class MspSession(VehicleSession):
     def _lose(self, reason: str, now_ns: int) -> None:
         """Ask who it is anew, and meanwhile for its state as before, so that what flies is soon steered again.
 
-        Sticks go on as they were, for what flies may still hear them.
+        It gets :data:`LAST_STICKS` more, and then nothing but questions and stops: its own failsafe acts.
         """
         del now_ns
         self._keep_part()
@@ -432,6 +447,7 @@ class MspSession(VehicleSession):
         if self.setup is not None:
             self.setpoints.set_up(self.setup, "its settings are being read again")
         self._sticks.clear()
+        self._last_sticks = LAST_STICKS
         self.motion.lost()
         self.setpoints.lost()
         self.reported = replace(self.reported, attitude=None, altitude=None, status=None)

@@ -145,6 +145,7 @@ FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is 
 ENTER_NS: Final = nanoseconds(0.5)  #: between two ``command`` while no state comes
 ALIVE_NS: Final = nanoseconds(4.0)  #: between questions that keep the drone from landing by itself after 15 s
 ALONE_NS: Final = nanoseconds(30.0)  #: without any command it has landed by then: it begins to after 15 s
+ASK_NS: Final = nanoseconds(5.0)  #: a drone that others fly is asked who it is for no longer
 DEAF: Final = 2  #: questions in a row without an answer: our commands are not received
 VIDEO_NS: Final = nanoseconds(2.0)  #: without video that can be shown for so long it is asked for
 ALIVE: Final = "wifi?"
@@ -189,7 +190,7 @@ class TelloSession(VehicleSession):
         self._health = Health()
         self._entered_ns = now_ns - ENTER_NS
         self._lost_ns = self._sent_ns = now_ns  # when it was lost, or a hover asked for since; when anything was sent
-        self._alive_ns = now_ns
+        self._alive_ns = self._found_ns = now_ns
         self._asked_video_ns = 0
         self._asking_version = False
         self._deaf = 0
@@ -354,7 +355,7 @@ class TelloSession(VehicleSession):
 
     def _keep_alive(self, now_ns: int) -> None:
         """Ask something now and then: it keeps the drone awake, and shows whether our commands are received."""
-        if self.ready and self.setpoints.left_alone:
+        if self._is_silent(now_ns):
             return
         if self.ready and now_ns - self._alive_ns >= ALIVE_NS:
             self._alive_ns = now_ns
@@ -362,6 +363,11 @@ class TelloSession(VehicleSession):
         elif not self.ready and not self._asking_version:
             self._asking_version = True
             self.conversation.ask(Request("sdk?", self._on_version))
+
+    def _is_silent(self, now_ns: int) -> bool:
+        """Return whether to ask nothing, as each question keeps what nobody flies from landing by itself."""
+        asked = self.ready or self.setpoints.left_alone or now_ns - self._found_ns >= ASK_NS
+        return asked and self.setpoints.flown_by_others
 
     def _alive(self, reply: str | None) -> None:
         if reply is None:
@@ -377,7 +383,7 @@ class TelloSession(VehicleSession):
     def _keep_video(self, now_ns: int) -> None:
         last_ns = max(self._video_ns(), self._asked_video_ns)
         missing = self.options.video and self.ready and now_ns - last_ns >= VIDEO_NS
-        if missing and self.conversation.idle and not self.setpoints.left_alone:
+        if missing and self.conversation.idle and not self._is_silent(now_ns):
             self._asked_video_ns = now_ns
             self.conversation.ask(Request("streamon", _whatever))
 
@@ -407,7 +413,9 @@ class TelloSession(VehicleSession):
 
     def _begin(self, now_ns: int) -> None:
         self._unreachable, self._answered = "", False
-        self._deaf, self._alive_ns, self._asked_video_ns = 0, now_ns, 0
+        self._deaf, self._alive_ns, self._found_ns, self._asked_video_ns = 0, now_ns, now_ns, 0
+        if self.setpoints.left_alone:
+            self._set_link_state(LinkState.DEGRADED, "it lands by itself: nothing is sent until it is commanded")
         self.due_ns = 0
 
     def _on_version(self, reply: str | None) -> None:

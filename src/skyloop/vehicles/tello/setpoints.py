@@ -134,6 +134,11 @@ class SetpointController:
         return self._decision, self._stick, self.stop.active
 
     @property
+    def flown_by_others(self) -> bool:
+        """Whether nothing from here is to keep it in the air: it was given up, or this flight is not ours."""
+        return self.left_alone or (self.watch.phase.airborne and not self._steering)
+
+    @property
     def flies_unheard(self) -> bool:
         """Whether it flew or was to rise when it was heard last, and may fly still."""
         return not self.receiving and self._was_in_air
