@@ -7,6 +7,7 @@ import pytest
 from skyloop.messages import (
     AnyAction,
     Attitude,
+    Event,
     EventKind,
     Failsafe,
     Fate,
@@ -366,6 +367,35 @@ def test_words_of_a_driver_that_can_not_be_sent_keep_nothing_back(bench: Bench, 
     bench.run(0.7)
     assert pilot.last_feedback().seq > seq
     assert (Hover() in bench.driver.told) is (where != "others")
+
+@pytest.mark.parametrize("leaves", ["is killed", "falls silent", "releases"])
+def test_the_vehicle_hovers_before_anything_is_told(bench: Bench, leaves: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three events went out first, to every application, of which each takes its time."""
+    pilot, witness = bench.airborne(), bench.join("witness")
+    pilot.command(Velocity(0.5))
+    told_first: list[list[Event]] = []
+    apply, before = bench.driver._apply, len(bench.events)
+
+    def applied(action: AnyAction) -> AnyAction:
+        told_first.append(bench.events[before:])
+        return apply(action)
+
+    monkeypatch.setattr(bench.driver, "_apply", applied)
+    if leaves == "is killed":
+        pilot.end.close()
+        wait_until(lambda: bench.proxy.handler.authority.holder is None, "its end is noticed")
+    elif leaves == "releases":
+        pilot.ask(ReleaseAuthority())
+        before = len(bench.events)
+    bench.run(0.5)
+    witness.sync()
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    assert told_first == [[]]
+    kinds = [event.kind for event in witness.events if event.kind is not EventKind.AUTHORITY_GRANTED]
+    if leaves == "is killed":
+        assert kinds[-3:] == [EventKind.APPLICATION_LINK, EventKind.AUTHORITY_LOST, EventKind.FAILSAFE]
+    assert kinds[-1] is EventKind.FAILSAFE
+
 
 
 def test_nothing_is_done_on_the_ground(bench: Bench) -> None:

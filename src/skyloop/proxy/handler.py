@@ -11,7 +11,7 @@ here; a driver publishes what it receives from any thread without this lock.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -53,7 +53,8 @@ from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.authority_events import EventContext, authority_event
 from skyloop.proxy.core.command_checks import CommandChecks
-from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
+from skyloop.proxy.core.events import EventDraft
+from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import Whose
 from skyloop.proxy.core.flight_events import (
@@ -254,10 +255,10 @@ class CommandHandler:
             self._apply_authority(self.authority.release(session.app_id, now_ns), now_ns)
         return Done()
 
-    def application_left(self, session: Session, now_ns: int) -> None:
-        """An application's connection ended; it must still be among the sessions."""
+    def application_left(self, session: Session, now_ns: int, news: Sequence[EventDraft] = ()) -> None:
+        """An application's connection ended; it must still be among the sessions. ``news``: told once it hovers."""
         with self._lock:
-            self._apply_authority(self.authority.gone(session.app_id, now_ns), now_ns)
+            self._apply_authority(self.authority.gone(session.app_id, now_ns), now_ns, news)
 
     def holds(self, session: Session, lease: int) -> bool:
         """Return whether the application holds the authority under this lease."""
@@ -586,8 +587,8 @@ class CommandHandler:
 
     # Authority ---------------------------------------------------------------------------------------------------
 
-    def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int) -> None:
-        """Make the vehicle hover where the authority changes hands, then publish the changes."""
+    def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
+        """Make the vehicle hover where the authority changes hands, then publish ``news`` and the changes."""
         for effect in effects:
             if isinstance(effect, Lost):
                 self._pilot = effect.reason
@@ -601,20 +602,16 @@ class CommandHandler:
                 self._tell(session, session.intents.newest)
                 self._withdraw_takeoff(now_ns)
         self._stamp()
-        ended = [effect for effect in effects if isinstance(effect, (Lost, Preempted))]
-        for effect in ended:
-            self._publish_authority(effect, now_ns)
-        self._update_failsafe(now_ns)  # which hovers, before anybody learns that it has the authority
+        ended = [self._authority_draft(one, now_ns) for one in effects if isinstance(one, (Lost, Preempted))]
+        self._update_failsafe(now_ns, [*news, *ended])  # which hovers, before anybody learns of any of this
         for effect in effects:
-            if effect not in ended:
-                self._publish_authority(effect, now_ns)
+            if not isinstance(effect, (Lost, Preempted)):
+                self._events.publish_draft(self._authority_draft(effect, now_ns))
 
-    def _publish_authority(self, effect: AuthorityEffect, now_ns: int) -> None:
+    def _authority_draft(self, effect: AuthorityEffect, now_ns: int) -> EventDraft:
         holder = self.authority.holder
         holder_name = "" if holder is None else self._name(holder.app_id)
-        self._events.publish_draft(
-            authority_event(effect, EventContext(now_ns, self._name, self._identity, holder_name))
-        )
+        return authority_event(effect, EventContext(now_ns, self._name, self._identity, holder_name))
 
     def _identity(self, app_id: int) -> str:
         """What the transport knows about an application."""
@@ -733,7 +730,8 @@ class CommandHandler:
 
     # Failsafe ----------------------------------------------------------------------------------------------------
 
-    def _update_failsafe(self, now_ns: int) -> None:
+    def _update_failsafe(self, now_ns: int, news: Sequence[EventDraft] = ()) -> None:
+        """Let the ladder decide and act; ``news``: to be published then, before its own."""
         if self._left:
             return
         self._observe_flight(now_ns)
@@ -754,28 +752,30 @@ class CommandHandler:
             shown=self._vehicle.link_up or Land not in self._executor.native,
         )
         effects = self.ladder.update(now_ns, inputs)
-        if effects:
-            self._apply_failsafe(effects, now_ns)
+            self._events.publish_all(news)
+        if effects or news:
+            self._apply_failsafe(effects, now_ns, news)
 
-    def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int) -> None:
-        for effect in effects:
-            if not isinstance(effect, FailsafeAction):
-                self._publish_failsafe(effect)
-            elif isinstance(effect.action, ReturnToStart):
-                self._back.begin(effect.action, now_ns)
-                self.ladder.attempted(True)
-            else:
-                self.checks.back = None
-                taken = self._executor.failsafe(effect.action, now_ns)
-                self.ladder.attempted(taken)
-                if taken:
-                    self._echo_own(effect.action, now_ns)
-
-    def _publish_failsafe(self, effect: StepChange | BatteryLow) -> None:
-        if isinstance(effect, BatteryLow):
-            self._events.publish_draft(battery_event(effect))
-            return
-        self._stamp()
-        if effect.step is not Failsafe.NONE:
-            self._end_intents(Fate.FAILSAFE, self._clock())
-        self._events.publish_draft(failsafe_event(effect))
+    def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
+        """Act first, as each event takes its time, and publish then."""
+        drafts = [*news]
+        try:
+            for effect in effects:
+                if isinstance(effect, StepChange):
+                    self._stamp()
+                    if effect.step is not Failsafe.NONE:
+                        self._end_intents(Fate.FAILSAFE, self._clock())
+                    drafts.append(failsafe_event(effect))
+                elif isinstance(effect, BatteryLow):
+                    drafts.append(battery_event(effect))
+                elif isinstance(effect.action, ReturnToStart):
+                    self._back.begin(effect.action, now_ns)
+                    self.ladder.attempted(True)
+                else:
+                    self.checks.back = None
+                    taken = self._executor.failsafe(effect.action, now_ns)
+                    self.ladder.attempted(taken)
+                    if taken:
+                        self._echo_own(effect.action, now_ns)
+        finally:
+            self._events.publish_all(drafts)
