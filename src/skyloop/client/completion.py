@@ -220,9 +220,13 @@ class ActionWait:
 
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
         """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
-        if outcome.fate in OVERRULED or outcome.fate is Fate.TIMED_OUT:
-            if self._commands.may_ask:  # a pilot may have taken it by hand while a link was lost
-                self._again(automatic=outcome.fate is not Fate.FAILSAFE)
+        if outcome.fate in OVERRULED:
+            if self._commands.may_ask:
+                # The caller still asks for it, but a pilot who took the vehicle by hand since then keeps it. While the
+                # application's own link is lost, nothing shows that.
+                taken = self._may_be_sent and self._others_now not in (None, self._others)
+                explicit = outcome.fate is Fate.FAILSAFE or (outcome.fate is Fate.AUTHORITY and not taken)
+                self._again(automatic=not explicit)
             return None
         return None if outcome.fate in OUTDONE else _refused(outcome)
 

@@ -56,13 +56,15 @@ from skyloop.proxy.core.command_checks import CommandChecks
 from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
-from skyloop.proxy.core.flight import Whose
+from skyloop.proxy.core.flight import BELIEF_NS, Whose
 from skyloop.proxy.core.flight_events import (
+    UNHEARD,
     battery_event,
     clamped_event,
     emergency_event,
     enforcement_event,
     failsafe_event,
+    landing_given_up_event,
     ownership_event,
     position_jumped_event,
     refused_event,
@@ -145,6 +147,7 @@ class CommandHandler:
         self._left = False  # the proxy ends: nothing flies by a decision of it any more
         self._pilot = "none"  # why nobody holds the authority, or "held"
         self._breaks_seen = 0  # of the vehicle's link, when last looked at
+        self._heard_ns = -LATEST_NS  # when the vehicle was heard last, as far as a tick noticed
         self._slept = slept
         self._slept_seen = slept()  # when last looked at, or noticed
         self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
@@ -277,6 +280,7 @@ class CommandHandler:
                 return
             self._observe_sleep(now_ns)
             self._observe_link(now_ns)
+            self._observe_silence(now_ns)
             self._observe_position(now_ns)
             effects = self.authority.update(now_ns)
             if effects:
@@ -660,6 +664,21 @@ class CommandHandler:
             self.ladder.hand_over(now_ns)
         self._update_failsafe(now_ns)
 
+    def _observe_silence(self, now_ns: int) -> None:
+        """Give up a landing when the vehicle has not been heard for long: by then it may be on another flight."""
+        if self._vehicle.link_up:
+            self._heard_ns = now_ns
+            return
+        landing = self._landing
+        if landing is None and not self.ladder.lands_on:
+            return
+        asked_ns = self.ladder.wanted_ns if landing is None else landing.asked_ns  # its pilot may have left
+        if now_ns - max(asked_ns, self._heard_ns) >= BELIEF_NS:
+            if landing is not None:
+                self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: land it again", Refusal.VEHICLE_LINK_LOST)
+            self.ladder.give_up_landing()
+            self._events.publish_draft(landing_given_up_event())
+
     def _observe_sleep(self, now_ns: int) -> None:
         """Act on a sleep of the computer: all that is known is older than its clock says."""
         slept_ns = self._slept() - self._slept_seen
@@ -733,6 +752,7 @@ class CommandHandler:
     def _update_failsafe(self, now_ns: int, news: Sequence[EventDraft] = ()) -> None:
         """Let the ladder decide and act; ``news``: to be published then, before its own."""
         if self._left:
+            self._events.publish_all(news)
             return
         self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
@@ -752,7 +772,6 @@ class CommandHandler:
             shown=self._vehicle.link_up or Land not in self._executor.native,
         )
         effects = self.ladder.update(now_ns, inputs)
-            self._events.publish_all(news)
         if effects or news:
             self._apply_failsafe(effects, now_ns, news)
 

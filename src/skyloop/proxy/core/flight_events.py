@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from typing import Final
 
+from skyloop.clock import seconds
 from skyloop.messages import Command, EventKind, Failsafe, Refusal, Severity, Value
 from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
-from skyloop.proxy.core.flight import Changed, Whose
+from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
 from skyloop.proxy.core.limits import Clamp
 from skyloop.zones import THINNEST_M, ZONES, Space
 
+#: Why a landing is given up.
+UNHEARD: Final = f"the vehicle was not heard for {seconds(BELIEF_NS):g} s, and may be on another flight by now"
 _ENFORCED: Final = "enforced: its position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
 
@@ -53,6 +56,12 @@ def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
 def emergency_event(name: str) -> EventDraft:
     """The application ``name`` stopped the motors."""
     text = f"emergency stop by {name}"
+def landing_given_up_event() -> EventDraft:
+    """A pilot's landing is given up because the vehicle was not heard."""
+    text = f"the landing is given up: {UNHEARD}: land it again when it is heard"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": "landing_given_up"})
+
+
     return EventDraft(EventKind.EMERGENCY, text, Severity.ERROR, name, {"reason": text})
 
 
