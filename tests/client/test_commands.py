@@ -199,12 +199,20 @@ def lost_lease(proxy: ScriptedProxy, _: Command) -> None:
     proxy.event(EventKind.AUTHORITY_LOST, "", name, app_id=app_id, lease=lease, reason="silent")
 
 
-@pytest.mark.parametrize("ending", [failsafe, not_fresh, lost_link, lost_lease])
+def lost_lease_to_others(proxy: ScriptedProxy, command: Command) -> None:
+    """A pilot takes it by hand while the application has no lease."""
+    proxy.more["others"] = "the vehicle is in LOITER, which was not chosen here"
+    proxy.feedback()
+    lost_lease(proxy, command)
+
+
+@pytest.mark.parametrize("ending", [failsafe, not_fresh, lost_link, lost_lease, lost_lease_to_others])
 def test_a_landing_that_something_ended_is_asked_for_anew(
     proxy: ScriptedProxy, drone: Drone, ending: Callable[[ScriptedProxy, Command], None]
 ) -> None:
     def vehicle() -> None:
         first = proxy.until_commanded(Land())
+        assert not first.automatic
         ending(proxy, first)
         proxy.until(lambda: any(command.intent > first.intent for command in proxy.commands), "a new intent to land")
         proxy.more.clear()

@@ -117,6 +117,8 @@ class ActionWait:
         self._flew = False  # it was in the air meanwhile
         self._refused, self._refused_ns = 0, 0  # the newest intent of ours that was not possible yet, and since when
         self._asked_ns = state.scheduler.clock()
+        # The call may take the vehicle from the pilot who has it now, or when it can first be sent.
+        self._others, self._may_be_sent = self._others_now, commands.may_ask
         self._intent = ask(action, False)
 
     @property
@@ -233,6 +235,10 @@ class ActionWait:
     def _again(self, *, automatic: bool = True) -> None:
         self._asked_ns = self._state.scheduler.clock()
         self._intent = self._ask(self._action, automatic)
+
+    @property
+    def _others_now(self) -> str | None:
+        return None if self._state.newest is None else self._state.newest.others
 
     def _not_reached(self, timeout_s: float) -> str:
         newest, connection = self._state.newest, self._connection
