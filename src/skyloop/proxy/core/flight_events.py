@@ -26,8 +26,11 @@ def refused_event(name: str, command: Command, reason: Refusal, why: str) -> Eve
 
 def clamped_event(name: str, clamp: Clamp) -> EventDraft:
     """A limit shortened a set-point of the application ``name``."""
-    text = f"{name}: {clamp.limit} made {clamp.applied:.3g} of {clamp.asked:.3g}"
+    zone = f" ({clamp.zone})" if clamp.zone else ""
+    text = f"{name}: {clamp.limit}{zone} made {clamp.applied:.3g} of {clamp.asked:.3g}"
     data: dict[str, Value] = {"limit": clamp.limit, "asked": clamp.asked, "applied": clamp.applied}
+    if clamp.zone:
+        data["zone"] = clamp.zone
     return EventDraft(EventKind.COMMAND_CLAMPED, text, Severity.INFO, name, data)
 
 
@@ -53,15 +56,15 @@ def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
-def emergency_event(name: str) -> EventDraft:
-    """The application ``name`` stopped the motors."""
-    text = f"emergency stop by {name}"
 def landing_given_up_event() -> EventDraft:
     """A pilot's landing is given up because the vehicle was not heard."""
     text = f"the landing is given up: {UNHEARD}: land it again when it is heard"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": "landing_given_up"})
 
 
+def emergency_event(name: str) -> EventDraft:
+    """The application ``name`` stopped the motors."""
+    text = f"emergency stop by {name}"
     return EventDraft(EventKind.EMERGENCY, text, Severity.ERROR, name, {"reason": text})
 
 
