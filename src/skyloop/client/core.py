@@ -15,7 +15,7 @@ from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
 from skyloop.client.channels import JOIN_S, Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
-from skyloop.client.commands import LANDING, CommandSender, GivenUpError
+from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
 from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.logbook import Logbook
@@ -363,7 +363,7 @@ class DroneCore:
             elif feedback is not None and _returns(feedback):
                 report("it returns to its start and lands")
                 self.check_may_wait()
-                if not self.state.notifier.wait_for(self._is_down, RETURN_S):
+                if not self.state.notifier.wait_for(lambda: self._is_down() or cancelled.get()(), RETURN_S):
                     return NoAnswerError(f"the vehicle has not returned and landed within {RETURN_S:g} s")
             else:
                 report("landing")
