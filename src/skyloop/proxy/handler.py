@@ -51,14 +51,12 @@ from skyloop.messages.command import SET_POINTS
 from skyloop.messages.numbers import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
-from skyloop.proxy.core.authority_events import EventContext, authority_event
 from skyloop.proxy.core.command_checks import CommandChecks
-from skyloop.proxy.core.events import EventDraft
-from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
-from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
-from skyloop.proxy.core.flight import BELIEF_NS, Whose
-from skyloop.proxy.core.flight_events import (
+from skyloop.proxy.core.events import (
     UNHEARD,
+    EventContext,
+    EventDraft,
+    authority_event,
     battery_event,
     clamped_event,
     emergency_event,
@@ -72,6 +70,9 @@ from skyloop.proxy.core.flight_events import (
     taken_event,
     thin_zones_event,
 )
+from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
+from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
+from skyloop.proxy.core.flight import BELIEF_NS, Whose
 from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
 from skyloop.proxy.core.limits import Clamp, Episodes
 from skyloop.proxy.events import Counters, EventPublisher
