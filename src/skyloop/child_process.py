@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import subprocess
 import tempfile
 import threading
 import weakref
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import IO, Final, Protocol
 
 GRACE_S: Final = 4.0  #: for a child to end by itself, and again to end when it is terminated
@@ -189,6 +190,27 @@ class ChildProcess:
         if self._errors is not None and not self._errors.closed:
             self._last_words = self.last_words
             self._errors.close()
+
+
+@contextmanager
+def interrupt_deferred() -> Iterator[threading.Event]:
+    """Let Ctrl-C set an event within the block, and raise :class:`KeyboardInterrupt` at its end only.
+
+    For the end of several flights: raised in the middle it would keep the rest from theirs. It does nothing on other
+    threads than the main one, nor where the program handles Ctrl-C itself.
+    """
+    noted = threading.Event()
+    on_main = threading.current_thread() is threading.main_thread()
+    if not on_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield noted
+        return
+    signal.signal(signal.SIGINT, lambda *_: noted.set())
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if noted.is_set():
+        raise KeyboardInterrupt
 
 
 def handed_over() -> str | None:

@@ -35,6 +35,7 @@ class Wall(NamedTuple):
     normal: Vec3
     distance: float
     name: str  #: of the parameter
+    zone: str = ""  #: name of the zone, if it has one
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +60,9 @@ class Box:
         way = (nearest[0] - place[0], nearest[1] - place[1], nearest[2] - place[2])
         distance = math.hypot(*way)
         if distance > 0.0:
-            return Wall((way[0] / distance, way[1] / distance, way[2] / distance), distance, ZONES)
+            return Wall((way[0] / distance, way[1] / distance, way[2] / distance), distance, ZONES, self.name)
         return max(
-            (Wall((-n[0], -n[1], -n[2]), -d, ZONES) for n, d, _ in self.walls_inside(place)),
+            (Wall((-n[0], -n[1], -n[2]), -d, ZONES, self.name) for n, d, *_ in self.walls_inside(place)),
             key=lambda wall: wall.distance,
         )
 
@@ -107,10 +108,10 @@ class Cylinder:
         if across > 0.0 and along > 0.0:
             distance = math.hypot(across, along)
             share = across / distance
-            return Wall((aside[0] * share, aside[1] * share, up * along / distance), distance, ZONES)
+            return Wall((aside[0] * share, aside[1] * share, up * along / distance), distance, ZONES, self.name)
         if across >= along:
-            return Wall((aside[0], aside[1], 0.0), across, ZONES)
-        return Wall((0.0, 0.0, up), along, ZONES)
+            return Wall((aside[0], aside[1], 0.0), across, ZONES, self.name)
+        return Wall((0.0, 0.0, up), along, ZONES, self.name)
 
     def holds(self, place: Vec3) -> bool:
         """Whether a place is within it, or on its surface."""

@@ -32,7 +32,7 @@ from skyloop.cli.keyboard import (
     Tokenizer,
 )
 from skyloop.cli.teleop import Teleop
-from skyloop.messages import EmergencyStop, FlightState, Hover, Land, Takeoff, Velocity
+from skyloop.messages import EmergencyStop, Fate, FlightState, Hover, Land, Outcome, Refusal, Takeoff, Velocity
 from tests.cli.conftest import Run
 from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
 from tests.processes.conftest import Process
@@ -294,6 +294,39 @@ def test_an_arrow_that_comes_slowly_is_an_arrow() -> None:
     assert tokens.feed(b"[Aw") == ["w"], "an arrow, and no letters"
 
 
+@pytest.mark.parametrize(("focus", "told"), [(b"\x1b[O", "another window"), (b"\x1b[I", "again")])
+def test_a_window_that_gets_no_keys_is_told_and_takes_no_press_of_esc_away(focus: bytes, told: str) -> None:
+    """A terminal with another window in front of it heard no key, and said nothing."""
+    tokens = Tokenizer()
+    assert tokens.feed(focus) == []
+    assert told in tokens.other
+    assert tokens.feed(b"w") == ["w"]
+    assert tokens.other == ""
+    assert tokens.feed(b"\x1b\x1b" + focus + b"l") == ["esc", "esc", "l"]
+    assert told in tokens.other
+    assert tokens.feed(b"\x1b[15~") == []
+    assert tokens.other == "this key is none here"
+    tokens.feed(b"\x1b")
+    tokens.flush()
+    assert tokens.other == ""
+
+
+def test_a_key_that_does_nothing_says_so() -> None:
+    fingers = Fingers()
+    for key, told in (("x", "X is no key here"), ("\n", "Enter is no key here"), ("\x01", "'\\x01' is no key here")):
+        assert fingers.press(key) == []
+        assert fingers.hands.no_effect == told
+    assert fingers.press("w") == [FORWARD]
+    assert fingers.hands.no_effect == ""
+    assert fingers.press("l") == ["land"]
+    assert fingers.press("up", state=LANDING) == []
+    assert fingers.hands.no_effect.startswith("↑ has no effect on a landing, which H ends")
+    assert fingers.press("esc", after_s=5.0) == ["hover"]
+    assert fingers.press("esc", after_s=0.15) == ["stop"]
+    assert fingers.press("t") == []
+    assert fingers.hands.no_effect == "T has no effect while the motors are being stopped"
+
+
 @given(st.lists(st.binary(max_size=60), max_size=5))
 def test_whatever_a_terminal_sends_is_keys(parts: list[bytes]) -> None:
     tokens, hands = Tokenizer(), Hands()
@@ -400,6 +433,34 @@ def test_what_the_hands_ask_for_is_flown(proxy: ScriptedProxy) -> None:
             pilot.obey(order)  # type: ignore[arg-type]
             assert told in pilot._message
         assert pilot.picture()
+
+
+def test_keys_that_have_no_effect_say_why(proxy: ScriptedProxy) -> None:
+    """With the link lost, or sticks refused, nothing moved and nothing was said."""
+    with flown(proxy) as drone:
+        drone.wait("flying", WAIT_S)
+        pilot = Teleop(drone, 0.5, 0.8)
+        pilot.obey(FORWARD)
+        command = proxy.until_commanded(Velocity(0.5))
+        assert pilot._message == ""
+        assert proxy.owner is not None
+        text = "skyloop teleop: velocity refused: the vehicle is in RTL, which was not chosen here"
+        proxy.more["outcome"] = Outcome(proxy.owner[0], command.intent, Fate.OTHERS, Refusal.WRONG_STATE, text)
+        drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
+        pilot.obey(FORWARD)
+        assert pilot._message == f"the keys have no effect: {text}"
+        proxy.more.clear()
+        proxy.stop()
+        drone._core.state.notifier.wait_for(lambda: drone.link.application.value == "lost", WAIT_S)
+        pilot.obey(FORWARD)
+        assert pilot._message.startswith("the keys have no effect: the link is ")
+        proxy.start()
+    proxy.state = LANDED
+    with flown(proxy) as drone:
+        drone.wait("landed", WAIT_S)
+        pilot = Teleop(drone, 0.5, 0.8)
+        pilot.obey("hover")
+        assert pilot._message == "on the ground: T takes off"
 
 
 def test_without_a_terminal_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

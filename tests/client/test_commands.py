@@ -199,12 +199,20 @@ def lost_lease(proxy: ScriptedProxy, _: Command) -> None:
     proxy.event(EventKind.AUTHORITY_LOST, "", name, app_id=app_id, lease=lease, reason="silent")
 
 
-@pytest.mark.parametrize("ending", [failsafe, not_fresh, lost_link, lost_lease])
+def lost_lease_to_others(proxy: ScriptedProxy, command: Command) -> None:
+    """A pilot takes it by hand while the application has no lease."""
+    proxy.more["others"] = "the vehicle is in LOITER, which was not chosen here"
+    proxy.feedback()
+    lost_lease(proxy, command)
+
+
+@pytest.mark.parametrize("ending", [failsafe, not_fresh, lost_link, lost_lease, lost_lease_to_others])
 def test_a_landing_that_something_ended_is_asked_for_anew(
     proxy: ScriptedProxy, drone: Drone, ending: Callable[[ScriptedProxy, Command], None]
 ) -> None:
     def vehicle() -> None:
         first = proxy.until_commanded(Land())
+        assert not first.automatic
         ending(proxy, first)
         proxy.until(lambda: any(command.intent > first.intent for command in proxy.commands), "a new intent to land")
         proxy.more.clear()
@@ -217,7 +225,59 @@ def test_a_landing_that_something_ended_is_asked_for_anew(
     landing.join(WAIT_S)
     assert {command.action for command in proxy.commands if command.intent > 0} <= {Land(), Idle()}
     again = [command for command in proxy.commands if command.action == Land()][-1]
-    assert again.automatic is (ending is not failsafe), "a pilot who took it meanwhile keeps it"
+    kept = ending in (lost_link, lost_lease_to_others)
+    assert again.automatic is kept, "a pilot who took it meanwhile keeps it; else who asked for it still does"
+
+
+@pytest.mark.parametrize("pressed", ["before the lease is back", "under the lease"])
+def test_a_landing_asked_for_during_a_return_of_the_autopilots_own_is_the_callers_also_when_repeated(
+    proxy: ScriptedProxy, drone: Drone, pressed: str
+) -> None:
+    """It was asked for again as if the library had done so by itself, and refused."""
+    in_rtl = "the vehicle is in RTL, which was not chosen here"
+    proxy.state = FlightState.FLYING
+    drone.wait(lambda feedback: feedback.state is FlightState.FLYING, WAIT_S)
+    if pressed == "under the lease":
+        proxy.more["others"] = in_rtl
+        drone.wait(lambda feedback: feedback.others == in_rtl, WAIT_S)
+    else:
+        proxy.answers[RequestAuthority] = None
+        lost_lease(proxy, proxy.until_commanded(Idle()))
+        proxy.until(lambda: isinstance(proxy.requests[-1], RequestAuthority), "the loss is known")
+
+    def vehicle() -> None:
+        if pressed == "under the lease":
+            lost_lease(proxy, proxy.until_commanded(Land()))
+        else:
+            drone._core.state.notifier.wait_for(lambda: drone._core.commands.newest == Land(), WAIT_S)
+            proxy.more["others"] = in_rtl
+            drone.wait(lambda feedback: feedback.others == in_rtl, WAIT_S)
+            del proxy.answers[RequestAuthority]
+        proxy.until(lambda: any((c.action, c.lease) == (Land(), 2) for c in proxy.commands), "it is sent anew")
+        proxy.more.clear()
+        proxy.state = FlightState.LANDED
+
+    landing = background(vehicle)
+    drone.land(timeout_s=2 * WAIT_S)
+    landing.join(WAIT_S)
+    again = next(command for command in proxy.commands if (command.action, command.lease) == (Land(), 2))
+    assert not again.automatic
+
+
+def test_a_landing_that_was_given_up_after_a_minute_is_not_asked_for_anew(proxy: ScriptedProxy, drone: Drone) -> None:
+    """Whoever waited for it may have forgotten it, and what is heard by then may be another flight."""
+
+    def vehicle() -> None:
+        first = proxy.until_commanded(Land())
+        refuse(proxy, first, Refusal.VEHICLE_LINK_LOST, "me: not heard for 60 s", Fate.TIMED_OUT)
+
+    proxy.state = FlightState.HOVERING
+    drone.wait(lambda feedback: feedback.state is FlightState.HOVERING, WAIT_S)
+    losing = background(vehicle)
+    with pytest.raises(RefusedError, match="not heard for 60 s"):
+        drone.land(timeout_s=WAIT_S)
+    losing.join(WAIT_S)
+    assert len({command.intent for command in proxy.commands if command.action == Land()}) == 1
 
 
 def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -10,17 +10,20 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
+from skyloop import extend
 from skyloop.client import Drone, LinkStatus, RedialPolicy
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, LinkError, NoAnswerError, RefusedError, UnknownNameError
 from skyloop.messages import (
     Command,
+    Done,
     Event,
     EventKind,
     GetParameter,
     Hello,
     Hover,
     Idle,
+    JoinProcessor,
     Land,
     LinkState,
     Ping,
@@ -30,6 +33,7 @@ from skyloop.messages import (
     SetParameter,
     Takeoff,
     Velocity,
+    VideoRequest,
     encode,
 )
 from skyloop.transport.base import EVENTS, FEEDBACK, ClientHandler, TransportClient, video
@@ -191,6 +195,57 @@ def test_a_proxy_that_is_restarted_with_another_camera_is_read_by_that(proxy: Sc
     assert found == ["top"]
     with pytest.raises(UnknownNameError, match="front"):
         drone.next_frame("front")
+
+
+@pytest.mark.parametrize("kept", [False, True], ids=["another one", "another one first"])
+def test_callbacks_follow_a_proxy_that_is_restarted_with_another_camera(
+    proxy: ScriptedProxy, drone: Drone, kept: bool
+) -> None:
+    """Where they asked for no camera by name; readers did so already."""
+    frames, pictures, inline, named = [], [], [], []  # type: ignore[var-annotated]
+    listeners = [
+        drone.on_frame(lambda frame: frames.append(frame.camera)),
+        drone.on_frame(lambda frame: inline.append(frame.camera), inline=True),
+        drone.on_frame(lambda frame: named.append(frame.camera), "front"),
+        drone.on_encoded(pictures.append, kbit_s=100),
+    ]
+    mailboxes = extend.inbox(drone, frames=True)
+    front = proxy.capabilities.cameras[0]
+    cameras = (msgspec.structs.replace(front, name="top"), *((front,) if kept else ()))
+    with mailboxes:
+        proxy.until(lambda: proxy.server.subscribers("video/front") == 1, "the first subscription")
+        proxy.capabilities = msgspec.structs.replace(proxy.capabilities, cameras=cameras)
+        restarted(proxy)
+        proxy.until(lambda: proxy.server.subscribers("video/top") >= 1, "the new camera's subscription")
+        for seq in itertools.count(1):
+            proxy.frame(seq, "top")
+            if (frame := mailboxes.frame()) is not None and frames and inline:
+                break
+            assert seq < 100 * WAIT_S, "no frame came"
+            time.sleep(0.01)
+        assert frame.camera == "top"
+        assert set(frames) == set(inline) == {"top"}
+        assert named == []
+        stream = VideoRequest("top", encoding="h264", kbit_s=100).stream_topic
+        assert drone._core.state.streams[stream].consumed
+    for listener in listeners:
+        listener.cancel()
+    assert not any(channel.consumed for channel in drone._core.state.variants.values())
+    assert not any(channel.consumed for channel in drone._core.state.streams.values())
+    assert not drone._core.state.on_welcome.consumed
+
+
+def test_a_processor_follows_a_proxy_that_is_restarted_with_another_camera(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.answers[JoinProcessor] = Done()
+    membership = extend.join_processor(drone, "found", code="1")
+    top = msgspec.structs.replace(proxy.capabilities.cameras[0], name="top")
+    proxy.capabilities = msgspec.structs.replace(proxy.capabilities, cameras=(top,))
+    restarted(proxy)
+    proxy.until(
+        lambda: any(isinstance(one, JoinProcessor) and one.camera == "top" for one in proxy.requests), "it joins again"
+    )
+    assert membership.camera == "top"
+    membership.close()
 
 
 def test_garbage_restarts_the_connection(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -422,6 +422,27 @@ def test_the_rest_of_a_swarm_is_landed_by_the_library_and_not_by_its_program(
     assert Land() not in proxy.actions()
 
 
+def test_ctrl_c_at_the_end_of_a_swarm_waits_no_longer_and_keeps_no_drone_from_its_landing(
+    proxy: ScriptedProxy, two: tuple[ScriptedProxy, Swarm], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second Ctrl-C while the first drone was being landed left the others as they were."""
+    other, swarm = two
+    begin = threading.Thread.start
+
+    def start(thread: threading.Thread) -> None:
+        begin(thread)
+        if thread.name == "skyloop-swarm-a":
+            proxy.until_commanded(Land())
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt), swarm:
+        monkeypatch.setattr(threading.Thread, "start", start)
+    assert Land() in other.actions()
+    assert Land() in proxy.actions()
+    assert all(drone.closed for drone in swarm)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_the_end_of_a_swarm_bars_all_its_drones_before_the_first_lands(
     proxy: ScriptedProxy, two: tuple[ScriptedProxy, Swarm], drone: Drone, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -119,6 +120,54 @@ def test_one_that_fails_to_close_keeps_no_other_one_from_its_end(monkeypatch: py
         assert good.driver.closed
         assert good.proxy.ended
         assert broken.proxy.end(), "it ends once"
+
+
+@pytest.mark.parametrize("at", ["the first begins", "all have begun"])
+def test_ctrl_c_keeps_none_of_several_from_its_end(monkeypatch: pytest.MonkeyPatch, at: str) -> None:
+    """Raised while they were told one after the other, it left the rest in the air. It only shortens the wait."""
+    with ExitStack() as stack:
+        benches = [stack.enter_context(Bench()) for _ in range(3)]
+        for bench in benches:
+            bench.airborne()
+        begin, begun = threading.Thread.start, list[threading.Thread]()
+
+        def start(thread: threading.Thread) -> None:
+            begin(thread)
+            if thread.name == "skyloop-end":
+                begun.append(thread)
+                if len(begun) == (1 if at == "the first begins" else len(benches)):
+                    land_told(benches[0])
+                    signal.raise_signal(signal.SIGINT)
+
+        monkeypatch.setattr(threading.Thread, "start", start)
+        proxies = [bench.proxy for bench in benches]
+        with pytest.raises(KeyboardInterrupt):
+            end_all(proxies, LONG_S, reason="it is late", hurry=lambda: False)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        for bench in benches:
+            assert bench.driver.told
+            assert set(bench.driver.told) <= {Land(), Hover()}
+            assert bench.driver.closed
+
+
+def test_those_that_end_in_turn_are_told_to_land_before_the_first_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a thread for each, the second flew on while the first landed."""
+    with Bench() as first, Bench() as second:
+        for bench in (first, second):
+            bench.airborne()
+        begin = threading.Thread.start
+
+        def start(thread: threading.Thread) -> None:
+            if thread.name == "skyloop-end":
+                raise RuntimeError("can't start new thread")
+            begin(thread)
+
+        monkeypatch.setattr(threading.Thread, "start", start)
+        with ending(lambda: end_all([first.proxy, second.proxy], LONG_S, reason="it is late", hurry=lambda: False)):
+            land_told(second)
+            assert not first.driver.closed
+            for bench in (first, second):
+                bench.driver.report(state=FlightState.LANDED)
 
 
 def test_where_there_is_no_thread_for_all_the_rest_ends_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import pytest
 from skyloop.messages import (
     AnyAction,
     Attitude,
+    Event,
     EventKind,
     Failsafe,
     Fate,
@@ -19,6 +20,7 @@ from skyloop.messages import (
     Refusal,
     ReleaseAuthority,
     RequestAuthority,
+    SetParameter,
     Takeoff,
     Velocity,
 )
@@ -130,6 +132,109 @@ def test_a_pilots_landing_survives_a_broken_link(bench: Bench, noticed: bool) ->
     bench.driver.report(state=FlightState.HOVERING)
     bench.run(1.0, lambda: pilot.command(Idle(), repeat=True))
     assert bench.driver.told == [], "it is over"
+
+
+def in_the_dark(bench: Bench, seconds: int, app: App, action: AnyAction) -> None:
+    """Let time pass in steps of a second while an application repeats this, with patience for both."""
+    for _ in range(seconds):
+        bench.clock.advance(1.0)
+        bench.tick()
+        app.command(action, repeat=True)
+
+
+def be_patient(app: App) -> None:
+    for name in ("failsafe.hover_after_s", "failsafe.land_after_s", "authority.timeout_s"):
+        app.ask(SetParameter(name, 3600.0, app.lease))
+
+
+@pytest.mark.parametrize("state", [FlightState.FLYING, FlightState.LANDING, FlightState.LANDED, FlightState.UNKNOWN])
+def test_a_landing_asked_for_in_the_dark_is_given_up_after_a_minute(bench: Bench, state: FlightState) -> None:
+    """A vehicle that was heard again ten minutes later was landed at once: by then it may be another flight."""
+    pilot = bench.airborne()
+    be_patient(pilot)
+    bench.driver.answers = False
+    bench.driver.report(state=state)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    in_the_dark(bench, 30, pilot, Idle())
+    pilot.command(Land())
+    in_the_dark(bench, 59, pilot, Land())
+    assert messages(pilot, "landing_given_up") == []
+    assert bench.driver.told[-1] == Land()
+    in_the_dark(bench, 1, pilot, Land())
+    (text,) = messages(pilot, "landing_given_up")
+    assert "not heard for 60 s" in text
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.fate, outcome.reason) == (Fate.TIMED_OUT, Refusal.VEHICLE_LINK_LOST)
+    bench.driver.told.clear()
+    in_the_dark(bench, 5, pilot, Land())
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(0.5, lambda: pilot.command(Land(), repeat=True))
+    assert Land() not in bench.driver.told
+    assert len(messages(pilot, "landing_given_up")) == 1
+    pilot.command(Land())
+    assert bench.driver.told[-1] == Land(), "asked for anew, it lands"
+
+
+@pytest.mark.parametrize("pilot_stays", [True, False])
+def test_a_landing_that_is_under_way_outlives_a_broken_link_for_a_minute(bench: Bench, pilot_stays: bool) -> None:
+    pilot = bench.airborne()
+    be_patient(pilot)
+    bench.driver.answers = False
+    pilot.command(Land())
+    in_the_dark(bench, 10, pilot, Idle())
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    if not pilot_stays:
+        pilot.ask(ReleaseAuthority())
+    bench.driver.told.clear()
+    in_the_dark(bench, 59, pilot, Idle())
+    assert bench.driver.told == [Land()] * 59, "a driver keeps it for 3 s only"
+    assert bench.published(EventKind.VEHICLE_MESSAGE) == []
+    in_the_dark(bench, 1, pilot, Idle())
+    bench.driver.told.clear()
+    in_the_dark(bench, 5, pilot, Idle())
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(0.5)
+    assert Land() not in bench.driver.told
+    (event,) = bench.published(EventKind.VEHICLE_MESSAGE)
+    assert event.data["reason"] == "landing_given_up"
+
+
+def test_one_that_only_the_software_can_fly_is_given_up_as_well() -> None:
+    with Bench({"velocity"}) as software:
+        software.driver.report(altitude_m=2.0, state=FlightState.FLYING)
+        pilot = software.pilot()
+        be_patient(pilot)
+        pilot.command(Hover())
+        software.driver.link(LinkState.LOST)
+        software.tick()
+        pilot.command(Land())
+        in_the_dark(software, 60, pilot, Land())
+        assert len(messages(pilot, "landing_given_up")) == 1
+        software.driver.link(LinkState.UP)
+        software.driver.report(altitude_m=2.0, state=FlightState.FLYING)
+        software.driver.told.clear()
+        software.run(0.5, lambda: pilot.command(Land(), repeat=True))
+        assert all(action.up >= 0.0 for action in software.driver.told if isinstance(action, Velocity))
+
+
+@pytest.mark.parametrize("leaves", ["falls silent", "is killed", "releases"])
+def test_no_hover_breaks_off_a_landing_that_its_pilot_asked_for(bench: Bench, leaves: str) -> None:
+    """Also not the one of the ladder, nor that between two pilots."""
+    pilot = bench.airborne()
+    pilot.command(Land())
+    assert bench.driver.now.state is FlightState.LANDING
+    if leaves == "is killed":
+        pilot.end.close()
+        wait_until(lambda: bench.proxy.handler.authority.holder is None, "its end is noticed")
+    elif leaves == "releases":
+        pilot.ask(ReleaseAuthority())
+    bench.run(3.0)
+    bench.pilot("other")
+    bench.run(0.2)
+    assert Hover() not in bench.driver.told
 
 
 def landing_in_the_dark(bench: Bench) -> App:
@@ -261,6 +366,35 @@ def test_a_killed_pilot(bench: Bench) -> None:
     assert bench.driver.told[2:] == []
     bench.run(0.02)
     assert bench.driver.told[2:] == [Land()]
+
+
+@pytest.mark.parametrize("leaves", ["is killed", "falls silent", "releases"])
+def test_the_vehicle_hovers_before_anything_is_told(bench: Bench, leaves: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three events went out first, to every application, of which each takes its time."""
+    pilot, witness = bench.airborne(), bench.join("witness")
+    pilot.command(Velocity(0.5))
+    told_first: list[list[Event]] = []
+    apply, before = bench.driver._apply, len(bench.events)
+
+    def applied(action: AnyAction) -> AnyAction:
+        told_first.append(bench.events[before:])
+        return apply(action)
+
+    monkeypatch.setattr(bench.driver, "_apply", applied)
+    if leaves == "is killed":
+        pilot.end.close()
+        wait_until(lambda: bench.proxy.handler.authority.holder is None, "its end is noticed")
+    elif leaves == "releases":
+        pilot.ask(ReleaseAuthority())
+        before = len(bench.events)
+    bench.run(0.5)
+    witness.sync()
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    assert told_first == [[]]
+    kinds = [event.kind for event in witness.events if event.kind is not EventKind.AUTHORITY_GRANTED]
+    if leaves == "is killed":
+        assert kinds[-3:] == [EventKind.APPLICATION_LINK, EventKind.AUTHORITY_LOST, EventKind.FAILSAFE]
+    assert kinds[-1] is EventKind.FAILSAFE
 
 
 def test_a_pilot_who_released(bench: Bench) -> None:

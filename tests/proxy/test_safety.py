@@ -17,6 +17,7 @@ from skyloop.messages import (
     EventKind,
     Feedback,
     Hover,
+    ParameterValue,
     Position,
     Refusal,
     Refused,
@@ -418,6 +419,24 @@ def test_thin_zones_are_kept_clear_of_as_if_they_were_thicker_and_that_is_told(b
     assert event.severity is Severity.WARNING
     assert event.data["reason"] == "thin_zones"
     assert "net: box 1 -5 0 1.05 5 3" in event.text
+
+
+def test_a_zone_with_a_name_is_told_by_it(bench: Bench) -> None:
+    """Its name was in what was refused, and not in what was shortened."""
+    pilot = bench.airborne()
+    zones = "tree: cylinder 2 0 0.5 0 3; pond: box -3 -1 0 -2 1 3; box 5 5 0 6 6 3"
+    assert isinstance(pilot.ask(SetParameter(ZONES, zones, pilot.lease)), ParameterValue)
+    bench.driver.report(position_m=(1.3, 0.0, 1.0), yaw_rad=0.0)
+    pilot.command(Velocity(2.0))
+    pilot.command(Attitude(pitch=0.3))
+    told = pilot.told(EventKind.COMMAND_CLAMPED)
+    assert {event.data.get("zone") for event in told if event.data["limit"] == ZONES} == {"tree"}
+    assert f"{ZONES} (tree) made" in next(event.text for event in told if event.data["limit"] == ZONES)
+    pilot.command(Position(2.0, 0.0, 1.0))
+    assert "tree: cylinder" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
+    bench.move((-1.8, 0.0, 1.0))
+    pilot.command(Velocity(-2.0))
+    assert pilot.told(EventKind.COMMAND_CLAMPED)[-1].data["zone"] == "pond"
 
 
 def test_a_refused_take_off_leaves_the_vehicle_where_it_stands(bench: Bench) -> None:

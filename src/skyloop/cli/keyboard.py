@@ -80,6 +80,14 @@ KEY_MAP: Final = (
     ("C R", "take control, release"),
     ("Q", "land if flying, and end"),
 )
+_NAMES: Final = {"up": "↑", "down": "↓", "left": "←", "right": "→", " ": "Space", "\n": "Enter", "\t": "Tab"}
+#: Ask the terminal to report when its window gains and loses the keyboard, and to stop that.
+TELL_FOCUS: Final = "\x1b[?1004h"
+TELL_NO_FOCUS: Final = "\x1b[?1004l"
+_FOCUS: Final = {
+    b"\x1b[I": "this window gets the keys again",
+    b"\x1b[O": "another window gets the keys: none is heard here",
+}
 _ARROWS: Final = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}
 _ARROW: Final = re.compile(rb"\x1b[\[O]([ABCD])")
 _SEQUENCE: Final = re.compile(rb"\x1b+(?:\[[0-?]*[ -/]*[@-~]|O[0-9;]*[@-~])")
@@ -111,6 +119,7 @@ class Hands:
         self._doubtful = False  # the last Esc may have been a press, or the first repeat of one that was held
         self._delay_s = math.inf  # the keyboard's, before it repeats a key that is held; not known yet
         self._newest = "", -math.inf, math.inf  # the last key, when, and how long after the same one before it
+        self.no_effect = ""  #: why a key of the last step did nothing, for people; empty where each did something
 
     def step(self, keys: Sequence[str], now_s: float, state: FlightState) -> list[Order | Deflection]:
         """Return what is to be done, in this order; last where the sticks are, if one is moved.
@@ -121,6 +130,7 @@ class Hands:
             state: Of the vehicle.
         """
         wanted: list[Order | Deflection] = []
+        self.no_effect = ""
         stalled = now_s - self._stepped_s > REPEAT_S  # keys may have waited, and tell no time
         self._stepped_s = now_s
         repeats = stalled and bool(keys) and keys[0] == "esc"
@@ -161,12 +171,18 @@ class Hands:
         if order == "quit":
             return order
         if now_s - self._stopped_s < STOPPING_S and state is not FlightState.EMERGENCY:
+            self.no_effect = f"{_shown(key)} has no effect while the motors are being stopped"
             return None  # nothing takes the place of a stop that is not shown yet
         if key not in STICKS:
+            if order is None:
+                self.no_effect = f"{_shown(key)} is no key here"
             return order
         axis, sign = STICKS[key]
         landing = state is FlightState.LANDING or now_s - self._landed_s < LANDING_S
         if landing or now_s - self._held_over.get(key, -math.inf) < HOLD_S:
+            self.no_effect = (
+                f"{_shown(key)} has no effect on a landing, which H ends; let it go, and press it again then"
+            )
             self._held_over[key] = now_s  # a landing is ended by H, by no stick and no key that was held meanwhile
         else:
             self._pressed[axis] = (sign, now_s)
@@ -201,6 +217,11 @@ class Hands:
         return "stop"
 
 
+def _shown(key: str) -> str:
+    """Return a key as it is written on a keyboard, or as what it sends."""
+    return _NAMES.get(key) or (key.upper() if key.isprintable() else repr(key))
+
+
 class Tokenizer:
     """Makes keys of what a terminal sends: letters, ``up`` … for arrows, ``esc``, and ``alt`` for Alt with any key.
 
@@ -210,6 +231,7 @@ class Tokenizer:
     def __init__(self) -> None:
         self._rest = b""
         self._alone = False  # an Esc was taken for one that stands alone
+        self.other = ""  #: a notice about other input in the last bytes, for people; may be empty
 
     @property
     def waits(self) -> bool:
@@ -220,6 +242,7 @@ class Tokenizer:
         """Return the keys that are complete."""
         late = self._alone and data[:1] in (b"[", b"O")  # the rest of an arrow that came slowly
         data, self._alone = self._rest + (b"\x1b" if late else b"") + data, False
+        self.other = ""
         keys: list[str] = []
         while data:
             if data[:1] != b"\x1b":
@@ -227,10 +250,15 @@ class Tokenizer:
                 data = data[1:]
             elif found := _SEQUENCE.match(data):
                 arrow = _ARROW.fullmatch(found[0])
-                if arrow is not None and not late:
+                if (focus := _FOCUS.get(found[0][-3:])) is not None:
+                    self.other = focus
+                    keys += ["esc"] * (len(found[0]) - 3)  # pressed just before, and no part of this
+                elif arrow is not None and not late:
                     keys.append(_ARROWS[arrow[1]])
                 elif data[:2] == b"\x1b\x1b":
                     keys.append("alt")
+                elif arrow is None:
+                    self.other = "this key is none here"
                 data = data[found.end() :]
             elif len(data) <= _LONGEST and _UNFINISHED.fullmatch(data):
                 break
@@ -245,7 +273,7 @@ class Tokenizer:
 
     def flush(self) -> list[str]:
         """Return what the beginning of a sequence was, as nothing more came."""
-        rest, self._rest = self._rest, b""
+        rest, self._rest, self.other = self._rest, b"", ""
         self._alone = rest == b"\x1b"
         return ["esc"] * len(rest) if not rest.strip(b"\x1b") else ["alt"]
 
@@ -298,6 +326,11 @@ class Keyboard:
             if hasattr(termios, name):
                 mode[6][getattr(termios, name)] = bytes((os.fpathconf(self._fd, "PC_VDISABLE"),))
         termios.tcsetattr(self._fd, termios.TCSANOW, mode)
+
+    @property
+    def other(self) -> str:
+        """A notice about other input than keys that was just read, for people; may be empty."""
+        return self._tokens.other
 
     def keys(self, within_s: float) -> list[str]:
         """Return the keys that were pressed, as soon as there are any.

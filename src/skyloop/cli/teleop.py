@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -11,10 +13,11 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from skyloop.cli.keyboard import KEY_MAP, Deflection, Hands, Keyboard, Order
+from skyloop.cli.keyboard import KEY_MAP, TELL_FOCUS, TELL_NO_FOCUS, Deflection, Hands, Keyboard, Order
 from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
 from skyloop.errors import AuthorityError, SkyloopError
 from skyloop.extend import Known, commands, let_go
+from skyloop.messages import LinkState
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -81,13 +84,19 @@ class Teleop:
             EOFError: The terminal is gone.
         """
         # It is drawn on a thread of its own: a terminal that takes no more keeps no key waiting.
-        with keyboard, Live(console=Console(), get_renderable=self.picture, refresh_per_second=REFRESH_HZ):
+        console = Console()
+        with (
+            keyboard,
+            _focus_told(console),
+            Live(console=console, get_renderable=self.picture, refresh_per_second=REFRESH_HZ),
+        ):
             while True:
                 keys = keyboard.keys(PERIOD_S)
                 for order in self._hands.step(keys, time.monotonic(), self._drone.feedback().state):
                     if order == "quit":
                         return
                     self.obey(order)
+                self._message = self._hands.no_effect or keyboard.other or self._message
 
     def obey(self, order: Order | Deflection) -> None:
         """Carry out what the hands ask for; what is not possible is reported and changes nothing.
@@ -132,8 +141,9 @@ class Teleop:
         elif order == "land":
             drone.land(wait=False)
         elif order == "hover":
-            if drone.feedback().state.airborne or commands(drone).wants_flight:  # a take-off may not show yet
-                drone.hover()
+            if not (drone.feedback().state.airborne or commands(drone).wants_flight):  # a take-off may not show yet
+                return self._obey("grounded")
+            drone.hover()
         elif order == "take":
             drone.request_authority()
         elif order == "release":
@@ -142,12 +152,23 @@ class Teleop:
 
     def _steer(self, sticks: Deflection) -> None:
         speed, turn = self._speed * self._gain, self._turn * self._gain
-        self._drone.velocity(
+        sent = self._drone.velocity(
             forward=sticks.forward * speed,
             left=sticks.left * speed,
             up=sticks.up * speed,
             yaw_rate=sticks.yaw_rate * turn,
         )
+        if not sent:
+            self._message = f"the keys have no effect: {self._why_not()}"
+
+    def _why_not(self) -> str:
+        """Return why the newest set-point has no effect."""
+        link, told = self._drone.link, commands(self._drone).told
+        if link.application not in (LinkState.UP, LinkState.DEGRADED):
+            return f"the link is {link.application.value} ({link.reason})"
+        if self._drone.authority.state != "held":
+            return "control is asked for"
+        return told.text if told is not None and told.text else "nothing can be sent now"
 
     def picture(self) -> Group:
         """Return all that is shown at one time, what matters most on top: what does not fit is cut at the bottom."""
@@ -158,6 +179,17 @@ class Teleop:
         video = Text(self._page or f"skyloop cockpit {drone.name} shows the video", "dim")
         message = Text(self._message, "bold")
         return Group(message, state_panel(drone), keys, video, channels(drone), *events(drone, EVENTS_SHOWN))
+
+
+@contextmanager
+def _focus_told(console: Console) -> Iterator[None]:
+    """Ask the terminal to report whether its window gets the keys."""
+    try:
+        console.file.write(TELL_FOCUS if console.is_terminal else "")
+        yield
+    finally:
+        console.file.write(TELL_NO_FOCUS if console.is_terminal else "")
+        console.file.flush()
 
 
 def _page(drone: Drone) -> CockpitProcess:

@@ -6,9 +6,10 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from types import TracebackType
-from typing import Final, Generic, Protocol, Self, TypedDict, TypeVar
+from typing import Any, Final, Generic, Protocol, Self, TypedDict, TypeVar
 
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.feedback_history import FeedbackHistory
@@ -16,12 +17,13 @@ from skyloop.client.frame import Arrival, Frame, SmallArrival
 from skyloop.client.link_monitor import StallWatch
 from skyloop.client.mailbox import Holder, Mailbox
 from skyloop.client.statistics import ChannelCounter, ChannelStats
-from skyloop.errors import ClosedError, DecodeError
+from skyloop.errors import ClosedError, DecodeError, SkyloopError
 from skyloop.messages import CameraInfo, EventKind, FrameHeader, Severity, VideoRequest
 from skyloop.messages.video import FrameFilter, VideoEncoding
 from skyloop.transport.base import Pixels, video
 
 T = TypeVar("T")
+C = TypeVar("C", bound="Channel[Any]")
 
 #: Called with the name of a listener and the exception that its function raised.
 Report = Callable[[str, Exception | SystemExit], None]
@@ -117,6 +119,58 @@ class Channel(Generic[T]):
             self.subscribed = wanted
             if self._subscribe is not None:
                 self._subscribe(wanted)
+
+
+class FollowingChannel(Channel[T], Generic[T, C]):
+    """The channel that is found now, and another one once the proxy was started again with other cameras.
+
+    Who asked for no camera by name follows the vehicle's first. Consumers are added to the channel that is found, which
+    delivers to them as to any others.
+    """
+
+    def __init__(self, find: Callable[[], C], changes: Channel[Any]) -> None:
+        """Begin with the present channel.
+
+        Args:
+            find: Returns the channel; it may raise what keeps the one before.
+            changes: Published to when there may be another channel.
+        """
+        super().__init__()
+        self.current = find()
+        self._find = find
+        self._changes = changes
+        self._looks = self._look
+
+    def add(self, consumer: Callable[[T], None], dropped: Callable[[], int]) -> None:
+        """Deliver to ``consumer`` too; see :meth:`Channel.add`."""
+        with self._lock:
+            if not self._drops:
+                self._changes.add(self._looks, _none)
+            self._drops[consumer] = dropped
+            self.current.add(consumer, dropped)
+
+    def remove(self, consumer: Callable[[T], None]) -> None:
+        """Stop delivering to ``consumer``. Does nothing if it is not there."""
+        with self._lock:
+            if self._drops.pop(consumer, None) is not None:
+                self.current.remove(consumer)
+                if not self._drops:
+                    self._changes.remove(self._looks)
+
+    def _look(self, _: object) -> None:
+        with self._lock, suppress(SkyloopError):  # there is no camera, or the drone was closed
+            before, self.current = self.current, self._find()
+            for consumer, dropped in self._drops.items() if self.current is not before else ():
+                before.remove(consumer)
+                self.current.add(consumer, partial(_since, dropped, dropped()))
+
+
+def _none() -> int:
+    return 0
+
+
+def _since(dropped: Callable[[], int], before: int) -> int:
+    return dropped() - before
 
 
 class VideoChannel(Channel[Arrival]):

@@ -117,6 +117,8 @@ class ActionWait:
         self._flew = False  # it was in the air meanwhile
         self._refused, self._refused_ns = 0, 0  # the newest intent of ours that was not possible yet, and since when
         self._asked_ns = state.scheduler.clock()
+        # The call may take the vehicle from the pilot who has it now, or when it can first be sent.
+        self._others, self._may_be_sent = self._others_now, commands.may_ask
         self._intent = ask(action, False)
 
     @property
@@ -220,15 +222,23 @@ class ActionWait:
 
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
         """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
-        if outcome.fate in OVERRULED or outcome.fate is Fate.TIMED_OUT:
-            if self._commands.may_ask:  # a pilot may have taken it by hand while a link was lost
-                self._again(automatic=outcome.fate is not Fate.FAILSAFE)
+        if outcome.fate in OVERRULED:
+            if self._commands.may_ask:
+                # The caller still asks for it, but a pilot who took the vehicle by hand since then keeps it. While the
+                # application's own link is lost, nothing shows that.
+                taken = self._may_be_sent and self._others_now not in (None, self._others)
+                explicit = outcome.fate is Fate.FAILSAFE or (outcome.fate is Fate.AUTHORITY and not taken)
+                self._again(automatic=not explicit)
             return None
         return None if outcome.fate in OUTDONE else _refused(outcome)
 
     def _again(self, *, automatic: bool = True) -> None:
         self._asked_ns = self._state.scheduler.clock()
         self._intent = self._ask(self._action, automatic)
+
+    @property
+    def _others_now(self) -> str | None:
+        return None if self._state.newest is None else self._state.newest.others
 
     def _not_reached(self, timeout_s: float) -> str:
         newest, connection = self._state.newest, self._connection

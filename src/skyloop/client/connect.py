@@ -17,7 +17,7 @@ from skyloop.client.authority import Authority, check_seconds
 from skyloop.client.connection import Scheduler
 from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
-from skyloop.client.swarm import OnError, Swarm, check_policy, in_parallel
+from skyloop.client.swarm import OnError, Swarm, check_policy, end_flights, in_parallel
 from skyloop.client.warm_up import keeper
 from skyloop.errors import Hint, LinkError, MissingExtraError, SwarmError, UnknownNameError, UsageError
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
@@ -378,7 +378,7 @@ def swarm(
 
     drones, errors = in_parallel({name: join(target) for name, target in chosen.items()})
     if errors and (missing == "raise" or not drones):
-        in_parallel({name: drone._core.end_flight for name, drone in drones.items()})
+        end_flights(drones)
         raise SwarmError("connecting", errors, len(chosen))
     return Swarm(drones, on_error=on_error, missing=errors)
 

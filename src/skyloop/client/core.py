@@ -13,9 +13,9 @@ from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 
 from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
-from skyloop.client.channels import JOIN_S, Listener, VideoChannel
+from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
-from skyloop.client.commands import LANDING, CommandSender, GivenUpError
+from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
 from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.logbook import Logbook
@@ -363,7 +363,7 @@ class DroneCore:
             elif feedback is not None and _returns(feedback):
                 report("it returns to its start and lands")
                 self.check_may_wait()
-                if not self.state.notifier.wait_for(self._is_down, RETURN_S):
+                if not self.state.notifier.wait_for(lambda: self._is_down() or cancelled.get()(), RETURN_S):
                     return NoAnswerError(f"the vehicle has not returned and landed within {RETURN_S:g} s")
             else:
                 report("landing")
@@ -585,6 +585,10 @@ class DroneCore:
         )
         return channel if request == channel.request else self.state.video(channel.camera, request)
 
+    def follow(self, find: Callable[[], C]) -> FollowingChannel[Any, C]:
+        """Return the channel that ``find`` returns, also once the proxy was started again with other cameras."""
+        return FollowingChannel(find, self.state.on_welcome)
+
     def stream(self, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
         """Return the channel of a camera's H.264; see :func:`skyloop.extend.stream_channel`."""
         return self.state.stream(VideoRequest(self.channel(camera).camera.name, encoding="h264", **how))
@@ -623,7 +627,7 @@ class DroneCore:
             self.state.scheduler,
             self.connection,
             feedback=self.state.on_feedback if feedback else None,
-            frames=self.channel(camera) if frames else None,
+            frames=self.follow(lambda: self.channel(camera)) if frames else None,
             results=wanted if results else [],
             max_age_s=checked_age(max_age_s),
         )
@@ -636,7 +640,12 @@ class DroneCore:
         if not isinstance(code, str) or len(code) > MAX_CODE:
             raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
         membership = Membership(
-            self.connection, self.state, checked_name(name), code, self.channel(camera).camera.name, shared=shared
+            self.connection,
+            self.state,
+            checked_name(name),
+            code,
+            lambda: self.channel(camera).camera.name,
+            shared=shared,
         )
         membership.start(timeout_s)
         self._to_close.append(membership)  # ends with the drone

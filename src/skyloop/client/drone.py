@@ -50,6 +50,7 @@ from skyloop.client.results import (
     silence,
 )
 from skyloop.client.statistics import ChannelStats, Distribution
+from skyloop.client.streams import StreamChannel
 from skyloop.client.telemetry import LinkStatus, Wanted, as_predicate
 from skyloop.errors import (
     AuthorityError,
@@ -706,26 +707,20 @@ class Drone:
             UsageError: If an option is out of range, or from an inline callback.
             ClosedError: If the drone was closed before.
         """
-        channel = self._core.channel(camera, **how)
+        channel = self._core.follow(lambda: self._core.channel(camera, **how))
+        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._core.sample_notifier())
         self._core.check_may_wait()
         max_age_s, deadline = how.get("max_age_s"), time.monotonic() + timeout_s
-        while not self._core.closed:
-            mailbox: Mailbox[Arrival] = Mailbox(notifier=self._core.sample_notifier())
-            with self._core.closing(mailbox), channel.into(mailbox):
-                while not self._core.closed:
-                    arrival = mailbox.wait(max(0.0, min(LOOK_S, deadline - time.monotonic())))
-                    if arrival is not None:
-                        frame = channel.picture(arrival, max_age_s)
-                        if frame is not None:
-                            yield frame
-                            deadline = time.monotonic() + timeout_s
-                    elif mailbox.closed:
-                        continue
-                    elif time.monotonic() >= deadline:
-                        raise self._core.no_frame(channel.camera.name, timeout_s)
-                    elif (now := self._core.channel(camera, **how)) is not channel:
-                        channel = now  # the proxy was started again with another camera
-                        break
+        with self._core.closing(mailbox), channel.into(mailbox):
+            while not self._core.closed:
+                arrival = mailbox.wait(max(0.0, deadline - time.monotonic()))
+                if arrival is not None:
+                    frame = channel.current.picture(arrival, max_age_s)
+                    if frame is not None:
+                        yield frame
+                        deadline = time.monotonic() + timeout_s
+                elif not mailbox.closed:
+                    raise self._core.no_frame(channel.current.camera.name, timeout_s)
 
     def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
         """Wait until the newest feedback is as wanted.
@@ -851,7 +846,7 @@ class Drone:
 
         Args:
             function: Called on a thread of its own with the newest ``depth`` frames that it has not seen.
-            camera: Name of the camera; None: the vehicle's first.
+            camera: Name of the camera; None: the vehicle's first, also once its proxy is started again with others.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
             **how: As for :meth:`frames`.
@@ -868,16 +863,15 @@ class Drone:
         if depth < 1:
             raise UsageError(f"depth is {depth!r} and must be at least 1 frame")
         self._check_listener(function)
-        channel = self._core.channel(camera, **how)
-
+        channel = self._core.follow(lambda: self._core.channel(camera, **how))
         max_age_s = how.get("max_age_s")
 
         def call(arrival: Arrival) -> None:
-            frame = channel.picture(arrival, max_age_s)
+            frame = channel.current.picture(arrival, max_age_s)
             if frame is not None:
                 function(frame)
 
-        return self._listen(channel, call, f"frames of {channel.camera.name}", depth=depth, inline=inline)
+        return self._listen(channel, call, f"frames of {channel.current.camera.name}", depth=depth, inline=inline)
 
     def on_encoded(
         self,
@@ -918,19 +912,22 @@ class Drone:
         if depth < 1:
             raise UsageError(f"depth is {depth!r} and must be at least 1 picture")
         self._check_listener(function)
-        info = self._core.channel(camera).camera
-        as_it_came = bool(info.stream) and kbit_s is None and max_fps is None and scale == 1.0
-        subscriber = "" if as_it_came or kbit_s is not None else f"{self._core.subscriber}-encoded"
-        stream = self._core.stream(info.name, kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
-        chain = Chain()
+
+        def find() -> StreamChannel:
+            info = self._core.channel(camera).camera
+            as_it_came = bool(info.stream) and kbit_s is None and max_fps is None and scale == 1.0
+            subscriber = "" if as_it_came or kbit_s is not None else f"{self._core.subscriber}-encoded"
+            return self._core.stream(info.name, kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
+
+        stream, chain = self._core.follow(find), Chain()
 
         def call(picture: EncodedFrame) -> None:
             follows = chain.follows(picture.seq, key=picture.key)
-            stream.report(picture.seq, wants_key=not follows)
+            stream.current.report(picture.seq, wants_key=not follows)
             if follows:
                 function(picture)
 
-        return self._listen(stream, call, f"pictures of {info.name}", depth=depth, inline=inline)
+        return self._listen(stream, call, f"pictures of {camera or 'the camera'}", depth=depth, inline=inline)
 
     def annotate(self, frame: Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         """Publish shapes drawn over a frame, for the cockpit and for recordings.

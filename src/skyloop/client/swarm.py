@@ -14,8 +14,18 @@ from typing import Final, Literal, Self, TypeVar, get_args
 
 import numpy as np
 
+from skyloop.child_process import interrupt_deferred
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import above_zero, by_name, cancelled, checked, number, position_action, return_action
+from skyloop.client.commands import (
+    GivenUpError,
+    above_zero,
+    by_name,
+    cancelled,
+    checked,
+    number,
+    position_action,
+    return_action,
+)
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
@@ -577,12 +587,13 @@ class Swarm:
         for drone in self._drones.values():
             if not drone.closed:
                 drone._core.commands.bar()  # all before the first lands
-        return _problems(self._drones, lambda drone: drone._core.end_flight())
+        return end_flights(self._drones)
 
     def close(self) -> None:
         """End all connections. Does not land. Idempotent."""
         self._closed = True
-        in_parallel({name: drone.close for name, drone in self._drones.items()})
+        with interrupt_deferred():
+            in_parallel({name: drone.close for name, drone in self._drones.items()})
 
     def __enter__(self) -> Self:
         self._check_open()
@@ -673,13 +684,28 @@ def _is(drone: Drone, predicate: Callable[[Feedback], bool]) -> bool:
     return drone.link.application in _THERE and predicate(drone.feedback())
 
 
+def end_flights(drones: Mapping[str, Drone]) -> dict[str, Exception]:
+    """End the flights of all at the same time and close; return what went wrong, by name.
+
+    Ctrl-C meanwhile waits no longer for landings: each is asked for all the same, and goes on without this program.
+    """
+    return _problems(drones, lambda drone: drone._core.end_flight())
+
+
 def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError | None]) -> dict[str, Exception]:
-    """End the flights of all at the same time; return what went wrong, by name."""
+    """Land all, or end their flights, at the same time; return what went wrong, by name."""
 
     def job(drone: Drone) -> Callable[[], SkyloopError | None]:
-        return lambda: end(drone)
+        def ended() -> SkyloopError | None:
+            try:
+                return end(drone)
+            except GivenUpError:  # nobody waits for it any more
+                return None
 
-    ended, errors = in_parallel({name: job(drone) for name, drone in drones.items()})
+        return ended
+
+    with interrupt_deferred() as interrupted:
+        ended, errors = in_parallel({name: job(drone) for name, drone in drones.items()}, interrupted)
     return errors | {name: problem for name, problem in ended.items() if problem is not None}
 
 
@@ -692,7 +718,9 @@ def _what(actions: Mapping[str, AnyAction]) -> str:
     return ", ".join(sorted({action.name for action in actions.values()}))
 
 
-def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict[str, Exception]]:
+def in_parallel(
+    jobs: Mapping[str, Callable[[], T]], interrupted: threading.Event | None = None
+) -> tuple[dict[str, T], dict[str, Exception]]:
     """Run all jobs at the same time, each on a thread of its own, and wait for the last.
 
     The threads are daemons; what gets none is done on this one. An interrupt of the waiting ends their waits for
@@ -700,6 +728,7 @@ def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict
 
     Args:
         jobs: By name.
+        interrupted: Ends their waits as well, once it is set.
 
     Returns:
         What each job returned, and the :class:`SkyloopError` that each raised, both by name. Any other exception is
@@ -707,7 +736,7 @@ def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict
     """
     results: dict[str, T] = {}
     raised: dict[str, BaseException] = {}
-    interrupted, outside = threading.Event(), cancelled.get()
+    interrupted, outside = interrupted or threading.Event(), cancelled.get()
 
     def work(name: str, job: Callable[[], T]) -> None:
         cancelled.set(lambda: interrupted.is_set() or outside())

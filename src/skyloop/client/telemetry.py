@@ -11,7 +11,7 @@ from functools import partial
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
-from skyloop.client.channels import Channel, VideoChannel, usual
+from skyloop.client.channels import Channel, FollowingChannel, VideoChannel, usual
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.feedback_demand import FeedbackChannel, FeedbackDemand
@@ -77,7 +77,7 @@ class Mailboxes:
         connection: ProxyConnection,
         *,
         feedback: Channel[Feedback] | None,
-        frames: VideoChannel | None,
+        frames: FollowingChannel[Arrival, VideoChannel] | None,
         results: Sequence[Channel[Result]],
         max_age_s: float | None,
     ) -> None:
@@ -122,8 +122,10 @@ class Mailboxes:
 
     def frame(self) -> Frame | None:
         """Take the newest frame; None if it was taken already, none came, or it can't be decoded."""
-        arrival = self.frames.take()
-        return None if arrival is None or self._video is None else self._video.picture(arrival)
+        arrival, video = self.frames.take(), self._video
+        if arrival is None or video is None:
+            return None
+        return video.current.picture(arrival)
 
 
 class ClientState:
@@ -307,11 +309,9 @@ class Receiver:
         now_ns = self._clock()
         for channel in state.variants.values():
             channel.restart(now_ns)
-        for gone in state.channels.keys() - {camera.name for camera in welcome.capabilities.cameras}:
-            del state.channels[gone]  # the proxy was started again, with other cameras
-        for camera in welcome.capabilities.cameras:
-            if camera.name not in state.channels:
-                state.channels[camera.name] = state.video(camera)
+        # The proxy may have been started again, with other cameras, of which another one is the first.
+        cameras = welcome.capabilities.cameras
+        state.channels = {one.name: state.channels.get(one.name) or state.video(one) for one in cameras}
         state.results.restart()
         self._restorer.connected(welcome.run_id)
         self._commands.connected(welcome.app_id, welcome.run_id)

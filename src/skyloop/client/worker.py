@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import LinkError, NameTakenError, RefusedError, SkyloopError
@@ -40,7 +41,7 @@ class Membership:
         state: ClientState,
         processor: str,
         code: str,
-        camera: str,
+        find: Callable[[], str],
         *,
         shared: bool,
     ) -> None:
@@ -51,11 +52,12 @@ class Membership:
             state: Publishes shares and new connections.
             processor: Name of the processor.
             code: Identifies the code that runs, the same for all workers.
-            camera: Name of the camera.
+            find: Returns the name of the camera, also once the proxy was started again with other ones.
             shared: Each frame goes to one of the workers; if False, each worker gets all.
         """
         self.processor = processor
-        self.camera = camera
+        self.camera = find()
+        self._find = find
         self.code = code
         self.shared = shared
         #: Called at each renewal: whether this worker can take frames now; False gives its share to the others.
@@ -164,6 +166,8 @@ class Membership:
 
     def _welcomed(self, welcome: Welcome) -> None:  # noqa: ARG002  (as a topic calls it)
         self.share = None
+        with suppress(SkyloopError):  # no such camera, which the proxy's answer says, too
+            self.camera = self._find()
         self._wake.set()
 
 

@@ -6,10 +6,12 @@ import logging
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from skyloop.child_process import interrupt_deferred
 from skyloop.drivers.base import Driver, ServedLink
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import VehicleUri
@@ -24,6 +26,7 @@ from skyloop.host.workers import RequestWorkers
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
 from skyloop.proxy.overview import OverviewRegistry
+from skyloop.proxy.serve import at_once
 from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
 
@@ -235,26 +238,33 @@ class Host:
         Args:
             reason: Why, for people.
             within_s: How long they may take to land [s].
-            hurry: Asked several times a second whether to wait for them no longer.
+            hurry: Asked several times a second whether to wait for them no longer; Ctrl-C, where nothing else handles
+                it, does the same, and is raised at the end.
         """
         with self._lock:
             self._closing = True
             vehicles = list(self.vehicles.values())
-        ending = {  # a thread of its own for each: a driver that hangs keeps no other vehicle in the air
-            vehicle: threading.Thread(
-                target=self._end, args=(vehicle, within_s, reason, hurry), name="skyloop-host-end", daemon=True
+        with interrupt_deferred() as interrupted:
+
+            def end(vehicle: HostedVehicle) -> None:
+                self._end(vehicle, within_s, reason, lambda: hurry() or interrupted.is_set())
+
+            def tell(vehicle: HostedVehicle) -> None:
+                proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
+                if proxy is not None and within_s > 0.0:
+                    proxy.handler.order_landing(proxy.clock())
+
+            # A thread of its own for each: a driver that hangs keeps no other vehicle in the air.
+            at_once(
+                {vehicle: partial(end, vehicle) for vehicle in vehicles},
+                tell=tell,
+                over=lambda vehicle: vehicle.condition is Condition.FAILED,
+                daemon=True,
             )
-            for vehicle in vehicles
-        }
-        for thread in ending.values():
-            thread.start()
-        for vehicle, thread in ending.items():
-            while thread.is_alive() and vehicle.condition is not Condition.FAILED:
-                thread.join(LOOK_S)
-        self._watchdog.close()
-        for loop in self._loops:
-            loop.close()
-        self._workers.close()
+            self._watchdog.close()
+            for loop in self._loops:
+                loop.close()
+            self._workers.close()
 
     # When a driver hangs or fails --------------------------------------------------------------------------------
 

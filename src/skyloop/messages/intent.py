@@ -38,7 +38,7 @@ ENDINGS: Final[dict[Fate, str]] = {
     Fate.REFUSED: "it was refused",
     Fate.REPLACED: "a newer command took its place",
     Fate.WITHDRAWN: "its application wants it no more: the call was cancelled, failed, or ran out of time",
-    Fate.TIMED_OUT: "the vehicle did not leave the ground within 20 s",
+    Fate.TIMED_OUT: "the vehicle did not leave the ground within 20 s, or one that was to land was not heard for 60 s",
     Fate.LANDED: "the vehicle landed or disarmed, whoever made it",
     Fate.EMERGENCY: "there was an emergency, or somebody stopped the motors",
     Fate.AUTHORITY: "the authority was granted anew, lost or given back",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Final
 
 from skyloop.clock import NS_PER_S, Clock
@@ -81,6 +81,11 @@ class EventPublisher:
         """Publish one event now."""
         with self._lock:
             self._number(draft.kind, draft.text, draft.severity, draft.app, draft.data)
+
+    def publish_all(self, drafts: Iterable[EventDraft]) -> None:
+        """Publish these events now, in this order."""
+        for draft in drafts:
+            self.publish_draft(draft)
 
     def publish_repeated(self, key: Hashable, make: Callable[[], EventDraft]) -> None:
         """Publish an event that may come many times a second; ``make`` is called only when it is published."""

@@ -11,7 +11,7 @@ here; a driver publishes what it receives from any thread without this lock.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -51,17 +51,18 @@ from skyloop.messages.command import SET_POINTS
 from skyloop.messages.numbers import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
-from skyloop.proxy.core.authority_events import EventContext, authority_event
 from skyloop.proxy.core.command_checks import CommandChecks
-from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
-from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
-from skyloop.proxy.core.flight import Whose
-from skyloop.proxy.core.flight_events import (
+from skyloop.proxy.core.events import (
+    UNHEARD,
+    EventContext,
+    EventDraft,
+    authority_event,
     battery_event,
     clamped_event,
     emergency_event,
     enforcement_event,
     failsafe_event,
+    landing_given_up_event,
     ownership_event,
     position_jumped_event,
     refused_event,
@@ -69,6 +70,9 @@ from skyloop.proxy.core.flight_events import (
     taken_event,
     thin_zones_event,
 )
+from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
+from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
+from skyloop.proxy.core.flight import BELIEF_NS, Whose
 from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
 from skyloop.proxy.core.limits import Clamp, Episodes
 from skyloop.proxy.events import Counters, EventPublisher
@@ -144,6 +148,7 @@ class CommandHandler:
         self._left = False  # the proxy ends: nothing flies by a decision of it any more
         self._pilot = "none"  # why nobody holds the authority, or "held"
         self._breaks_seen = 0  # of the vehicle's link, when last looked at
+        self._heard_ns = -LATEST_NS  # when the vehicle was heard last, as far as a tick noticed
         self._slept = slept
         self._slept_seen = slept()  # when last looked at, or noticed
         self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
@@ -254,10 +259,10 @@ class CommandHandler:
             self._apply_authority(self.authority.release(session.app_id, now_ns), now_ns)
         return Done()
 
-    def application_left(self, session: Session, now_ns: int) -> None:
-        """An application's connection ended; it must still be among the sessions."""
+    def application_left(self, session: Session, now_ns: int, news: Sequence[EventDraft] = ()) -> None:
+        """An application's connection ended; it must still be among the sessions. ``news``: told once it hovers."""
         with self._lock:
-            self._apply_authority(self.authority.gone(session.app_id, now_ns), now_ns)
+            self._apply_authority(self.authority.gone(session.app_id, now_ns), now_ns, news)
 
     def holds(self, session: Session, lease: int) -> bool:
         """Return whether the application holds the authority under this lease."""
@@ -276,6 +281,7 @@ class CommandHandler:
                 return
             self._observe_sleep(now_ns)
             self._observe_link(now_ns)
+            self._observe_silence(now_ns)
             self._observe_position(now_ns)
             effects = self.authority.update(now_ns)
             if effects:
@@ -586,8 +592,8 @@ class CommandHandler:
 
     # Authority ---------------------------------------------------------------------------------------------------
 
-    def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int) -> None:
-        """Make the vehicle hover where the authority changes hands, then publish the changes."""
+    def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
+        """Make the vehicle hover where the authority changes hands, then publish ``news`` and the changes."""
         for effect in effects:
             if isinstance(effect, Lost):
                 self._pilot = effect.reason
@@ -601,20 +607,16 @@ class CommandHandler:
                 self._tell(session, session.intents.newest)
                 self._withdraw_takeoff(now_ns)
         self._stamp()
-        ended = [effect for effect in effects if isinstance(effect, (Lost, Preempted))]
-        for effect in ended:
-            self._publish_authority(effect, now_ns)
-        self._update_failsafe(now_ns)  # which hovers, before anybody learns that it has the authority
+        ended = [self._authority_draft(one, now_ns) for one in effects if isinstance(one, (Lost, Preempted))]
+        self._update_failsafe(now_ns, [*news, *ended])  # which hovers, before anybody learns of any of this
         for effect in effects:
-            if effect not in ended:
-                self._publish_authority(effect, now_ns)
+            if not isinstance(effect, (Lost, Preempted)):
+                self._events.publish_draft(self._authority_draft(effect, now_ns))
 
-    def _publish_authority(self, effect: AuthorityEffect, now_ns: int) -> None:
+    def _authority_draft(self, effect: AuthorityEffect, now_ns: int) -> EventDraft:
         holder = self.authority.holder
         holder_name = "" if holder is None else self._name(holder.app_id)
-        self._events.publish_draft(
-            authority_event(effect, EventContext(now_ns, self._name, self._identity, holder_name))
-        )
+        return authority_event(effect, EventContext(now_ns, self._name, self._identity, holder_name))
 
     def _identity(self, app_id: int) -> str:
         """What the transport knows about an application."""
@@ -662,6 +664,21 @@ class CommandHandler:
         else:
             self.ladder.hand_over(now_ns)
         self._update_failsafe(now_ns)
+
+    def _observe_silence(self, now_ns: int) -> None:
+        """Give up a landing when the vehicle has not been heard for long: by then it may be on another flight."""
+        if self._vehicle.link_up:
+            self._heard_ns = now_ns
+            return
+        landing = self._landing
+        if landing is None and not self.ladder.lands_on:
+            return
+        asked_ns = self.ladder.wanted_ns if landing is None else landing.asked_ns  # its pilot may have left
+        if now_ns - max(asked_ns, self._heard_ns) >= BELIEF_NS:
+            if landing is not None:
+                self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: land it again", Refusal.VEHICLE_LINK_LOST)
+            self.ladder.give_up_landing()
+            self._events.publish_draft(landing_given_up_event())
 
     def _observe_sleep(self, now_ns: int) -> None:
         """Act on a sleep of the computer: all that is known is older than its clock says."""
@@ -733,8 +750,10 @@ class CommandHandler:
 
     # Failsafe ----------------------------------------------------------------------------------------------------
 
-    def _update_failsafe(self, now_ns: int) -> None:
+    def _update_failsafe(self, now_ns: int, news: Sequence[EventDraft] = ()) -> None:
+        """Let the ladder decide and act; ``news``: to be published then, before its own."""
         if self._left:
+            self._events.publish_all(news)
             return
         self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
@@ -754,28 +773,29 @@ class CommandHandler:
             shown=self._vehicle.link_up or Land not in self._executor.native,
         )
         effects = self.ladder.update(now_ns, inputs)
-        if effects:
-            self._apply_failsafe(effects, now_ns)
+        if effects or news:
+            self._apply_failsafe(effects, now_ns, news)
 
-    def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int) -> None:
-        for effect in effects:
-            if not isinstance(effect, FailsafeAction):
-                self._publish_failsafe(effect)
-            elif isinstance(effect.action, ReturnToStart):
-                self._back.begin(effect.action, now_ns)
-                self.ladder.attempted(True)
-            else:
-                self.checks.back = None
-                taken = self._executor.failsafe(effect.action, now_ns)
-                self.ladder.attempted(taken)
-                if taken:
-                    self._echo_own(effect.action, now_ns)
-
-    def _publish_failsafe(self, effect: StepChange | BatteryLow) -> None:
-        if isinstance(effect, BatteryLow):
-            self._events.publish_draft(battery_event(effect))
-            return
-        self._stamp()
-        if effect.step is not Failsafe.NONE:
-            self._end_intents(Fate.FAILSAFE, self._clock())
-        self._events.publish_draft(failsafe_event(effect))
+    def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
+        """Act first, as each event takes its time, and publish then."""
+        drafts = [*news]
+        try:
+            for effect in effects:
+                if isinstance(effect, StepChange):
+                    self._stamp()
+                    if effect.step is not Failsafe.NONE:
+                        self._end_intents(Fate.FAILSAFE, self._clock())
+                    drafts.append(failsafe_event(effect))
+                elif isinstance(effect, BatteryLow):
+                    drafts.append(battery_event(effect))
+                elif isinstance(effect.action, ReturnToStart):
+                    self._back.begin(effect.action, now_ns)
+                    self.ladder.attempted(True)
+                else:
+                    self.checks.back = None
+                    taken = self._executor.failsafe(effect.action, now_ns)
+                    self.ladder.attempted(taken)
+                    if taken:
+                        self._echo_own(effect.action, now_ns)
+        finally:
+            self._events.publish_all(drafts)

@@ -412,12 +412,15 @@ class Proxy:
         session = self._sessions.get(peer.id)
         if session is None:
             return
+        news = []
         if session.role is not None:
             text = f"the connection of {session.name} ended: {reason}"
             data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": reason, "app_id": session.app_id}
-            self.events.publish(EventKind.APPLICATION_LINK, text, Severity.WARNING, app=session.name, data=data)
-        if not self._stopping.is_set():  # else everybody leaves, and the driver may be closed already
-            self.handler.application_left(session, self.clock())
+            news.append(EventDraft(EventKind.APPLICATION_LINK, text, app=session.name, data=data))
+        if self._stopping.is_set():  # everybody leaves, and the driver may be closed already
+            self.events.publish_all(news)
+        else:
+            self.handler.application_left(session, self.clock(), news)
         self.workers.application_left(session)
         del self._sessions[peer.id]
 

@@ -6,14 +6,14 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import Final, TypeVar
 
-from skyloop.child_process import on_parent_end
+from skyloop.child_process import interrupt_deferred, on_parent_end
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import VehicleUri
@@ -32,6 +32,7 @@ _POLL_S: Final = 0.2
 GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this; until then nothing is printed about waiting
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
 _log = logging.getLogger(__name__)
+K = TypeVar("K")
 
 #: Says what is new about the keys of the network, a sentence each.
 Look = Callable[[], Sequence[str]]
@@ -207,32 +208,59 @@ def keep_trail(proxy: Proxy, path: Path | None) -> None:
 
 
 def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Callable[[], bool]) -> None:
-    """End several proxies at the same time, as :meth:`Proxy.end` does each. Raises what one of them does, then."""
+    """End several proxies at the same time, as :meth:`Proxy.end` does each. Raises what one of them does, then.
+
+    Ctrl-C, where nothing else handles it, waits no longer for those that land, and is raised when all have ended.
+    """
     raised: list[Exception] = []
+    with interrupt_deferred() as interrupted:
 
-    def end(proxy: Proxy) -> None:
-        try:
-            proxy.end(within_s, reason=reason, hurry=hurry)
-        except Exception as error:  # noqa: BLE001  it is raised when all have ended
-            raised.append(error)
+        def end(proxy: Proxy) -> None:
+            try:
+                proxy.end(within_s, reason=reason, hurry=lambda: hurry() or interrupted.is_set())
+            except Exception as error:  # noqa: BLE001  it is raised when all have ended
+                raised.append(error)
 
-    threads: list[threading.Thread] = []
-    left: list[Proxy] = []
-    for proxy in proxies:
-        thread = threading.Thread(target=end, args=(proxy,), name="skyloop-end")
-        try:
-            thread.start()
-        except RuntimeError:  # there is none to be had: it ends all the same
-            left.append(proxy)
-        else:
-            threads.append(thread)
-    for proxy in left:
-        end(proxy)
-    for thread in threads:
-        while thread.is_alive():  # looks up now and then, for signals
-            thread.join(_POLL_S)
+        at_once(
+            {proxy: partial(end, proxy) for proxy in proxies},
+            tell=lambda proxy: within_s > 0.0 and proxy.handler.order_landing(proxy.clock()),
+        )
     if raised:
         raise raised[0]
+
+
+def at_once(
+    ends: Mapping[K, Callable[[], object]],
+    *,
+    tell: Callable[[K], object],
+    over: Callable[[K], bool] = lambda _: False,
+    daemon: bool = False,
+) -> None:
+    """Call at the same time what ends each of several flights, and wait for all.
+
+    Args:
+        ends: What ends each, on a thread of its own; must not raise.
+        tell: Told of those for which there is no thread, before the first of them ends: they do so in turn.
+        over: Whether one is not waited for any more.
+        daemon: Whether the program may end before them.
+    """
+    threads: dict[K, threading.Thread] = {}
+    for one, end in ends.items():
+        thread = threading.Thread(target=end, name="skyloop-end", daemon=daemon)
+        with suppress(RuntimeError):  # there is none to be had: it ends all the same
+            thread.start()
+            threads[one] = thread
+    left = [one for one in ends if one not in threads]
+    for one in left:
+        try:
+            tell(one)
+        except Exception:  # noqa: BLE001  it is ended all the same
+            _log.exception("one of several that end together could not be told so")
+    for one in left:
+        ends[one]()
+    for one, thread in threads.items():
+        while thread.is_alive() and not over(one):  # looks up now and then, for signals
+            thread.join(_POLL_S)
 
 
 @contextmanager

@@ -219,7 +219,7 @@ class Airspace:
             wall = zone.wall_outside(at)
             if wall.distance <= 0.0 and (side := self._sides.get(zone)) is not None:
                 normal, offset = side
-                wall = Wall(normal, offset - _dot(normal, at), wall.name)
+                wall = wall._replace(normal=normal, distance=offset - _dot(normal, at))
             walls.append(wall)
         return walls
 
@@ -230,8 +230,8 @@ class Airspace:
         wanted, clamps = asked, dict[str, Clamp]()
         beyond = [(_dot(asked, wall.normal), wall) for wall in walls if wall.distance < -MARGIN_M]
         if beyond and any(asked) and (max(beyond)[0] > 0.0 or min(beyond)[0] >= 0.0):
-            name = beyond[0][1].name
-            clamps[name] = Clamp(name, math.hypot(*asked), 0.0)
+            wall = beyond[0][1]
+            clamps[wall.name] = Clamp(wall.name, math.hypot(*asked), 0.0, wall.zone)
             wanted = (0.0, 0.0, 0.0)
         for _ in range(_PASSES):
             before = wanted
@@ -245,7 +245,7 @@ class Airspace:
                 if towards > most + 1e-9:
                     wanted = _add(wanted, wall.normal, most - towards)
                     first = clamps.get(wall.name)
-                    clamps[wall.name] = Clamp(wall.name, towards if first is None else first.asked, most)
+                    clamps[wall.name] = Clamp(wall.name, towards if first is None else first.asked, most, wall.zone)
             if math.dist(wanted, before) < 1e-6:
                 break
         else:
@@ -277,9 +277,9 @@ class Airspace:
                 brake = -min(deceleration, max(deceleration / 2 if outside else 0.0, BRAKE_GAIN * excess))
                 if pull > brake and (excess >= 0.0 or outside):
                     east, north = east + (brake - pull) * x, north + (brake - pull) * y
-                    clamps[wall.name] = Clamp(wall.name, pull, brake)
+                    clamps[wall.name] = Clamp(wall.name, pull, brake, wall.zone)
             if abs(z) > 0.3 and climb * z > most:
-                clamps[wall.name] = Clamp(wall.name, climb * z, most)
+                clamps[wall.name] = Clamp(wall.name, climb * z, most, wall.zone)
                 climb = most / z
         if not clamps:
             return action, ()

@@ -1,15 +1,27 @@
-"""Events before they are numbered and published, and how often one that goes on is repeated. Pure."""
+"""Events before they are numbered and published: kinds, texts for people, data, and how often one is repeated. Pure.
+
+Those of commands, failsafe and ownership come first, then those of the authority.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
-from skyloop.clock import NS_PER_S
-from skyloop.messages import EventKind, Severity, Value
+from skyloop.clock import NS_PER_S, seconds
+from skyloop.messages import Command, EventKind, Failsafe, Refusal, Severity, Value
+from skyloop.proxy.core import authority
+from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
+from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
+from skyloop.proxy.core.limits import Clamp
+from skyloop.zones import THINNEST_M, ZONES, Space
 
 REPEAT_NS: Final = NS_PER_S  #: how often an event that goes on is published again
+#: Why a landing is given up.
+UNHEARD: Final = f"the vehicle was not heard for {seconds(BELIEF_NS):g} s, and may be on another flight by now"
+_ENFORCED: Final = "enforced: its position is known again"
+_NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
 
 
 @dataclass(slots=True)
@@ -60,3 +72,193 @@ class RepeatedEvents:
             else:
                 del self._published[key], self._counts[key]
         return due
+
+
+def refused_event(name: str, command: Command, reason: Refusal, why: str) -> EventDraft:
+    """A command of the application ``name`` was refused."""
+    text = f"{name}: {command.action.name} refused: {why}"
+    return EventDraft(EventKind.COMMAND_REFUSED, text, app=name, data={"reason": reason.value, "seq": command.seq})
+
+
+def clamped_event(name: str, clamp: Clamp) -> EventDraft:
+    """A limit shortened a set-point of the application ``name``."""
+    zone = f" ({clamp.zone})" if clamp.zone else ""
+    text = f"{name}: {clamp.limit}{zone} made {clamp.applied:.3g} of {clamp.asked:.3g}"
+    data: dict[str, Value] = {"limit": clamp.limit, "asked": clamp.asked, "applied": clamp.applied}
+    if clamp.zone:
+        data["zone"] = clamp.zone
+    return EventDraft(EventKind.COMMAND_CLAMPED, text, Severity.INFO, name, data)
+
+
+def enforcement_event(enforced: bool) -> EventDraft:
+    """The safety box and zones are, or are not, enforced from now on."""
+    text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
+    severity = Severity.INFO if enforced else Severity.WARNING
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
+
+
+def thin_zones_event(space: Space) -> EventDraft:
+    """Some zones are kept clear of as if they were thicker than they are written."""
+    thin = "; ".join(str(zone) for zone in space.thin)
+    text = f"no-fly zones thinner than {THINNEST_M:g} m are kept clear of as if they were so thick: {thin} ({ZONES})"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "thin_zones"})
+
+
+def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
+    """The position changed by more than the vehicle can have flown; ``lands``: while it was landed."""
+    what = "goes on to land" if lands else "hovers, until something new is commanded"
+    text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
+    data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
+
+
+def landing_given_up_event() -> EventDraft:
+    """A pilot's landing is given up because the vehicle was not heard."""
+    text = f"the landing is given up: {UNHEARD}: land it again when it is heard"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": "landing_given_up"})
+
+
+def emergency_event(name: str) -> EventDraft:
+    """The application ``name`` stopped the motors."""
+    text = f"emergency stop by {name}"
+    return EventDraft(EventKind.EMERGENCY, text, Severity.ERROR, name, {"reason": text})
+
+
+def failsafe_event(change: StepChange) -> EventDraft:
+    """A step of the failsafe ladder was taken or left."""
+    why = REASONS.get(change.reason, change.reason)
+    if change.step is Failsafe.NONE:
+        text, severity = f"failsafe ended: {why}", Severity.INFO
+    else:
+        what = "return to the start and land there" if change.returns else change.step.value
+        text, severity = f"failsafe: {what}, because {why}", Severity.WARNING
+        if change.why:
+            text += f"; it can't return to its start: {change.why}"
+    data: dict[str, Value] = {"step": change.step.value, "reason": change.reason, "returns": change.returns}
+    return EventDraft(EventKind.FAILSAFE, text, severity, data=data)
+
+
+def battery_event(low: BatteryLow) -> EventDraft:
+    """The battery fell below the warning level."""
+    text = f"battery low: {low.battery:.0%} left"
+    return EventDraft(EventKind.BATTERY_LOW, text, data={"battery": low.battery})
+
+
+def taken_event(name: str, action: str, others: str) -> EventDraft:
+    """The application ``name`` took the vehicle from others by an action; ``others`` says what they did with it."""
+    text = f"{name} took the vehicle by {action}: {others}"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, app=name, data={"reason": "taken"})
+
+
+def ownership_event(changed: Changed) -> EventDraft:
+    """The flight is somebody else's, or an earlier run's."""
+    reason = "others" if changed.whose is Whose.OTHERS else "flight"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})
+
+
+def slept_event(slept_s: float) -> EventDraft:
+    """The computer slept in the meantime, for so long [s]."""
+    text = f"this computer slept for {slept_s:.1f} s: nothing that was asked for before is done any more"
+    data: dict[str, Value] = {"reason": "slept", "seconds": slept_s}
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
+
+
+@dataclass(frozen=True, slots=True)
+class EventContext:
+    """What an event's text needs besides the change itself."""
+
+    now_ns: int
+    name: Callable[[int], str]  #: name of an application, by its number
+    identity: Callable[[int], str]  #: what the transport knows about an application
+    holder: str  #: name of who holds the authority now; empty for nobody
+
+
+def authority_event(effect: authority.Effect, context: EventContext) -> EventDraft:
+    """Return the event of one change of the authority."""
+    draft = _DRAFTS[type(effect)](effect, context)
+    draft.app = context.name(effect.app_id)
+    draft.data = {"app_id": effect.app_id, **draft.data}
+    return draft
+
+
+def _granted(effect: authority.Granted, context: EventContext) -> EventDraft:
+    data: dict[str, Value] = {"priority": effect.priority, "lease": effect.lease}
+    data["identity"] = context.identity(effect.app_id)
+    term = ""
+    if effect.until_ns is not None:
+        data["until_ns"] = effect.until_ns
+        term = f", for {seconds(effect.until_ns - context.now_ns):.0f} s"
+    text = f"{context.name(effect.app_id)} has the authority (priority {effect.priority}, lease {effect.lease}{term})"
+    return EventDraft(EventKind.AUTHORITY_GRANTED, text, Severity.INFO, data=data)
+
+
+def _queued(effect: authority.Queued, context: EventContext) -> EventDraft:
+    data: dict[str, Value] = {"priority": effect.priority, "position": effect.position}
+    text = f"{context.name(effect.app_id)} waits for the authority, number {effect.position} in the queue"
+    if effect.wait_ns is not None:
+        data["wait_s"] = seconds(effect.wait_ns)
+        text += f", for about {seconds(effect.wait_ns):.0f} s"
+    return EventDraft(EventKind.AUTHORITY_QUEUED, text, Severity.INFO, data=data)
+
+
+def _lost(effect: authority.Lost, context: EventContext) -> EventDraft:
+    text = f"{context.name(effect.app_id)} lost the authority: {effect.reason}"
+    if effect.reason == "silent" and not context.holder:
+        text += "; it is still listed as the holder until another application asks"
+    data: dict[str, Value] = {"lease": effect.lease, "reason": effect.reason, "by": context.holder}
+    return EventDraft(EventKind.AUTHORITY_LOST, text, data=data)
+
+
+def _preempted(effect: authority.Preempted, context: EventContext) -> EventDraft:
+    name, by = context.name(effect.app_id), context.name(effect.by_id)
+    if effect.granted:
+        text = f"{name} handed the authority over to {by} (priority {effect.by_priority})"
+    else:
+        text = f"{by} (priority {effect.by_priority}) took the authority over from {name}"
+    return EventDraft(EventKind.AUTHORITY_PREEMPTED, text, data=_by(effect, context) | {"granted": effect.granted})
+
+
+def _asked(effect: authority.Asked, context: EventContext) -> EventDraft:
+    within_s = seconds(effect.until_ns - context.now_ns)
+    name, by = context.name(effect.app_id), context.name(effect.by_id)
+    text = f"{by} (priority {effect.by_priority}) asks {name} for the authority, within {within_s:.0f} s"
+    data = _by(effect, context) | {"within_s": within_s}
+    if effect.term_ns is not None:
+        data["for_s"] = seconds(effect.term_ns)
+    return EventDraft(EventKind.AUTHORITY_ASKED, text, data=data)
+
+
+def _declined(effect: authority.Declined, context: EventContext) -> EventDraft:
+    by, why = context.name(effect.holder_id), f": {effect.reason}" if effect.reason else ""
+    text = f"{by} does not hand the authority over to {context.name(effect.app_id)} yet{why}"
+    data: dict[str, Value] = {"by": by, "by_id": effect.holder_id, "reason": effect.reason}
+    return EventDraft(EventKind.AUTHORITY_DECLINED, text, Severity.INFO, data=data)
+
+
+def _withdrawn(effect: authority.Withdrawn, context: EventContext) -> EventDraft:
+    by = context.name(effect.by_id)
+    data: dict[str, Value] = {"lease": effect.lease, "by": by, "by_id": effect.by_id}
+    text = f"{by} no longer asks {context.name(effect.app_id)} for the authority"
+    return EventDraft(EventKind.AUTHORITY_WITHDRAWN, text, Severity.INFO, data=data)
+
+
+def _expired(effect: authority.Expired, context: EventContext) -> EventDraft:
+    text = f"the time of {context.name(effect.app_id)} is over: the next application that asks gets the authority"
+    return EventDraft(EventKind.AUTHORITY_EXPIRED, text, data={"lease": effect.lease})
+
+
+def _by(effect: authority.Preempted | authority.Asked, context: EventContext) -> dict[str, Value]:
+    by = context.name(effect.by_id)
+    return {"lease": effect.lease, "by": by, "by_id": effect.by_id, "by_priority": effect.by_priority}
+
+
+_DRAFTS: Final[dict[type[authority.Effect], Callable[[Any, EventContext], EventDraft]]] = {
+    authority.Granted: _granted,
+    authority.Queued: _queued,
+    authority.Lost: _lost,
+    authority.Preempted: _preempted,
+    authority.Asked: _asked,
+    authority.Declined: _declined,
+    authority.Withdrawn: _withdrawn,
+    authority.Expired: _expired,
+}

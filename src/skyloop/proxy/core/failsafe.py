@@ -141,6 +141,7 @@ class FailsafeLadder:
         self.battery_low = False  #: it is below the charge to return at, and was not charged since
         self._overruled = False  # the pilot has taken over a return for that, and flies on
         self._wanted: FailsafeTask | None = None
+        self.wanted_ns = 0  #: when what it wants was begun
         self._taken = False
         self._next_try_ns = 0
 
@@ -207,6 +208,11 @@ class FailsafeLadder:
         if not isinstance(self._wanted, Land | ReturnToStart):
             self._want(Land(), now_ns)
 
+    def give_up_landing(self) -> None:
+        """Go on no longer with a pilot's landing."""
+        if self.lands_on:
+            self._wanted = None
+
     def order_landing(self) -> None:
         """Land because the proxy is about to end; from now on only landing and emergency stop are accepted."""
         self._closing = True
@@ -255,6 +261,7 @@ class FailsafeLadder:
 
     def _want(self, action: FailsafeTask, now_ns: int) -> None:
         self._wanted, self._taken, self._next_try_ns = action, False, now_ns
+        self.wanted_ns = now_ns
 
     def _try(self, now_ns: int, state: FlightState) -> list[Effect]:
         wanted = self._wanted

@@ -25,6 +25,7 @@ class Clamp:
     limit: str  #: name of the parameter
     asked: float
     applied: float
+    zone: str = ""  #: name of the no-fly zone, if it has one
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +77,12 @@ class Episodes:
     """Which limits are touched now, so that each is published once and not with every repeat of a set-point."""
 
     def __init__(self) -> None:
-        self._touched_ns: dict[str, int] = {}
+        self._touched_ns: dict[tuple[str, str], int] = {}
 
     def begun(self, clamps: tuple[Clamp, ...], now_ns: int) -> list[Clamp]:
         """Return those of the clamps that begin an episode."""
-        new = [clamp for clamp in clamps if now_ns - self._touched_ns.get(clamp.limit, -EPISODE_NS) >= EPISODE_NS]
+        touched, since_ns = self._touched_ns, now_ns - EPISODE_NS
+        new = [clamp for clamp in clamps if touched.get((clamp.limit, clamp.zone), since_ns) <= since_ns]
         for clamp in clamps:
-            self._touched_ns[clamp.limit] = now_ns
+            touched[clamp.limit, clamp.zone] = now_ns
         return new
