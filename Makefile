@@ -10,7 +10,7 @@ PIP    := $(BIN)/python -m pip install --disable-pip-version-check $(if $(LOCKED
 # Where Python is told to keep nothing that it compiled, each process of the tests compiles the tests and the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test test-all test-core explore check chaos docs fuzz format coverage package page pictures lock clean
+.PHONY: help demo test test-all test-core explore check chaos docs fuzz format stubs coverage package page pictures lock clean
 help:
 	@echo "make demo [ARGS='--seconds 30 --headless']   a simulated drone that flies by its camera"
 	@echo "make test [ARGS='-k authority']              the tests of every day, 5 minutes; with ARGS, those that they select of all"
@@ -23,7 +23,7 @@ help:
 	@echo "make docs                                    the documentation as a site: build/site/index.html"
 	@echo "make package                                 wheel and source package, checked, and the demo flown from the wheel"
 	@echo "make page                                    the cockpit's page anew from its sources, where node and npm are"
-	@echo "make format | coverage | pictures | lock | clean"
+	@echo "make format | stubs | coverage | pictures | lock | clean"
 
 # One stamp for what the demo needs and one for what the tests need besides; both are made again when the project changes.
 $(VENV)/.installed: pyproject.toml
@@ -78,6 +78,11 @@ fuzz: $(VENV)/.installed-dev
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+# What type checkers and editors see of skyloop.aio, anew.
+stubs: $(VENV)/.installed-dev
+	$(BIN)/python scripts/aio_stub.py
+	$(BIN)/ruff format src/skyloop/aio/__init__.pyi
 
 coverage: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest --numprocesses auto --cov --cov-report=term $(ARGS)

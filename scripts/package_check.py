@@ -29,6 +29,7 @@ EXTRAS = ("sim", "vision", "cockpit")
 NEEDED = (
     "skyloop/py.typed",
     "skyloop/__init__.pyi",
+    "skyloop/aio/__init__.pyi",
     "skyloop/cockpit/static/index.html",
     "skyloop/cockpit/static/licences.txt",
     "skyloop/vision/weights/figures.onnx",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
+import inspect
 import threading
 import time
-from collections.abc import AsyncIterator, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from typing import Any
 
+import aio_stub
 import msgspec
 import pytest
 
@@ -405,6 +408,67 @@ def test_the_asyncio_face_has_all_that_the_other_has() -> None:
 
     assert public(skyloop.client.Drone) <= public(aio.Drone)
     assert public(skyloop.client.Swarm) - public(aio.Swarm) == {"fail"}, "for formations, which fly in threads"
+
+
+def _methods(face: type, kind: type) -> list[tuple[Any, Any]]:
+    names = {name for name in set(dir(face)) & set(dir(kind)) if name == "__len__" or name[0] != "_"}
+    pairs = [(vars(face)[name], vars(kind)[name]) for name in sorted(names) if name in vars(kind)]
+    return [pair for pair in pairs if inspect.isfunction(pair[0]) and inspect.isfunction(pair[1])]
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (aio.connect, skyloop.client.connect),
+        (aio.swarm, skyloop.client.swarm),
+        (aio.Config.get, skyloop.client.Config.__getitem__),
+        (aio.Config.set, skyloop.client.Config.__setitem__),
+        *_methods(aio.Config, skyloop.client.Config),
+        *_methods(aio.Drone, skyloop.client.Drone),
+        *_methods(aio.Swarm, skyloop.client.Swarm),
+    ],
+    ids=lambda function: function.__qualname__,
+)
+def test_both_faces_have_the_same_arguments(ours: Callable[..., Any], theirs: Callable[..., Any]) -> None:
+    """Names, defaults, and which are given by name alone."""
+
+    def arguments(function: Callable[..., Any]) -> list[tuple[str, object, object]]:
+        found = inspect.signature(function).parameters.values()
+        return [(one.name, one.kind, one.default) for one in found]
+
+    assert arguments(ours) == arguments(theirs)
+    assert ours.__doc__ or ours.__name__ == "__len__", "it has a text"
+
+
+def test_the_stub_says_what_the_code_says() -> None:
+    stub = ast.parse(aio_stub.STUB.read_text(encoding="utf-8"))
+    assert ast.dump(stub) == ast.dump(ast.parse(aio_stub.stub())), "make stubs"
+
+
+def test_a_callback_that_would_hold_up_the_receiving_thread_is_refused(proxy: ScriptedProxy) -> None:
+    async def listen() -> None:
+        async with aio.connect("me") as drone:
+            with pytest.raises(UsageError, match="inline must be False"):
+                drone.on_feedback(lambda _: None, inline=True)
+            with pytest.raises(UsageError, match="can't be called"):
+                drone.on_event("not a function")  # type: ignore[arg-type]
+            drone.on_result(lambda _: None, depth=4, inline=False).cancel()
+
+    run(listen())
+
+
+def test_a_coroutine_function_as_predicate_is_refused(proxy: ScriptedProxy) -> None:
+    """What it returns is true: the wait was over at once, whatever the vehicle did."""
+
+    async def is_there(_: object) -> bool:
+        return False
+
+    async def wait() -> None:
+        async with aio.connect("me") as drone:
+            with pytest.raises(UsageError, match="wait takes a plain function"):
+                await drone.wait(is_there)  # type: ignore[arg-type]
+
+    run(wait())
 
 
 def test_clocks_poses_and_own_events_are_the_drones(proxy: ScriptedProxy) -> None:

@@ -12,8 +12,6 @@ available as :attr:`Drone.sync` and :attr:`Swarm.sync`. Cancelling a call ends t
 not undone.
 """
 
-from skyloop.aio.bridge import Callback
-from skyloop.aio.drone import Config, Drone, Listener, connect
-from skyloop.aio.swarm import Swarm, swarm
+from skyloop.aio.bridge import Callback, Config, Drone, Listener, Swarm, connect, swarm
 
 __all__ = ["Callback", "Config", "Drone", "Listener", "Swarm", "connect", "swarm"]

@@ -1,21 +1,29 @@
-"""Between the client's threads and an event loop."""
+"""The asyncio API of drones and swarms: tables of the members that forward to the synchronous ones, and the rest."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import inspect
+import re
 import threading
-from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Generator
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager
+from functools import wraps
 from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, Unpack
 
+from skyloop import client
+from skyloop.client.channels import VideoChannel, VideoOptions
 from skyloop.client.commands import cancelled
-from skyloop.client.mailbox import Notifier
+from skyloop.client.drone import LOOK_S
+from skyloop.client.frame import Arrival
+from skyloop.client.mailbox import Mailbox, Notifier
+from skyloop.client.results import ResultMailbox, checked_age, silence
+from skyloop.client.swarm import Tick
 from skyloop.drivers.uri import parse_uri
-from skyloop.errors import UsageError
+from skyloop.errors import NoAnswerError, UsageError
+from skyloop.messages import Encoding
 
 T = TypeVar("T")
 Opened = TypeVar("Opened", bound=AbstractAsyncContextManager[Any, Any])
@@ -24,41 +32,27 @@ Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 
 
 class LoopNotifier(Notifier):
-    """Wakes the coroutine that waits for :attr:`came`, from any thread."""
+    """Wakes the coroutine that waits in :meth:`within`, from any thread."""
 
-    __slots__ = ("came", "loop")
+    __slots__ = ("_came", "_loop")
 
     def __init__(self) -> None:
         super().__init__()
-        self.came = asyncio.Event()
-        self.loop = asyncio.get_running_loop()
+        self._came = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
 
     def notify(self) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            self.loop.call_soon_threadsafe(self.came.set)
+            self._loop.call_soon_threadsafe(self._came.set)
 
-
-def reject_in_step(target: str) -> None:
-    """Raise :class:`UsageError` for a stepped replay, whose time would stand still here."""
-    if isinstance(target, str) and target.startswith("replay://") and parse_uri(target).options.get("speed") == "max":
-        raise UsageError(
-            f"{target}: speed=max is in step with the one thread that waits, which an event loop never does: use "
-            "skyloop.connect, or give a number, such as speed=10"
-        )
-
-
-def on_loop(function: Callback[T]) -> Callable[[T], Any]:
-    """Wrap ``function`` so that another thread can call it: it runs on this event loop and is waited for."""
-    loop = asyncio.get_running_loop()
-
-    async def call(sample: T) -> object:
-        result = function(sample)
-        return await result if inspect.isawaitable(result) else result
-
-    def from_thread(sample: T) -> object:
-        return None if loop.is_closed() else asyncio.run_coroutine_threadsafe(call(sample), loop).result()
-
-    return from_thread
+    async def within(self, timeout_s: float) -> bool:
+        """Wait for a notification that this has not returned True for yet; return whether one came in time."""
+        try:
+            await asyncio.wait_for(self._came.wait(), timeout_s)
+        except TimeoutError:
+            return False
+        self._came.clear()
+        return True
 
 
 async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], object] | None = None) -> T:
@@ -102,13 +96,343 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
         raise
 
 
-class Opening(ABC, Generic[Opened]):
-    """What is awaited for a drone or a swarm, or entered with ``async with`` so that it ends with the block."""
+def from_thread(function: Callback[T]) -> Callable[[T], Any]:
+    """Wrap ``function`` so that another thread can call it: it runs on this event loop and is waited for."""
+    loop = asyncio.get_running_loop()
+
+    async def call(sample: T) -> object:
+        result = function(sample)
+        return await result if inspect.isawaitable(result) else result
+
+    def wait(sample: T) -> object:
+        return None if loop.is_closed() else asyncio.run_coroutine_threadsafe(call(sample), loop).result()
+
+    return wait
+
+
+# Ways to make a member of a face from one of the synchronous class; each takes over names, defaults and text --------
+
+
+def mirrors(kind: type, rows: Mapping[Callable[[Any], Any], str]) -> Callable[[type[T]], type[T]]:
+    """Decorate a face with members of ``kind``: for each way to make one, a row of their names."""
+
+    def fill(face: type[T]) -> type[T]:
+        for way, names in rows.items():
+            for name in names.split():
+                setattr(face, name, way(getattr(kind, name)))
+        return face
+
+    return fill
+
+
+def at_once(member: Any) -> Any:
+    """Keep a method or a property that does not wait as it is."""
+    return property(_forwarded(member)) if isinstance(member, property) else _forwarded(member)
+
+
+def awaited(member: Any) -> Any:
+    """Make a coroutine function of a method or a property that waits: it waits on a thread of its own."""
+    plain = _forwarded(member)
+
+    @wraps(plain)
+    async def call(self: Any, *args: Any, **given: Any) -> Any:
+        return await in_thread(lambda: plain(self, *args, **given))
+
+    return _explained(call, "It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.")
+
+
+def on_loop(member: Any) -> Any:
+    """Let a method that takes a callback run it on the event loop that runs when it is called."""
+    plain = _forwarded(member)
+
+    @wraps(plain)
+    def call(self: Any, function: Any, *args: Any, **given: Any) -> Any:
+        if given.get("inline"):
+            raise UsageError(f"{member.__name__}: inline must be False, as the function runs on the event loop")
+        return Listener(plain(self, from_thread(function) if callable(function) else function, *args, **given))
+
+    call.__doc__ = (call.__doc__ or "").replace("on a thread of its own", "on the event loop")
+    signature = inspect.signature(member)
+    takes = signature.parameters["function"].annotation
+    either = re.sub(r"^(Callable\[\[.*\], )(.*)\]$", r"\1\2 | Awaitable[\2]]", takes)
+    text = "``function``, plain or a coroutine function, runs on the event loop"
+    text += "; ``inline`` has to be False." if "inline" in signature.parameters else "."
+    return _explained(_typed(call, signature, function=either, returns="Listener"), text)
+
+
+def opener(face: Callable[[Any], Opened], function: Callable[..., Any]) -> Callable[..., Opening[Opened]]:
+    """Make a function that connects from a synchronous one: its result is awaited, or entered."""
+
+    @wraps(function)
+    def call(*targets: Any, **options: Any) -> Opening[Opened]:
+        return Opening(face, function.__name__, targets, options)
+
+    text = "The result connects when it is awaited, or entered with ``async with``. ``speed=max`` is refused."
+    return _explained(_typed(call, inspect.signature(function), returns=f"Opening[{face.__name__}]"), text)
+
+
+def like(member: Any, text: str = "") -> Callable[[T], T]:
+    """Give a method that is written by hand its counterpart's docstring, with another paragraph."""
+
+    def explain(function: T) -> T:
+        function.__doc__ = member.__doc__
+        return _explained(function, text)
+
+    return explain
+
+
+def _forwarded(member: Any) -> Callable[..., Any]:
+    """Call the method, or read the property, of the object that a face wraps."""
+    reads = isinstance(member, property)
+    function = member.fget if reads else member
+
+    @wraps(function)
+    def call(self: Any, *args: Any, **given: Any) -> Any:
+        if any(callable(one) and inspect.iscoroutinefunction(one) for one in (*args, *given.values())):
+            raise UsageError(f"{function.__name__} takes a plain function, which it calls on another thread")
+        found = getattr(self.sync, function.__name__)
+        return found if reads else found(*args, **given)
+
+    return call
+
+
+def _explained(function: T, text: str) -> T:
+    summary, _, rest = inspect.cleandoc(function.__doc__ or "").partition("\n\n")
+    function.__doc__ = "\n\n".join(filter(None, (summary, text, rest)))
+    return function
+
+
+def _typed(made: T, signature: inspect.Signature, *, returns: str, **types: str) -> T:
+    parameters = [one.replace(annotation=types.get(one.name, one.annotation)) for one in signature.parameters.values()]
+    own: Any = made
+    own.__signature__ = signature.replace(parameters=parameters, return_annotation=returns)
+    own.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": returns}
+    del own.__wrapped__  # whose annotations would be read instead
+    return made
+
+
+# The faces -----------------------------------------------------------------------------------------------------------
+
+
+@mirrors(client.Config, {awaited: "items values parameters describe"})
+class Config:
+    """Parameters: ``await drone.config.get("limits.tilt")``, ``await drone.config.set("limits.tilt", 0.2)``.
+
+    Writing needs the authority. See :class:`skyloop.client.Config` for what becomes of values that were written.
+    """
+
+    sync: client.Config  #: the wrapped parameters
+
+    def __init__(self, sync: client.Config) -> None:
+        """Wrap parameters of a connected drone."""
+        self.sync = sync
+
+    get = awaited(client.Config.__getitem__)
+    set = awaited(client.Config.__setitem__)
+
+
+@mirrors(client.Listener, {at_once: "delivered dropped"})
+class Listener:
+    """A callback that runs on the event loop, one call at a time."""
+
+    sync: client.Listener[Any]  #: the wrapped listener, whose own thread waits for each call
+
+    def __init__(self, sync: client.Listener[Any]) -> None:
+        """Wrap a listener whose function hands over to the event loop."""
+        self.sync = sync
+
+    def cancel(self) -> None:
+        """Stop calling the function. Does not wait for a call that is under way."""
+        self.sync.cancel(wait=False)  # its thread may be waiting for this very event loop
+
+    @property
+    def errors(self) -> int:
+        """Calls that raised."""
+        return self.sync.errors
+
+
+@mirrors(
+    client.Drone,
+    {
+        awaited: """
+            close stats preflight takeoff land go_to return_to_start request_authority release_authority
+            next_feedback next_frame wait overview
+        """,
+        at_once: """
+            name uri app_id capabilities authority link closed now_ns clock_offset_ns clock_uncertainty_ns
+            start_position age_s recent_events hover idle velocity attitude emergency_stop reset_emergency command
+            send_external_pose emit annotate feedback frame result on_frame on_encoded
+        """,
+        on_loop: """
+            on_takeover on_overview on_feedback on_event on_link on_command on_annotation on_log on_result
+        """,
+    },
+)
+class Drone:
+    """A connected vehicle, made by :func:`connect`.
+
+    Methods have the names, arguments, results and errors of :class:`skyloop.Drone`; those that wait are coroutines.
+    Callbacks, plain or coroutine functions, run on the event loop that was running when they were added. Those of
+    images are plain functions on threads of their own, as work on images would block the event loop, and so is the
+    predicate that :meth:`wait` is given.
+    """
+
+    sync: client.Drone  #: the wrapped drone
+    config: Config  #: parameters of the vehicle and the proxy
+
+    def __init__(self, sync: client.Drone) -> None:
+        """Wrap a connected drone."""
+        self.sync = sync
+        self.config = Config(sync.config)
+
+    async def __aenter__(self) -> Drone:
+        return self
+
+    __aexit__ = awaited(client.Drone.__exit__)
+
+    @property
+    def log(self) -> client.Logbook:
+        """Publishes text and numbers beside the flight; see :class:`skyloop.client.Logbook`."""
+        return self.sync.log
+
+    @like(client.Drone.frames, "A JPEG is decoded on another thread, while :meth:`frame` decodes on the event loop.")
+    async def frames(
+        self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
+    ) -> AsyncIterator[client.Frame]:
+        core, notifier, clock = self.sync._core, LoopNotifier(), asyncio.get_running_loop().time
+        channel, deadline = core.channel(camera, **how), clock() + timeout_s
+        while not self.sync.closed:
+            mailbox = Mailbox[Arrival](notifier=notifier)
+            with core.closing(mailbox), channel.into(mailbox):
+                while not self.sync.closed:
+                    if await notifier.within(min(LOOK_S, deadline - clock())):
+                        frame = await _decoded(channel, mailbox.take(), how.get("max_age_s"))
+                        if frame is not None:
+                            yield frame
+                            deadline = clock() + timeout_s
+                    elif clock() >= deadline:
+                        raise core.no_frame(channel.camera.name, timeout_s)
+                    elif (now := core.channel(camera, **how)) is not channel:
+                        channel = now  # the proxy was started again with another camera
+                        break
+
+    @like(client.Drone.results)
+    async def results(
+        self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0
+    ) -> AsyncIterator[client.Result]:
+        core, notifier, clock = self.sync._core, LoopNotifier(), asyncio.get_running_loop().time
+        mailbox = ResultMailbox(checked_age(max_age_s), notifier)
+        with core.closing(mailbox), core.result_channel(processor).into(mailbox):
+            deadline = clock() + timeout_s
+            while not self.sync.closed:
+                if not await notifier.within(deadline - clock()):
+                    raise NoAnswerError(silence(processor, timeout_s, mailbox.expired))
+                result = mailbox.take()
+                if result is not None:
+                    yield result
+                    deadline = clock() + timeout_s
+
+
+async def _decoded(channel: VideoChannel, arrival: Arrival | None, max_age_s: float | None) -> client.Frame | None:
+    if arrival is not None and arrival.header.encoding is Encoding.JPEG:
+        return await in_thread(lambda: channel.picture(arrival, max_age_s))
+    return None if arrival is None else channel.picture(arrival, max_age_s)
+
+
+@mirrors(
+    client.Swarm,
+    {
+        awaited: """
+            close takeoff land go_to return_to_start hover idle velocity attitude reset_emergency command send
+            request_authority release_authority feedback wait_all
+        """,
+        at_once: "names errors readmit emergency_stop spread __len__ __contains__",
+    },
+)
+class Swarm:
+    """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating gives all.
+
+    Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
+    :meth:`emergency_stop` are coroutines, and so is :meth:`feedback`: what ``on_error`` says may be a landing. One
+    task at a time awaits them; :meth:`emergency_stop` may be called at any time.
+    """
+
+    sync: client.Swarm  #: the wrapped swarm
+
+    def __init__(self, sync: client.Swarm) -> None:
+        """Wrap a connected swarm."""
+        self.sync = sync
+        self._drones = {name: Drone(drone) for name, drone in sync.items()}
+
+    async def __aenter__(self) -> Swarm:
+        return self
+
+    __aexit__ = awaited(client.Swarm.__exit__)
+
+    @property
+    def active(self) -> dict[str, Drone]:
+        """Drones that commands go to, by name; see :attr:`skyloop.Swarm.active`."""
+        return {name: self._drones[name] for name in self.sync.active}
+
+    @like(client.Swarm.items)
+    def items(self) -> list[tuple[str, Drone]]:
+        return list(self._drones.items())
+
+    def __getitem__(self, name: str) -> Drone:
+        self.sync[name]  # raises for an unknown name
+        return self._drones[name]
+
+    def __iter__(self) -> Iterator[Drone]:
+        return iter(self._drones.values())
+
+    def __repr__(self) -> str:
+        return f"<aio.{repr(self.sync)[1:]}"
+
+    async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
+        """Await ``function`` of all active drones at the same time, on this event loop.
+
+        Args:
+            function: A coroutine function; what it raises counts as for :meth:`skyloop.Swarm.each`.
+            what: Name of the action in the report of failures; empty: the function's.
+
+        Returns:
+            What it returned, by name.
+        """
+        loop = asyncio.get_running_loop()
+        ours = {id(drone.sync): drone for drone in self}
+
+        async def call(drone: Drone) -> T:
+            return await function(drone)
+
+        def wait_for(drone: client.Drone) -> T:
+            return asyncio.run_coroutine_threadsafe(call(ours[id(drone)]), loop).result()
+
+        return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
+
+    @like(client.Swarm.ticks)
+    async def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
+        ticks = self.sync.ticks(rate_hz, seconds)
+        while (tick := await in_thread(lambda: next(ticks, None))) is not None:
+            yield tick
+
+
+class Opening(Generic[Opened]):
+    """Result of :func:`connect` and :func:`swarm`: connects when awaited; entered, it also ends with the block."""
 
     _opened: Opened | None = None
 
-    @abstractmethod
-    async def _connect(self) -> Opened: ...
+    def __init__(
+        self, face: Callable[[Any], Opened], name: str, targets: tuple[Any, ...], options: dict[str, Any]
+    ) -> None:
+        self._face, self._name, self._targets, self._options = face, name, targets, options
+
+    async def _connect(self) -> Opened:
+        for target in (*self._targets, self._options.get("target")):
+            for address in target.values() if isinstance(target, Mapping) else [target]:
+                _reject_in_step(address)
+        connect: Callable[..., Any] = getattr(client, self._name)
+        sync = await in_thread(lambda: connect(*self._targets, **self._options), abandoned=lambda made: made.close())
+        return self._face(sync)
 
     def __await__(self) -> Generator[Any, None, Opened]:
         return self._connect().__await__()
@@ -122,3 +446,15 @@ class Opening(ABC, Generic[Opened]):
     ) -> None:
         if self._opened is not None:
             await self._opened.__aexit__(kind, error, traceback)
+
+
+def _reject_in_step(target: object) -> None:
+    """Raise for a stepped replay, whose time would stand still here."""
+    if isinstance(target, str) and target.startswith("replay://") and parse_uri(target).options.get("speed") == "max":
+        raise UsageError(
+            f"{target}: speed=max is in step with the one thread that waits, which an event loop never does: use "
+            "skyloop.connect, or give a number, such as speed=10"
+        )
+
+
+connect, swarm = opener(Drone, client.connect), opener(Swarm, client.swarm)
