@@ -21,8 +21,6 @@ from skyloop.clock import NS_PER_S
 from skyloop.drivers.replay.source import ReplaySource
 from skyloop.emulators.ardrone.video import H264_360P
 from skyloop.emulators.encoders import Encoded, Encoder
-from skyloop.logfile.layout import VERSION, Channel, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
-from skyloop.logfile.reader import Recording
 from skyloop.messages import (
     Applied,
     CameraInfo,
@@ -36,7 +34,9 @@ from skyloop.messages import (
 )
 from skyloop.messages.encoded import H264
 from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.layout import VERSION, Channel, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.recording.output import RecordingFile
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.export import export_csv, read
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise

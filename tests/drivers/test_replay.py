@@ -22,18 +22,6 @@ from skyloop.drivers.replay.options import KNOWN
 from skyloop.drivers.replay.publisher import ReplayPublisher
 from skyloop.drivers.replay.source import ReplaySource, Timeline
 from skyloop.errors import ParameterError, UnknownNameError, UsageError
-from skyloop.logfile.layout import (
-    META_CLOCK,
-    META_RECORDING,
-    PROFILE,
-    VERSION,
-    ClockPair,
-    DroneRecord,
-    Start,
-    to_metadata,
-    to_plain,
-)
-from skyloop.logfile.reader import Recording
 from skyloop.messages import (
     CameraInfo,
     Encoding,
@@ -46,6 +34,18 @@ from skyloop.messages import (
     Severity,
     Velocity,
 )
+from skyloop.recording.layout import (
+    META_CLOCK,
+    META_RECORDING,
+    PROFILE,
+    VERSION,
+    ClockPair,
+    DroneRecord,
+    Start,
+    to_metadata,
+    to_plain,
+)
+from skyloop.recording.reader import Recording
 from tests.docs.pages import rows, section
 from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, UNIX_NS, Plan, feedback_at, write_flight
 

@@ -24,10 +24,10 @@ from skyloop.drivers.replay.playback import PAUSED, POSITION, SPEED, Playback
 from skyloop.drivers.replay.player import IDLE_S, Player
 from skyloop.drivers.replay.source import ReplaySource, Timeline
 from skyloop.errors import ParameterError, UnknownNameError
-from skyloop.logfile.reader import Entry, Recording
-from skyloop.logfile.scan import Piece
 from skyloop.messages import Feedback, LinkState
 from skyloop.proxy.proxy import Proxy
+from skyloop.recording.reader import Entry, Recording
+from skyloop.recording.scan import Piece
 from skyloop.transport.memory import MemoryServer
 from tests.recording.flights import BEGIN_NS, MS, WIDTH, Plan, feedback_at, write_flight
 

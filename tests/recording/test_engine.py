@@ -19,8 +19,6 @@ from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.drivers.base import Sink
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UnknownNameError, UsageError
-from skyloop.logfile import layout
-from skyloop.logfile.layout import META_END, META_RECORDING, End, FrameRecord, ResultRecord, Start
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -39,8 +37,9 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.proxy.proxy import Proxy
-from skyloop.recording import foxglove
+from skyloop.recording import foxglove, layout
 from skyloop.recording.engine import Engine
+from skyloop.recording.layout import META_END, META_RECORDING, End, FrameRecord, ResultRecord, Start
 from skyloop.recording.options import CHOICES, Options, channels_of
 from skyloop.recording.status import RecorderState
 from skyloop.recording.taps import Gaps, Video, encoder

@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Recording
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Recording
 from skyloop.recording.review import export, video
 from skyloop.recording.review.export import export_csv, export_npz, export_parquet, read
 from skyloop.recording.review.report import write_report

@@ -22,13 +22,23 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.replay.playback import Playback
 from skyloop.drivers.replay.player import StepPlayer
 from skyloop.drivers.replay.source import ReplaySource
-from skyloop.logfile import layout
-from skyloop.logfile.layout import TYPES, Channel, ClockPair, DroneRecord, Drops, End, FrameRecord, ResultRecord, Start
-from skyloop.logfile.reader import Recording
 from skyloop.messages import AnyAction, Applied, Command, Event, Feedback, LinkState, Sample
 from skyloop.messages.codec import decode, encode
+from skyloop.recording import layout
 from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.layout import (
+    TYPES,
+    Channel,
+    ClockPair,
+    DroneRecord,
+    Drops,
+    End,
+    FrameRecord,
+    ResultRecord,
+    Start,
+)
 from skyloop.recording.output import Message, RecordingFile
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
 from skyloop.recording.review.export import export_csv, export_npz, export_parquet, read
 from skyloop.recording.review.report import write_report

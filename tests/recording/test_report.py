@@ -18,8 +18,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.logfile.reader import Recording
 from skyloop.messages import Feedback
+from skyloop.recording.reader import Recording
 from skyloop.recording.review import flight as facts
 from skyloop.recording.review import keyframes, svg
 from skyloop.recording.review.report import write_report

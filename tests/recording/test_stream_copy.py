@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, UsageError
-from skyloop.logfile.reader import Recording
+from skyloop.recording.reader import Recording
 from skyloop.recording.review import stream_copy
 from skyloop.recording.review.stream_copy import contents, numbered
 from skyloop.recording.review.video import Videos, export_mp4

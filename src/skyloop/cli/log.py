@@ -17,8 +17,8 @@ from skyloop.cli.text import console
 from skyloop.errors import FileFormatError, UsageError
 
 if TYPE_CHECKING:
-    from skyloop.logfile.layout import Channel
-    from skyloop.logfile.reader import Recording
+    from skyloop.recording.layout import Channel
+    from skyloop.recording.reader import Recording
 
 log = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -85,7 +85,7 @@ def list_recordings(
     import msgspec
 
     from skyloop.cli import log_tables
-    from skyloop.logfile.listing import ENDING, describe, shown_name
+    from skyloop.recording.listing import ENDING, describe, shown_name
 
     try:
         paths = sorted(path for path in folder.iterdir() if path.suffix == ENDING)
@@ -309,7 +309,7 @@ def _export_rrd(recording: Recording, target: Path, drone: str | None) -> None:
 
 
 def _open(file: Path) -> Recording:
-    from skyloop.logfile.reader import Recording
+    from skyloop.recording.reader import Recording
 
     return Recording.open(file)
 
@@ -323,7 +323,7 @@ def _first_camera(recording: Recording, drone: str) -> str:
 
 def _channels(names: list[str] | None) -> list[Channel] | None:
     from skyloop.errors import UnknownNameError
-    from skyloop.logfile.layout import Channel
+    from skyloop.recording.layout import Channel
 
     known = {channel.value for channel in Channel}
     for name in names or ():

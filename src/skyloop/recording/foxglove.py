@@ -1,6 +1,6 @@
 """Messages for viewers, in Foxglove's public protobuf schemas: images, calibrations, poses, drawings, texts.
 
-Pure. Needs the extra ``record``. Times are Unix ns; frames are named as in :mod:`skyloop.logfile.layout`.
+Pure. Needs the extra ``record``. Times are Unix ns; frames are named as in :mod:`skyloop.recording.layout`.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import MissingExtraError
-from skyloop.logfile.layout import WORLD, optical_frame
 from skyloop.messages import Annotation, CameraInfo, Feedback, Intrinsics, Points, Polyline, Severity
 from skyloop.messages.annotation import Colour, Point, Shape, Text
 from skyloop.messages.encoded import H264
 from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.recording.layout import WORLD, optical_frame
 
 try:
     from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration

@@ -11,9 +11,9 @@ from typing import Final, Literal
 import msgspec
 
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.logfile.layout import Channel
 from skyloop.messages import CameraInfo
 from skyloop.messages.encoded import H264
+from skyloop.recording.layout import Channel
 
 VideoEncoding = Literal["auto", "jpeg", "png"]
 

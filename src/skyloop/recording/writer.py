@@ -15,10 +15,10 @@ import msgspec
 
 from skyloop.clock import nanoseconds
 from skyloop.errors import UsageError
-from skyloop.logfile.layout import VERSION, ClockPair, DroneRecord, End, Start
 from skyloop.messages import Severity
 from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Backlog, Item, Rank
+from skyloop.recording.layout import VERSION, ClockPair, DroneRecord, End, Start
 from skyloop.recording.options import MB, Options, numbered
 from skyloop.recording.output import CHUNK, Message, Opener, RecordingFile, open_target
 from skyloop.recording.status import RecorderState, Room, judge_room

@@ -12,19 +12,18 @@ from contextlib import ExitStack
 from typing import Any
 
 import pytest
+from skyloop.recording import parameters as module
 
 from skyloop.client import Drone
 from skyloop.drivers.base import Sink
 from skyloop.errors import LinkError, MissingExtraError, UsageError
-from skyloop.logfile import layout
-from skyloop.logfile.layout import FrameRecord
 from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Polyline
 from skyloop.recording import foxglove as schemas
-from skyloop.recording import taps
+from skyloop.recording import layout, taps
 from skyloop.recording.backlog import Item, Rank
-from skyloop.recording.live import parameters as module
-from skyloop.recording.live.origin_door import MAX_HEAD, OriginDoor, hidden_host
-from skyloop.recording.live.parameters import ParameterDesk
+from skyloop.recording.layout import FrameRecord
+from skyloop.recording.origin_door import MAX_HEAD, OriginDoor, hidden_host
+from skyloop.recording.parameters import ParameterDesk
 from skyloop.recording.translation import Picture
 from tests.integration.fake_vehicle import PERIOD_S, FakeVehicle
 from tests.integration.test_fabric import Node, far
@@ -36,8 +35,8 @@ pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: skyloop i
 
 import itertools
 
-from skyloop.recording.live.foxglove_server import WAITING, FoxgloveServer
-from skyloop.recording.live.view import View
+from skyloop.recording.foxglove_server import WAITING, FoxgloveServer
+from skyloop.recording.view import View
 
 __all__ = ["far"]
 Show = Callable[..., tuple[View, FoxgloveServer]]

@@ -15,8 +15,6 @@ from skyloop.drivers.replay.publisher import PREFIX, ReplayPublisher
 from skyloop.drivers.replay.source import ReplaySource, capabilities_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError, UsageError
-from skyloop.logfile.layout import DroneRecord
-from skyloop.logfile.reader import Recording
 from skyloop.messages import (
     AnyAction,
     Capabilities,
@@ -28,6 +26,8 @@ from skyloop.messages import (
     Severity,
     Value,
 )
+from skyloop.recording.layout import DroneRecord
+from skyloop.recording.reader import Recording
 
 _log = logging.getLogger(__name__)
 _CLOSE_S: Final = 2.0

@@ -13,7 +13,6 @@ from skyloop.drivers.base import Sink
 from skyloop.drivers.replay.playback import PAUSED, POSITION, SPEED, Playback
 from skyloop.drivers.replay.source import Moment, TimedSample, Timeline
 from skyloop.errors import SkyloopError
-from skyloop.logfile.pictures import Picture
 from skyloop.messages import (
     AnyAction,
     Applied,
@@ -25,6 +24,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
+from skyloop.recording.pictures import Picture
 
 #: Events of the vehicle itself. All others were the recorded proxy's or an application's: a client must not take them
 #: for events about its own authority or commands.

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Recording
 from skyloop.messages import Applied, Feedback
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.tables import ACTION_FIELDS, begin_ns
 
 RATE_HZ: Final = 100.0  #: rate at which both are compared; a command holds until the next one

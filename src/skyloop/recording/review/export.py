@@ -12,8 +12,8 @@ import numpy as np
 
 from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 from skyloop.files import replacing
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Progress, Recording
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review.tables import Table, tables
 
 #: Channels that become a table; frames are listed with their times.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 from skyloop.files import replacing
-from skyloop.logfile.reader import Recording
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.episodes import Times
 from skyloop.recording.review.video import even
 

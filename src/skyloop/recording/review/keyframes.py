@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 
 from skyloop.errors import FileFormatError, MissingExtraError
-from skyloop.logfile.pictures import Picture
-from skyloop.logfile.reader import Recording
 from skyloop.messages.encoded import H264
+from skyloop.recording.pictures import Picture
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.tables import Table
 
 WIDTH: Final = 360  #: of a thumbnail [px]

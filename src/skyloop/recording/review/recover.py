@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from skyloop.errors import UsageError
 from skyloop.files import replacing
-from skyloop.logfile.layout import PROFILE
-from skyloop.logfile.reader import Progress, Recording
-from skyloop.logfile.scan import Channel, Message, Scan, Schema, attachments, open_file, records
+from skyloop.recording.layout import PROFILE
+from skyloop.recording.reader import Progress, Recording
+from skyloop.recording.scan import Channel, Message, Scan, Schema, attachments, open_file, records
 
 if TYPE_CHECKING:
     from mcap.writer import Writer

@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 
 from skyloop.clock import NS_PER_S
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Progress, Recording
 from skyloop.messages import FlightState
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review import flight
 from skyloop.recording.review.keyframes import figures
 from skyloop.recording.review.page import Page, facts, table

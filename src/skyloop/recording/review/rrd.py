@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.errors import FileFormatError
-from skyloop.logfile.layout import Channel, DroneRecord
-from skyloop.logfile.pictures import Picture
-from skyloop.logfile.reader import Progress, Recording
+from skyloop.recording.layout import Channel, DroneRecord
+from skyloop.recording.pictures import Picture
+from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.rerun_log import RerunLog, Shown
 
 _CHANNELS: Final = (

@@ -13,8 +13,8 @@ from typing import Any, Final
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError
 from skyloop.files import replacing
-from skyloop.logfile.pictures import Picture
 from skyloop.messages.image_header import MAX_PIXELS
+from skyloop.recording.pictures import Picture
 from skyloop.wire.h264 import IDR, PPS, SLICE, SPS, START, unit_type, units
 
 TIME_BASE: Final = Fraction(1, 90_000)  #: of the files: the clock of video

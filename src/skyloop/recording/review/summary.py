@@ -8,9 +8,9 @@ from typing import Any, Final
 import numpy as np
 
 from skyloop.clock import NS_PER_S
-from skyloop.logfile.layout import Channel, Drops, FrameRecord
-from skyloop.logfile.reader import Progress, Recording
 from skyloop.messages import Applied, Event, Feedback
+from skyloop.recording.layout import Channel, Drops, FrameRecord
+from skyloop.recording.reader import Progress, Recording
 
 GAP_FACTOR: Final = 3.0  #: a step between two messages that is longer than so many usual ones is a gap
 MIN_STEPS: Final = 5  #: with fewer, the usual step is not known

@@ -11,9 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import NS_PER_S
-from skyloop.logfile.layout import Channel, Drops, FrameRecord, ResultRecord
-from skyloop.logfile.reader import Item, Progress, Recording
-from skyloop.logfile.times import Course
 from skyloop.messages import (
     AnyAction,
     Applied,
@@ -22,6 +19,9 @@ from skyloop.messages import (
     LogEntry,
     Parameter,
 )
+from skyloop.recording.layout import Channel, Drops, FrameRecord, ResultRecord
+from skyloop.recording.reader import Item, Progress, Recording
+from skyloop.recording.times import Course
 
 #: Columns of the parts of feedback's vectors, in their order.
 VECTORS: Final[dict[str, tuple[str, str, str]]] = {

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, MissingExtraError
 from skyloop.files import replacing
-from skyloop.logfile.layout import image_topic
-from skyloop.logfile.pictures import Picture
-from skyloop.logfile.reader import Progress, Recording
 from skyloop.pyav import require_pyav
+from skyloop.recording.layout import image_topic
+from skyloop.recording.pictures import Picture
+from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review.stream_copy import StreamCopy, TooManyChangesError, Video
 from skyloop.recording.review.tables import begin_ns
 

@@ -17,13 +17,13 @@ from typing import Final
 from skyloop.client import Drone
 from skyloop.clock import nanoseconds
 from skyloop.errors import LinkError, NoAnswerError, SkyloopError
-from skyloop.logfile.layout import ClockPair, FrameRecord
 from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Item
-from skyloop.recording.live.view import Source, check_names
+from skyloop.recording.layout import ClockPair, FrameRecord
 from skyloop.recording.options import MB, VIDEO
 from skyloop.recording.rerun_log import RerunLog, Shown, rerun_sdk
 from skyloop.recording.translation import Picture
+from skyloop.recording.view import Source, check_names
 
 PORT: Final = 9876  #: of Rerun's viewer
 _START_S: Final = 20.0
@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 
 class RerunViewer:
-    """A :class:`skyloop.recording.live.view.Screen` of everything: Rerun does not say what is looked at."""
+    """A :class:`skyloop.recording.view.Screen` of everything: Rerun does not say what is looked at."""
 
     def __init__(
         self,

@@ -18,17 +18,17 @@ from typing import Any, Final
 from skyloop.client import Drone
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UsageError
 from skyloop.extend import Known
-from skyloop.logfile.layout import ClockPair
 from skyloop.messages import Value
 from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Item
 from skyloop.recording.foxglove import CompressedVideo
-from skyloop.recording.live.origin_door import OriginDoor, hidden_host
-from skyloop.recording.live.parameters import ParameterDesk, Written
-from skyloop.recording.live.topics import ViewTopic, topics
-from skyloop.recording.live.view import Source, check_names
+from skyloop.recording.layout import ClockPair
+from skyloop.recording.origin_door import OriginDoor, hidden_host
 from skyloop.recording.output import Message, Schema
+from skyloop.recording.parameters import ParameterDesk, Written
+from skyloop.recording.topics import ViewTopic, topics
 from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.view import Source, check_names
 
 PORT: Final = 8765  #: that Foxglove asks for by itself
 WAITING: Final = 512  #: messages that may wait for a viewer; then its oldest are dropped
@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 
 class FoxgloveServer:
-    """A :class:`skyloop.recording.live.view.Screen` of any number of viewers."""
+    """A :class:`skyloop.recording.view.Screen` of any number of viewers."""
 
     def __init__(
         self, drones: Sequence[Drone], *, host: str = "127.0.0.1", port: int = PORT, priority: int | None = None

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, MissingExtraError
-from skyloop.logfile.h264 import Group
-from skyloop.logfile.layout import FrameRecord
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.messages.encoded import H264
 from skyloop.messages.image_header import why_not_decoded
+from skyloop.recording.h264 import Group
+from skyloop.recording.layout import FrameRecord
 
 _DATA: Final = 2  #: number of the field with the compressed image,
 _VIDEO_DATA: Final = 3  #: and of the one with H.264

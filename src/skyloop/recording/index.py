@@ -1,7 +1,7 @@
 """The structure of a complete MCAP file by the index at its end, without touching what lies before it.
 
 The index is believed only if it accounts for every byte of the file: then it says the same as
-:func:`skyloop.logfile.scan.scan`. The format is that of https://mcap.dev/spec: the footer says where the summary is,
+:func:`skyloop.recording.scan.scan`. The format is that of https://mcap.dev/spec: the footer says where the summary is,
 with its checksum, and that has each chunk's place, size and times.
 """
 
@@ -14,7 +14,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO, Final
 
-from skyloop.logfile.scan import (
+from skyloop.recording.scan import (
     FRAME,
     MAGIC,
     MAX_HEAD,

@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-from skyloop.logfile import layout
-from skyloop.logfile.layout import Channel, FrameRecord, Topic
 from skyloop.messages import CameraInfo, Capabilities
 from skyloop.messages.encoded import H264
-from skyloop.recording import foxglove
+from skyloop.recording import foxglove, layout
+from skyloop.recording.layout import Channel, FrameRecord, Topic
 from skyloop.recording.options import VIDEO
 
 _OTHERS: Final = (Channel.FRAMES, Channel.DROPS)  # a topic for each camera; of files alone
