@@ -147,7 +147,7 @@ def _ages(pipe: Pipe, pages: Pages) -> Arrivals:
 def recorder_problem() -> str:
     """Return why nothing can be recorded here; empty if it can."""
     try:
-        from skyloop.recording.child import check_installed
+        from skyloop.recording.recorder import check_installed
 
         check_installed()
     except ImportError as error:  # a part that is not installed is one too

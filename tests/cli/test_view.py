@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.recording.parameters import ParameterDesk
+from skyloop.recording.foxglove_access import ParameterDesk
 from tests.cli.conftest import Run
 from tests.processes.conftest import Process
 from tests.recording.live import fake_rerun

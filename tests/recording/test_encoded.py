@@ -27,9 +27,9 @@ from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError,
 from skyloop.messages import CameraInfo, Capabilities, Feedback, LinkState
 from skyloop.proxy.proxy import Proxy
 from skyloop.recording import layout, taps
-from skyloop.recording.h264 import Group, Groups
 from skyloop.recording.layout import FrameRecord
 from skyloop.recording.options import Options
+from skyloop.recording.pictures import Group, Groups
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise

@@ -40,8 +40,8 @@ from skyloop.recording.layout import (
 from skyloop.recording.output import Message, RecordingFile
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
-from skyloop.recording.review.export import export_csv, export_npz, export_parquet, read
 from skyloop.recording.review.report import write_report
+from skyloop.recording.review.tables import export_csv, export_npz, export_parquet, read
 from skyloop.recording.translation import Picture, Translator
 from tests.messages.samples import SAMPLES, TILT
 from tests.recording.flights import BEGIN_NS, CAPABILITIES, UNIX_NS, Plan, feedback_at, picture_at

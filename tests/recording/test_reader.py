@@ -19,9 +19,9 @@ from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.messages import Encoding, Feedback, LogEntry, Parameter, ParameterType
 from skyloop.recording.layout import Channel, image_topic
 from skyloop.recording.pictures import Picture, decode_image
+from skyloop.recording.plain import Course, reported_ns, shifted
 from skyloop.recording.reader import Item, Recording
 from skyloop.recording.review.tables import tables
-from skyloop.recording.times import Course, reported_ns, shifted
 from tests.recording.flights import BEGIN_NS, HEIGHT, MS, UNIX_NS, WIDTH, Plan, feedback_at, picture_at, write_flight
 
 

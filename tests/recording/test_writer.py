@@ -26,8 +26,7 @@ from skyloop.messages import (
 from skyloop.recording import layout
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import META_END, META_RECORDING, ClockPair, DroneRecord, End, FrameRecord, Start
-from skyloop.recording.options import MB, Options
-from skyloop.recording.status import Room, judge_room
+from skyloop.recording.options import MB, Options, Room, judge_room
 from skyloop.recording.translation import Picture, Translator
 from skyloop.recording.writer import FileWriter
 from tests.recording import files

@@ -30,15 +30,13 @@ from skyloop.drivers.replay.source import ReplaySource
 from skyloop.errors import FileFormatError, SkyloopError
 from skyloop.messages.image_header import MAX_PIXELS, MAX_SCANS, image_size, why_not_decoded
 from skyloop.recording import scan
-from skyloop.recording.h264 import Group
 from skyloop.recording.layout import Channel
 from skyloop.recording.listing import describe
-from skyloop.recording.pictures import Picture, decode_image
+from skyloop.recording.pictures import Group, Picture, decode_image
 from skyloop.recording.reader import Recording
-from skyloop.recording.review.export import export_csv, export_npz, read
-from skyloop.recording.review.recover import recover
 from skyloop.recording.review.report import write_report
-from skyloop.recording.review.summary import summarise
+from skyloop.recording.review.summary import recover, summarise
+from skyloop.recording.review.tables import export_csv, export_npz, read
 from tests.cli.conftest import Ended
 from tests.recording.flights import Plan, write_flight
 

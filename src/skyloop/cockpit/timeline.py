@@ -18,7 +18,7 @@ from skyloop.cockpit.reports import run_child
 from skyloop.cockpit.values import flat_values, truth_values, vector
 from skyloop.messages import Event, EventKind, Feedback, LogEntry, Severity
 from skyloop.recording.layout import Channel
-from skyloop.recording.times import Course
+from skyloop.recording.plain import Course
 
 if TYPE_CHECKING:
     from skyloop.recording.reader import Recording

@@ -4,5 +4,5 @@ import sys
 from importlib import import_module
 
 # Their modules are these under another name, so that classes are the same by both.
-for _name in ("layout", "pictures", "reader", "times"):
+for _name in ("layout", "pictures", "reader"):
     sys.modules[f"{__name__}.{_name}"] = globals()[_name] = import_module(f"skyloop.recording.{_name}")

@@ -13,8 +13,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import Severity
 from skyloop.recording.backlog import Backlog
 from skyloop.recording.layout import ClockPair, DroneRecord, to_plain
-from skyloop.recording.options import MB, Options
-from skyloop.recording.status import RecorderEvent, Status
+from skyloop.recording.options import MB, Options, RecorderEvent, Status
 from skyloop.recording.taps import Tap
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter

@@ -253,30 +253,6 @@ def _colour(colour: Colour) -> Color:
 
 
 def log(drone: str, at_ns: int, severity: Severity, text: str, source: str) -> bytes:
-    """Encode a line of text.
-
-    Args:
-        drone: The drone's name.
-        at_ns: Unix time.
-        severity: Becomes the level.
-        text: The line.
-        source: Who wrote it.
-    """
+    """Encode a line of text."""
     message = Log(timestamp=timestamp(at_ns), level=_LEVELS[severity], message=text, name=drone, file=source)
     return message.SerializeToString()
-
-
-# Decoding ------------------------------------------------------------------------------------------------------
-
-
-def read_image(data: bytes | memoryview) -> tuple[bytes, str]:
-    """Decode an image: its bytes and their format."""
-    message = CompressedImage.FromString(bytes(data))
-    return message.data, message.format
-
-
-def read_pose(data: bytes) -> tuple[Vector, tuple[float, float, float, float]]:
-    """Decode a pose in the world: position [m] and quaternion (x, y, z, w)."""
-    place: Any = PoseInFrame.FromString(data).pose
-    at, turned = place.position, place.orientation
-    return (at.x, at.y, at.z), (turned.x, turned.y, turned.z, turned.w)

@@ -15,8 +15,6 @@ from typing import IO, Any, TypeGuard
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, UnknownNameError
 from skyloop.messages.encoded import H264
-from skyloop.recording.h264 import Groups
-from skyloop.recording.index import indexed
 from skyloop.recording.layout import (
     META_CLOCK,
     META_END,
@@ -36,8 +34,19 @@ from skyloop.recording.layout import (
     parse_topic,
     video_topic,
 )
-from skyloop.recording.pictures import Picture, compressed
-from skyloop.recording.scan import MAX_TIME_NS, Message, Piece, Scan, find_channels, note, open_file, records, scan
+from skyloop.recording.pictures import Groups, Picture, compressed
+from skyloop.recording.scan import (
+    MAX_TIME_NS,
+    Message,
+    Piece,
+    Scan,
+    find_channels,
+    indexed,
+    note,
+    open_file,
+    records,
+    scan,
+)
 
 #: Called with the share of a file that has been read, from 0 to 1.
 Progress = Callable[[float], object]

@@ -16,7 +16,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from skyloop.recording import rerun_viewer
 
 import skyloop
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
@@ -34,13 +33,12 @@ from skyloop.messages import (
 )
 from skyloop.messages.annotation import Text
 from skyloop.messages.encoded import H264
-from skyloop.recording import rerun_log
+from skyloop.recording import rerun_log, rerun_viewer
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import FrameRecord
 from skyloop.recording.reader import Recording
 from skyloop.recording.rerun_log import RerunLog, Shown
-from skyloop.recording.rerun_viewer import RerunViewer
-from skyloop.recording.review.rrd import export_rrd
+from skyloop.recording.rerun_viewer import RerunViewer, export_rrd
 from skyloop.recording.translation import Picture
 from skyloop.recording.view import View
 from tests.cli.conftest import Ended

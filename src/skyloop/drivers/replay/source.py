@@ -14,8 +14,8 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.messages import Applied, CameraInfo, Capabilities, Encoding, Event, Feedback, Parameter
 from skyloop.recording.layout import Channel, DroneRecord
 from skyloop.recording.pictures import Picture
+from skyloop.recording.plain import Course, shifted
 from skyloop.recording.reader import Item, Recording
-from skyloop.recording.times import Course, shifted
 
 #: What is replayed. Annotations and logs are an application's own: it makes new ones.
 CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)
