@@ -88,8 +88,8 @@ def show(pipe: Pipe, proxy: str, number: int) -> None:
 
 def serve(pipe: Pipe, proxy: str) -> None:
     """Run a live view for Foxglove; send its address."""
-    from skyloop.recording.live.foxglove_server import FoxgloveServer
-    from skyloop.recording.live.view import View, give_way
+    from skyloop.recording.foxglove_server import FoxgloveServer
+    from skyloop.recording.view import View, give_way
 
     give_way()
     with connect(proxy, access="observe", name="view") as drone:
@@ -147,7 +147,7 @@ def _ages(pipe: Pipe, pages: Pages) -> Arrivals:
 def recorder_problem() -> str:
     """Return why nothing can be recorded here; empty if it can."""
     try:
-        from skyloop.recording.child import check_installed
+        from skyloop.recording.recorder import check_installed
 
         check_installed()
     except ImportError as error:  # a part that is not installed is one too

@@ -18,8 +18,6 @@ import msgspec
 from benchmarks.measuring.tables import Table
 from skyloop.bench import Flight, Machine
 from skyloop.clock import NS_PER_S
-from skyloop.logfile.layout import VERSION, Channel, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
-from skyloop.logfile.reader import Recording
 from skyloop.messages import (
     Applied,
     CameraInfo,
@@ -33,10 +31,12 @@ from skyloop.messages import (
 )
 from skyloop.messages.encoded import H264
 from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.layout import VERSION, Channel, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.recording.output import RecordingFile
-from skyloop.recording.review.export import export_csv, read
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise
+from skyloop.recording.review.tables import export_csv, read
 from skyloop.recording.review.video import export_mp4
 from skyloop.recording.translation import Picture, Translator
 from skyloop.sim.camera import FRONT_CAMERA

@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 
 import skyloop
-from skyloop.logfile.reader import Recording
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
 from skyloop.vision import MarkerDetector
 

@@ -112,7 +112,7 @@ def _tree(module: str) -> ast.Module:
 @cache
 def _sources(module: str) -> dict[str, str]:
     """Return the module that each name of a module's top is from."""
-    found = {}
+    found: dict[str, str] = {}
     for node in ast.walk(_tree(module)):
         if isinstance(node, ast.ImportFrom):
             found |= {alias.asname or alias.name: node.module or "" for alias in node.names}

@@ -36,10 +36,10 @@ import skyloop
 from skyloop.clock import nanoseconds
 from skyloop.control import FollowMarker, OnnxPolicy, PolicyNetwork
 from skyloop.control.rehearsal import Radio, rehearse
-from skyloop.logfile.reader import Recording
 from skyloop.messages import Attitude, Velocity
 from skyloop.messages.annotation import Shape
 from skyloop.messages.rows import ACTIONS, state_row
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.lerobot import export_lerobot
 from skyloop.vision import MarkerDetector
 from skyloop.vision.planar import pixels_of

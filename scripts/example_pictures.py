@@ -27,8 +27,8 @@ from matplotlib.figure import Figure
 from nbclient import NotebookClient
 
 import skyloop
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Recording
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
 from skyloop.recording.review.tables import begin_ns
 

@@ -18,9 +18,9 @@ from pictures import draw
 from PIL import Image
 
 from skyloop.gym.picture import look_at
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Recording
 from skyloop.messages import Annotation, Feedback, Text
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Recording
 from skyloop.sim import load_world
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState

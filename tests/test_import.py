@@ -86,3 +86,9 @@ def test_a_name_that_is_elsewhere_says_where(name: str, home: str) -> None:
 
 def test_version() -> None:
     assert skyloop.__version__[0].isdigit()
+
+
+@pytest.mark.parametrize("name", ["layout", "pictures", "reader"])
+def test_recordings_are_read_by_their_former_address_too(name: str) -> None:
+    former = importlib.import_module(f"skyloop.logfile.{name}")
+    assert former is importlib.import_module(f"skyloop.recording.{name}")

@@ -82,7 +82,7 @@ def paper(
 def _prepared(output: Path | None) -> Path:
     """Make the folder; check before anything flies what would otherwise fail only afterwards."""
     from benchmarks.measuring.figures import check_installed as check_figures
-    from skyloop.recording.child import check_installed as check_recording
+    from skyloop.recording.recorder import check_installed as check_recording
 
     check_figures()
     check_recording()

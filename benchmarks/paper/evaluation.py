@@ -21,10 +21,10 @@ from skyloop.bench import Machine
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError
 from skyloop.files import MAX_RESULTS, read_json
-from skyloop.logfile.layout import Channel, FrameRecord
-from skyloop.logfile.reader import Item, Progress, Recording
 from skyloop.messages import Applied, Event, EventKind, Feedback, Idle, LogEntry
 from skyloop.messages.log import MOCAP
+from skyloop.recording.layout import Channel, FrameRecord
+from skyloop.recording.reader import Item, Progress, Recording
 
 Floats = NDArray[np.float64]
 RECORDER: Final = "recorder"  #: the name under which the recorder's own delays stand beside ours

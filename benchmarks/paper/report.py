@@ -17,8 +17,7 @@ from benchmarks.measuring.schedule import FEEDBACK, VIDEO
 from benchmarks.paper.evaluation import RECORDER, Experiment
 from benchmarks.paper.marks import CORNERS
 from skyloop.files import write as write_file
-from skyloop.recording.review.page import Page, facts, table
-from skyloop.recording.review.svg import Line, TimeAxis, limits
+from skyloop.recording.review.charts import Line, Page, TimeAxis, facts, limits, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

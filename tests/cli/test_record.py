@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.cli import record as module
-from skyloop.recording.status import RecorderState, Status
+from skyloop.recording.options import RecorderState, Status
 from tests.cli.conftest import Run
 from tests.processes.conftest import Process
 from tests.recording import files

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.recording.live.parameters import ParameterDesk
+from skyloop.recording.foxglove_access import ParameterDesk
 from tests.cli.conftest import Run
 from tests.processes.conftest import Process
 from tests.recording.live import fake_rerun
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.process
 @pytest.fixture(autouse=True)
 def priority(monkeypatch: pytest.MonkeyPatch) -> None:
     """Keeps that of the tests' own process."""
-    monkeypatch.setattr("skyloop.recording.live.view.give_way", lambda: None)
+    monkeypatch.setattr("skyloop.recording.view.give_way", lambda: None)
 
 
 def test_foxglove_until_it_is_interrupted(start: Callable[..., Process], alpha: Process) -> None:

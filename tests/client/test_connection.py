@@ -6,12 +6,14 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import msgspec
 import pytest
 
 from skyloop import extend
 from skyloop.client import Drone, LinkStatus, RedialPolicy
+from skyloop.client.channels import Listener
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, LinkError, NoAnswerError, RefusedError, UnknownNameError
 from skyloop.messages import (
@@ -36,6 +38,7 @@ from skyloop.messages import (
     VideoRequest,
     encode,
 )
+from skyloop.messages.encoded import EncodedFrame
 from skyloop.transport.base import EVENTS, FEEDBACK, ClientHandler, TransportClient, video
 from skyloop.transport.memory import Faults
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
@@ -202,8 +205,11 @@ def test_callbacks_follow_a_proxy_that_is_restarted_with_another_camera(
     proxy: ScriptedProxy, drone: Drone, kept: bool
 ) -> None:
     """Where they asked for no camera by name; readers did so already."""
-    frames, pictures, inline, named = [], [], [], []  # type: ignore[var-annotated]
-    listeners = [
+    frames: list[str] = []
+    inline: list[str] = []
+    named: list[str] = []
+    pictures: list[EncodedFrame] = []
+    listeners: list[Listener[Any]] = [
         drone.on_frame(lambda frame: frames.append(frame.camera)),
         drone.on_frame(lambda frame: inline.append(frame.camera), inline=True),
         drone.on_frame(lambda frame: named.append(frame.camera), "front"),
@@ -219,11 +225,12 @@ def test_callbacks_follow_a_proxy_that_is_restarted_with_another_camera(
         proxy.until(lambda: proxy.server.subscribers("video/top") >= 1, "the new camera's subscription")
         for seq in itertools.count(1):
             proxy.frame(seq, "top")
-            if (frame := mailboxes.frame()) is not None and frames and inline:
+            frame = mailboxes.frame()
+            if frame is not None and frames and inline:
                 break
             assert seq < 100 * WAIT_S, "no frame came"
             time.sleep(0.01)
-        assert frame.camera == "top"
+        assert frame is not None and frame.camera == "top"
         assert set(frames) == set(inline) == {"top"}
         assert named == []
         stream = VideoRequest("top", encoding="h264", kbit_s=100).stream_topic

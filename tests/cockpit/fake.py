@@ -60,7 +60,7 @@ from skyloop.messages import (
     decode,
 )
 from skyloop.proxy.proxy import Proxy
-from skyloop.recording.status import RecorderState, Status
+from skyloop.recording.options import RecorderState, Status
 from skyloop.transport.base import ClientHandler, TransportClient
 from skyloop.transport.memory import MemoryServer
 from tests.cockpit.testclient import TestClient, WebSocketTestSession

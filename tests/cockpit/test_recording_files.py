@@ -19,9 +19,9 @@ from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.timeline import timeline
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import FileFormatError, RefusedError, UnknownNameError, UsageError
-from skyloop.logfile.reader import Recording
 from skyloop.messages import Role
 from skyloop.proxy.proxy import Proxy
+from skyloop.recording.reader import Recording
 from skyloop.transport.memory import MemoryServer
 from tests.cockpit.fake import ORIGIN, FakeRecorder, Node, Nodes, cockpit, this_user, until
 from tests.cockpit.testclient import TestClient

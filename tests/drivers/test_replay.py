@@ -18,18 +18,6 @@ from skyloop.clock import ManualClock
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import ParameterError, UnknownNameError, UsageError
-from skyloop.logfile.layout import (
-    META_CLOCK,
-    META_RECORDING,
-    PROFILE,
-    VERSION,
-    ClockPair,
-    DroneRecord,
-    Start,
-    to_metadata,
-    to_plain,
-)
-from skyloop.logfile.reader import Recording
 from skyloop.messages import (
     CameraInfo,
     Encoding,
@@ -42,6 +30,18 @@ from skyloop.messages import (
     Severity,
     Velocity,
 )
+from skyloop.recording.layout import (
+    META_CLOCK,
+    META_RECORDING,
+    PROFILE,
+    VERSION,
+    ClockPair,
+    DroneRecord,
+    Start,
+    to_metadata,
+    to_plain,
+)
+from skyloop.recording.reader import Recording
 from skyloop.vehicles.replay.driver import ReplayDriver
 from skyloop.vehicles.replay.options import KNOWN
 from skyloop.vehicles.replay.publisher import ReplayPublisher

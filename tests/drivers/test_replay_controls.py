@@ -21,10 +21,10 @@ from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.drivers.recording_sink import RecordingSink, SeenFrame
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import ParameterError, UnknownNameError
-from skyloop.logfile.reader import Entry, Recording
-from skyloop.logfile.scan import Piece
 from skyloop.messages import Feedback, LinkState
 from skyloop.proxy.proxy import Proxy
+from skyloop.recording.reader import Entry, Recording
+from skyloop.recording.scan import Piece
 from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.replay.playback import PAUSED, POSITION, SPEED, Playback
 from skyloop.vehicles.replay.player import IDLE_S, Player

@@ -16,15 +16,14 @@ from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.client.mailbox import Notifier
 from skyloop.errors import SkyloopError
-from skyloop.logfile.layout import ClockPair, DroneRecord
 from skyloop.messages import Applied, Capabilities, Event, EventKind, Feedback, Idle, LogEntry, Severity
 from skyloop.proxy import Proxy
 from skyloop.recording.backlog import Backlog, Item, Rank
-from skyloop.recording.child import RecorderProcess
 from skyloop.recording.engine import Engine
-from skyloop.recording.options import MB, Options
+from skyloop.recording.layout import ClockPair, DroneRecord
+from skyloop.recording.options import MB, Options, RecorderEvent, RecorderState, Status
 from skyloop.recording.output import RecordingFile
-from skyloop.recording.status import RecorderEvent, RecorderState, Status
+from skyloop.recording.recorder import RecorderProcess
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter
 from skyloop.transport.memory import MemoryServer

@@ -17,7 +17,7 @@ PACKAGES = {
     "mavlink": ["skyloop.vehicles.mavlink.wire"],
     "msp": ["skyloop.vehicles.msp.wire"],
     "vrpn": ["skyloop.motion_capture.vrpn_wire", "skyloop.motion_capture.vrpn"],
-    "recording": ["skyloop.logfile", "mcap"],
+    "recording": ["skyloop.recording", "mcap"],
     "files": ["skyloop.sim", "skyloop.calibration", "skyloop.zones", "skyloop.drivers.uri", "tomllib"],
     "page": ["skyloop.cockpit.commands"],
 }

@@ -153,7 +153,7 @@ def vrpn(data: bytes) -> None:
 
 def recording(data: bytes) -> None:
     """A recording that somebody else made: opened, and all that is in it read."""
-    from skyloop.logfile.reader import Recording
+    from skyloop.recording.reader import Recording
 
     with _file(data) as path, suppress(FileFormatError, UsageError):
         found = Recording.open(path)

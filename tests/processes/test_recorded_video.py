@@ -9,7 +9,7 @@ import pytest
 
 import skyloop
 from skyloop.errors import UnsupportedError
-from skyloop.logfile.reader import Recording
+from skyloop.recording.reader import Recording
 from skyloop.vehicles.ardrone.wire.pave import PaveParser
 from tests.processes.conftest import eventually
 from tests.recordings import recorded

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from mcap_protobuf.decoder import DecoderFactory
@@ -95,3 +97,16 @@ def until(condition: Callable[[], bool], what: str, timeout_s: float = 10.0) -> 
     while not condition():
         assert time.monotonic() < deadline, f"not within {timeout_s} s: {what}"
         time.sleep(0.03)
+
+
+def read_image(data: bytes | memoryview) -> tuple[bytes, str]:
+    """A foxglove.CompressedImage: its bytes and their format."""
+    message = CompressedImage.FromString(bytes(data))
+    return message.data, message.format
+
+
+def read_pose(data: bytes) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """A foxglove.PoseInFrame: position [m] and quaternion (x, y, z, w)."""
+    place = PoseInFrame.FromString(data).pose
+    at, turned = place.position, place.orientation
+    return (at.x, at.y, at.z), (turned.x, turned.y, turned.z, turned.w)

@@ -13,29 +13,6 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.writer import CompressionType, Writer
 
-from skyloop.logfile.layout import (
-    META_CLOCK,
-    META_END,
-    META_RECORDING,
-    PROFILE,
-    TYPES,
-    VERSION,
-    Channel,
-    ClockPair,
-    DroneRecord,
-    Drops,
-    End,
-    FrameRecord,
-    ResultRecord,
-    Start,
-    Topic,
-    encode,
-    image_topic,
-    schema,
-    schema_name,
-    to_metadata,
-    to_plain,
-)
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,
@@ -60,6 +37,29 @@ from skyloop.messages import (
     Takeoff,
     Value,
     Velocity,
+)
+from skyloop.recording.layout import (
+    META_CLOCK,
+    META_END,
+    META_RECORDING,
+    PROFILE,
+    TYPES,
+    VERSION,
+    Channel,
+    ClockPair,
+    DroneRecord,
+    Drops,
+    End,
+    FrameRecord,
+    ResultRecord,
+    Start,
+    Topic,
+    encode,
+    image_topic,
+    schema,
+    schema_name,
+    to_metadata,
+    to_plain,
 )
 
 MS = 1_000_000

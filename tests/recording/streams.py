@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from skyloop.clock import NS_PER_S
-from skyloop.logfile.layout import VERSION, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.messages import CameraInfo, Capabilities, Encoding, FrameHeader
 from skyloop.messages.encoded import H264
 from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.layout import VERSION, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.recording.output import RecordingFile
 from skyloop.recording.translation import Picture, Translator
 from skyloop.vehicles.emulation.encoders import Encoder, Format

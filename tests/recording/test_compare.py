@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from skyloop.errors import FileFormatError, UnknownNameError
-from skyloop.logfile.reader import Recording
 from skyloop.messages import Feedback
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
 from skyloop.recording.review.tables import tables
 from tests.cli.conftest import Ended

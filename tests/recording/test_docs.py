@@ -7,10 +7,9 @@ import re
 
 import skyloop
 from skyloop.cli.app import build
-from skyloop.logfile import layout
+from skyloop.recording import layout
 from skyloop.recording.backlog import RESERVE
-from skyloop.recording.options import CHOICES, MB
-from skyloop.recording.status import RecorderState
+from skyloop.recording.options import CHOICES, MB, RecorderState
 from tests.docs.pages import ROOT, rows, section
 
 PAGE = "docs/recording.md"

@@ -21,14 +21,13 @@ from skyloop.client.drone import open_drone
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
-from skyloop.logfile import layout
-from skyloop.logfile.h264 import Group, Groups
-from skyloop.logfile.layout import FrameRecord
-from skyloop.logfile.reader import Recording
 from skyloop.messages import CameraInfo, Capabilities, Feedback, LinkState
 from skyloop.proxy.proxy import Proxy
-from skyloop.recording import taps
+from skyloop.recording import layout, taps
+from skyloop.recording.layout import FrameRecord
 from skyloop.recording.options import Options
+from skyloop.recording.pictures import Group, Groups
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise
 from skyloop.recording.review.video import export_mp4

@@ -19,8 +19,6 @@ from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.drivers.base import Sink
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UnknownNameError, UsageError
-from skyloop.logfile import layout
-from skyloop.logfile.layout import META_END, META_RECORDING, End, FrameRecord, ResultRecord, Start
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -39,15 +37,16 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.proxy.proxy import Proxy
-from skyloop.recording import foxglove
+from skyloop.recording import layout
 from skyloop.recording.engine import Engine
-from skyloop.recording.options import CHOICES, Options, channels_of
-from skyloop.recording.status import RecorderState
+from skyloop.recording.layout import META_END, META_RECORDING, End, FrameRecord, ResultRecord, Start
+from skyloop.recording.options import CHOICES, Options, RecorderState, channels_of
 from skyloop.recording.taps import Gaps, Video, encoder
 from skyloop.transport.memory import MemoryServer
 from tests.integration.fake_vehicle import PERIOD_S, FakeVehicle
 from tests.recording import files
 from tests.recording.disks import Disk
+from tests.recording.files import read_image
 
 WAIT_S = 10.0
 INTRINSICS = Intrinsics(30.0, 30.0, 16.0, 12.0)
@@ -226,7 +225,7 @@ def test_jpeg_is_kept_as_it_came(fly: Fly, tmp_path: Path) -> None:
     ):
         record = layout.decode(frame.data, FrameRecord)
         assert (record.format, record.header.encoding) == ("jpeg", Encoding.JPEG)
-        assert foxglove.read_image(image.data) == (vehicle.shown(record.header.captured_ns), "jpeg")
+        assert read_image(image.data) == (vehicle.shown(record.header.captured_ns), "jpeg")
 
 
 @pytest.mark.parametrize("encoding", [Encoding.BGR8, Encoding.RGB8, Encoding.MONO8])
@@ -238,7 +237,7 @@ def test_png_loses_nothing(fly: Fly, tmp_path: Path, encoding: Encoding) -> None
         files.of(path, "/alpha/frames/front"), files.of(path, "/alpha/camera/front/image"), strict=True
     ):
         captured_ns = layout.decode(frame.data, FrameRecord).header.captured_ns
-        data, format_ = foxglove.read_image(image.data)
+        data, format_ = read_image(image.data)
         assert format_ == "png"
         shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         expected = picture(captured_ns)[:, :, 0] if encoding is Encoding.MONO8 else picture(captured_ns)

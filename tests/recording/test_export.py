@@ -15,12 +15,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Recording
-from skyloop.recording.review import export, video
-from skyloop.recording.review.export import export_csv, export_npz, export_parquet, read
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Recording
+from skyloop.recording.review import video
 from skyloop.recording.review.report import write_report
-from skyloop.recording.review.tables import Table, tables
+from skyloop.recording.review.tables import Table, export_csv, export_npz, export_parquet, read, tables
 from skyloop.recording.review.video import export_mp4
 from tests.cli.conftest import Ended
 from tests.recording.flights import BEGIN_NS, MS, Plan, write_flight
@@ -200,10 +199,10 @@ def test_where_it_can_not_be_written(flight: Path, tmp_path: Path) -> None:
         export_csv(found, tmp_path)
     (tmp_path / "feedback.parquet").mkdir()
     with pytest.raises(UsageError, match=r"feedback\.parquet can't be written"):
-        export.export_parquet(found, tmp_path)
+        export_parquet(found, tmp_path)
     (tmp_path / "x.npz").mkdir()
     with pytest.raises(UsageError, match=r"x\.npz can't be written: Is a directory"):
-        export.export_npz(found, tmp_path / "x")
+        export_npz(found, tmp_path / "x")
     with pytest.raises(UsageError, match="can't be written: No such file"):
         export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "nowhere" / "x.mp4")
     with pytest.raises(FileFormatError, match="holds none"):

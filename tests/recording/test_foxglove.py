@@ -22,6 +22,7 @@ from skyloop.messages import Annotation, CameraInfo, Feedback, Intrinsics, Sever
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.recording import foxglove
 from tests.messages.samples import CAMERA, SAMPLES
+from tests.recording.files import read_image, read_pose
 
 AT_NS = 1_700_000_000_123_456_789
 angles = st.floats(-math.pi, math.pi)
@@ -56,7 +57,7 @@ def test_a_pose_with_a_position_and_one_without() -> None:
         1_700_000_000,
         123_456_789,
     )
-    assert foxglove.read_pose(message.SerializeToString())[0] == (1.0, 2.0, 3.0)
+    assert read_pose(message.SerializeToString())[0] == (1.0, 2.0, 3.0)
     assert message.pose.orientation.z == pytest.approx(math.sqrt(0.5))
     above = foxglove.pose(Feedback(captured_ns=1, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, altitude_m=1.5))
     assert above is not None
@@ -83,7 +84,7 @@ def test_a_picture_there_and_back() -> None:
     data = foxglove.image("alpha", "front", AT_NS, b"\xff\xd8picture", "jpeg")
     message = CompressedImage.FromString(data)
     assert (message.frame_id, message.format) == ("alpha/front", "jpeg")
-    assert foxglove.read_image(data) == (b"\xff\xd8picture", "jpeg")
+    assert read_image(data) == (b"\xff\xd8picture", "jpeg")
 
 
 @pytest.mark.parametrize(

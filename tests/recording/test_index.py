@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from skyloop.errors import UsageError
-from skyloop.logfile.index import indexed
-from skyloop.logfile.reader import Entry, Recording
-from skyloop.logfile.scan import Scan, scan
+from skyloop.recording.reader import Entry, Recording
+from skyloop.recording.scan import Scan, indexed, scan
 from tests.recording.streams import film, write_film
 
 

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from skyloop.cli import log_tables
-from skyloop.logfile.reader import Recording
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.summary import summarise
 from tests.cli.conftest import Ended
 from tests.recording.flights import Plan, write_flight

@@ -12,7 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import FileFormatError
-from skyloop.logfile.layout import (
+from skyloop.messages import (
+    Annotation,
+    Applied,
+    Capabilities,
+    Feedback,
+    FrameHeader,
+    Parameter,
+    ParameterType,
+    Velocity,
+)
+from skyloop.recording.layout import (
     META_CLOCK,
     TYPES,
     Channel,
@@ -33,16 +43,6 @@ from skyloop.logfile.layout import (
     schema_name,
     to_metadata,
     to_plain,
-)
-from skyloop.messages import (
-    Annotation,
-    Applied,
-    Capabilities,
-    Feedback,
-    FrameHeader,
-    Parameter,
-    ParameterType,
-    Velocity,
 )
 from tests.messages.samples import CAMERA, SAMPLES, TILT
 

@@ -11,7 +11,8 @@ from mcap.writer import Writer
 
 import skyloop
 from skyloop.errors import FileFormatError
-from skyloop.logfile.layout import (
+from skyloop.messages import Feedback
+from skyloop.recording.layout import (
     META_CLOCK,
     META_RECORDING,
     PROFILE,
@@ -23,8 +24,7 @@ from skyloop.logfile.layout import (
     encode,
     to_metadata,
 )
-from skyloop.logfile.reader import Recording
-from skyloop.messages import Feedback
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.tables import tables
 from tests.cli.conftest import Ended
 from tests.recording.flights import Plan, feedback_at

@@ -16,10 +16,10 @@ import pytest
 
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Recording
 from skyloop.messages import Attitude, Feedback
 from skyloop.messages.rows import STATE
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.episodes import Episode, Form, episodes, form_of
 from skyloop.recording.review.lerobot import export_lerobot
 from skyloop.recording.review.tables import Table, tables

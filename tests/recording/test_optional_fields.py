@@ -19,16 +19,26 @@ import pytest
 from skyloop.clock import ManualClock
 from skyloop.cockpit.values import event_values, feedback_values, flat_values, set_point_values
 from skyloop.drivers.recording_sink import RecordingSink
-from skyloop.logfile import layout
-from skyloop.logfile.layout import TYPES, Channel, ClockPair, DroneRecord, Drops, End, FrameRecord, ResultRecord, Start
-from skyloop.logfile.reader import Recording
 from skyloop.messages import AnyAction, Applied, Command, Event, Feedback, LinkState, Sample
 from skyloop.messages.codec import decode, encode
+from skyloop.recording import layout
 from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.layout import (
+    TYPES,
+    Channel,
+    ClockPair,
+    DroneRecord,
+    Drops,
+    End,
+    FrameRecord,
+    ResultRecord,
+    Start,
+)
 from skyloop.recording.output import Message, RecordingFile
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
-from skyloop.recording.review.export import export_csv, export_npz, export_parquet, read
 from skyloop.recording.review.report import write_report
+from skyloop.recording.review.tables import export_csv, export_npz, export_parquet, read
 from skyloop.recording.translation import Picture, Translator
 from skyloop.vehicles.replay.playback import Playback
 from skyloop.vehicles.replay.player import StepPlayer

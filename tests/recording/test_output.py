@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.logfile import layout
-from skyloop.logfile.layout import META_CLOCK, META_END, META_RECORDING, ClockPair, DroneRecord, End, Start
 from skyloop.messages import Feedback
-from skyloop.recording import foxglove
+from skyloop.recording import foxglove, layout
+from skyloop.recording.layout import META_CLOCK, META_END, META_RECORDING, ClockPair, DroneRecord, End, Start
 from skyloop.recording.output import Message, RecordingFile
 from tests.recording import files
 from tests.recording.disks import Disk

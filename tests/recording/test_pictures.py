@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import FileFormatError, MissingExtraError
-from skyloop.logfile.layout import FrameRecord
-from skyloop.logfile.pictures import compressed, decode_image
 from skyloop.messages import Encoding, FrameHeader
+from skyloop.recording.layout import FrameRecord
+from skyloop.recording.pictures import compressed, decode_image
 
 RECORD = FrameRecord(FrameHeader("front", 1, 1, 2, 64, 48, Encoding.BGR8, 64 * 48 * 3), 3, "jpeg")
 

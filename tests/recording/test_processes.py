@@ -15,12 +15,11 @@ import pytest
 
 import skyloop
 from skyloop.errors import LinkError, UsageError
-from skyloop.logfile import layout
-from skyloop.logfile.layout import META_END, ClockPair, End, FrameRecord
 from skyloop.messages import Event, EventKind, Feedback, Severity
-from skyloop.recording import Recorder
-from skyloop.recording.child import RecorderProcess
-from skyloop.recording.status import RecorderState
+from skyloop.recording import Recorder, layout
+from skyloop.recording.layout import META_END, ClockPair, End, FrameRecord
+from skyloop.recording.options import RecorderState
+from skyloop.recording.recorder import RecorderProcess
 from skyloop.transport.backlog import SUPERSEDED
 from tests.processes.conftest import Process
 from tests.recording import files

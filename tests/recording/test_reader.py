@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
-from skyloop.logfile.layout import Channel, image_topic
-from skyloop.logfile.pictures import Picture, decode_image
-from skyloop.logfile.reader import Item, Recording
-from skyloop.logfile.times import Course, reported_ns, shifted
 from skyloop.messages import Encoding, Feedback, LogEntry, Parameter, ParameterType
+from skyloop.recording.layout import Channel, image_topic
+from skyloop.recording.pictures import Picture, decode_image
+from skyloop.recording.plain import Course, reported_ns, shifted
+from skyloop.recording.reader import Item, Recording
 from skyloop.recording.review.tables import tables
 from skyloop.vehicles.replay.source import ReplaySource
 from tests.recording.flights import BEGIN_NS, HEIGHT, MS, UNIX_NS, WIDTH, Plan, feedback_at, picture_at, write_flight

@@ -10,8 +10,8 @@ import pytest
 from mcap.reader import make_reader
 
 from skyloop.errors import UsageError
-from skyloop.logfile.reader import Recording
-from skyloop.recording.review.recover import problems, recover
+from skyloop.recording.reader import Recording
+from skyloop.recording.review.summary import problems, recover
 from tests.cli.conftest import Ended
 from tests.recording.flights import Plan, write_flight
 

@@ -19,10 +19,10 @@ from skyloop.clock import NS_PER_S
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import LinkError, NoAnswerError, UnsupportedError, UsageError
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Recording
 from skyloop.messages import Applied, Event, EventKind, Feedback, Hover, Velocity
 from skyloop.proxy.proxy import Proxy
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
 from skyloop.stepping.replay import SteppedReplay, connector
 from skyloop.transport.memory import MemoryServer

@@ -18,10 +18,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.logfile.reader import Recording
 from skyloop.messages import Feedback
+from skyloop.recording.reader import Recording
+from skyloop.recording.review import charts
 from skyloop.recording.review import flight as facts
-from skyloop.recording.review import keyframes, svg
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.tables import Table
 from tests.cli.conftest import Ended
@@ -162,7 +162,7 @@ def test_names_do_no_harm(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node to check the page's script")
 def test_the_script_is_one(tmp_path: Path) -> None:
-    script = Path(svg.__file__).parent / "static" / "page.js"
+    script = Path(charts.__file__).parent / "static" / "page.js"
     node = shutil.which("node")
     assert node is not None
     subprocess.run([node, "--check", str(script)], check=True, timeout=20)
@@ -173,7 +173,7 @@ def test_the_script_is_one(tmp_path: Path) -> None:
 
 @given(low=st.floats(-1e4, 1e4), span=st.floats(1e-3, 1e4), most=st.integers(2, 12))
 def test_ticks_are_round_and_within(low: float, span: float, most: int) -> None:
-    found = svg.ticks(low, low + span, most)
+    found = charts.ticks(low, low + span, most)
     assert len(found) <= most + 2
     assert all(low - 1e-6 * span <= tick <= low + span * (1 + 1e-6) for tick in found)
     steps = {round(b - a, 9) for a, b in pairwise(found)}
@@ -185,7 +185,7 @@ def test_ticks_are_round_and_within(low: float, span: float, most: int) -> None:
 @given(st.lists(st.floats(-1e3, 1e3) | st.just(math.nan), min_size=1, max_size=400), st.integers(2, 50))
 def test_thinning_keeps_the_extremes(values: list[float], buckets: int) -> None:
     numbers = np.array(values)
-    t_s, thin = svg.thin(np.arange(len(numbers), dtype=float), numbers, buckets)
+    t_s, thin = charts.thin(np.arange(len(numbers), dtype=float), numbers, buckets)
     assert len(t_s) == len(thin) <= max(2 * buckets, len(numbers) if len(numbers) <= 2 * buckets else 0)
     assert np.all(np.diff(t_s) > 0)
     if np.isfinite(numbers).any():
@@ -196,16 +196,16 @@ def test_thinning_keeps_the_extremes(values: list[float], buckets: int) -> None:
 def test_lines_have_gaps_where_nothing_is_known() -> None:
     t_s = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 5.0, 5.1])
     values = np.array([1.0, 2.0, math.nan, 3.0, 4.0, 5.0, 6.0])
-    assert [part[1].tolist() for part in svg.pieces(t_s, values)] == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]
-    assert svg.pieces(np.zeros(0), np.zeros(0)) == []
+    assert [part[1].tolist() for part in charts.pieces(t_s, values)] == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]
+    assert charts.pieces(np.zeros(0), np.zeros(0)) == []
 
 
 def test_limits() -> None:
-    line = svg.Line("x", np.arange(3.0), np.array([2.0, 3.0, math.nan]))
-    low, high = svg.limits([line], least_span=4.0)
+    line = charts.Line("x", np.arange(3.0), np.array([2.0, 3.0, math.nan]))
+    low, high = charts.limits([line], least_span=4.0)
     assert (low, high) == pytest.approx((0.26, 4.74))
-    assert svg.limits([line], least_span=4.0, zero=True) == pytest.approx((0.0, 4.24))
-    assert svg.limits([], least_span=1.0) == (0.0, 1.0)
+    assert charts.limits([line], least_span=4.0, zero=True) == pytest.approx((0.0, 4.24))
+    assert charts.limits([], least_span=1.0) == (0.0, 1.0)
 
 
 def test_key_frames_are_at_events_and_in_between() -> None:
@@ -218,7 +218,7 @@ def test_key_frames_are_at_events_and_in_between() -> None:
             "text": np.array(["took off", "touched a chair", "hello"]),
         },
     )
-    chosen = keyframes.moments(0.0, 10.0, events, 6)
+    chosen = facts.moments(0.0, 10.0, events, 6)
     assert [(round(t, 1), why) for t, why in chosen] == [
         (0.0, ""),
         (1.0, "took off"),
@@ -227,8 +227,8 @@ def test_key_frames_are_at_events_and_in_between() -> None:
         (6.0, ""),
         (8.0, ""),
     ]
-    assert keyframes.moments(0.0, 10.0, None, 3) == [(0.0, ""), (5.0, ""), (10.0, "")]
-    assert keyframes.moments(0.0, 10.0, events, 0) == []
+    assert facts.moments(0.0, 10.0, None, 3) == [(0.0, ""), (5.0, ""), (10.0, "")]
+    assert facts.moments(0.0, 10.0, events, 0) == []
 
 
 def test_the_way_without_a_position() -> None:
@@ -259,5 +259,5 @@ def test_without_a_picture_decoder_thumbnails_are_as_recorded(flight: Path, monk
 
     picture = next(Recording.open(flight).pictures("alpha", "front"))
     monkeypatch.setitem(sys.modules, "cv2", None)
-    data, form = keyframes.thumbnail(picture)
+    data, form = facts.thumbnail(picture)
     assert (data[:2], form) == (b"\xff\xd8", "jpeg")

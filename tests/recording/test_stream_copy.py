@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from skyloop.drivers.h264 import START, unit_type, units
 from skyloop.errors import FileFormatError, UsageError
-from skyloop.logfile.reader import Recording
-from skyloop.recording.review import stream_copy
-from skyloop.recording.review.stream_copy import contents, numbered
-from skyloop.recording.review.video import Videos, export_mp4
+from skyloop.recording.reader import Recording
+from skyloop.recording.review import video as copying
+from skyloop.recording.review.video import Videos, contents, export_mp4, numbered
 from tests.cli.conftest import Ended
 from tests.recording.streams import GROUP, STEP_NS, Unit, film, write_film
 
@@ -166,7 +165,7 @@ def test_parameters_that_come_back_the_same_begin_no_file(tmp_path: Path) -> Non
 def test_a_stream_that_changes_too_often_is_refused_without_any_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream_copy, "MAX_FILES", 2)
+    monkeypatch.setattr(copying, "MAX_FILES", 2)
     with pytest.raises(FileFormatError, match="front can't be copied: the stream changes more than 2 times"):
         exported(tmp_path, changing())
     assert {path.name for path in tmp_path.iterdir()} == {"flight.mcap"}

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.logfile.layout import ClockPair, DroneRecord, FrameRecord, to_plain
-from skyloop.logfile.reader import Recording
 from skyloop.messages import EncodedFrame
 from skyloop.recording.backlog import Backlog, Item, Rank
+from skyloop.recording.layout import ClockPair, DroneRecord, FrameRecord, to_plain
 from skyloop.recording.options import MB, Options
+from skyloop.recording.reader import Recording
 from skyloop.recording.taps import Stream
 from skyloop.recording.translation import Picture, Translator
 from skyloop.recording.writer import FileWriter

@@ -7,8 +7,6 @@ import math
 import msgspec
 import numpy as np
 
-from skyloop.logfile import layout
-from skyloop.logfile.layout import Channel, ClockPair, FrameRecord, ResultRecord
 from skyloop.messages import (
     CameraInfo,
     Capabilities,
@@ -22,7 +20,9 @@ from skyloop.messages import (
 )
 from skyloop.messages import ParameterType as Type
 from skyloop.messages.payload import pack
+from skyloop.recording import layout
 from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.layout import Channel, ClockPair, FrameRecord, ResultRecord
 from skyloop.recording.output import Message
 from skyloop.recording.translation import Path, Picture, Translator
 from tests.messages.samples import CAMERA

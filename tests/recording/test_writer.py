@@ -12,8 +12,6 @@ import pytest
 
 from skyloop.clock import NS_PER_S
 from skyloop.errors import UsageError
-from skyloop.logfile import layout
-from skyloop.logfile.layout import META_END, META_RECORDING, ClockPair, DroneRecord, End, FrameRecord, Start
 from skyloop.messages import (
     Applied,
     Capabilities,
@@ -25,9 +23,10 @@ from skyloop.messages import (
     ParameterType,
     Severity,
 )
+from skyloop.recording import layout
 from skyloop.recording.backlog import Backlog, Item, Rank
-from skyloop.recording.options import MB, Options
-from skyloop.recording.status import Room, judge_room
+from skyloop.recording.layout import META_END, META_RECORDING, ClockPair, DroneRecord, End, FrameRecord, Start
+from skyloop.recording.options import MB, Options, Room, judge_room
 from skyloop.recording.translation import Picture, Translator
 from skyloop.recording.writer import FileWriter
 from tests.recording import files

@@ -27,17 +27,15 @@ from skyloop import pyav
 from skyloop.cli import main
 from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import FileFormatError, SkyloopError
-from skyloop.logfile import scan
-from skyloop.logfile.h264 import Group
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.listing import describe
-from skyloop.logfile.pictures import Picture, decode_image
-from skyloop.logfile.reader import Recording
 from skyloop.messages.image_header import MAX_PIXELS, MAX_SCANS, image_size, why_not_decoded
-from skyloop.recording.review.export import export_csv, export_npz, read
-from skyloop.recording.review.recover import recover
+from skyloop.recording import scan
+from skyloop.recording.layout import Channel
+from skyloop.recording.listing import describe
+from skyloop.recording.pictures import Group, Picture, decode_image
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.report import write_report
-from skyloop.recording.review.summary import summarise
+from skyloop.recording.review.summary import recover, summarise
+from skyloop.recording.review.tables import export_csv, export_npz, read
 from skyloop.vehicles.replay.source import ReplaySource
 from tests.cli.conftest import Ended
 from tests.recording.flights import Plan, write_flight
@@ -124,7 +122,7 @@ BOMBS = [zstd_zeros, zstd_that_lies, zstd_without_size, lz4_zeros, empty_records
 # In a process of its own: memory is the greatest that it ever had.
 _LOOK = """
 import resource, sys, time
-from skyloop.logfile.reader import Recording
+from skyloop.recording.reader import Recording
 for path in sys.argv[1:]:
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     recording = Recording.open(path)

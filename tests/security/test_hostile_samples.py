@@ -23,7 +23,6 @@ from skyloop.client import Drone
 from skyloop.cockpit.feeds import WAYPOINTS, LogFeed, drawing_values
 from skyloop.cockpit.values import event_values, feedback_values, flat_values, mocap_values, motion_values
 from skyloop.errors import DecodeError, UsageError
-from skyloop.logfile.layout import ClockPair
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -47,6 +46,7 @@ from skyloop.messages.numbers import LATEST_NS
 from skyloop.messages.payload import ARRAY, MAX_DEPTH, pack, unpack
 from skyloop.messages.video import FrameFilter
 from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.layout import ClockPair
 from skyloop.recording.translation import Translator
 from tests.messages.samples import SAMPLES
 

@@ -17,8 +17,8 @@ from skyloop.cli.text import console
 from skyloop.errors import FileFormatError, UsageError
 
 if TYPE_CHECKING:
-    from skyloop.logfile.layout import Channel
-    from skyloop.logfile.reader import Recording
+    from skyloop.recording.layout import Channel
+    from skyloop.recording.reader import Recording
 
 log = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -85,7 +85,7 @@ def list_recordings(
     import msgspec
 
     from skyloop.cli import log_tables
-    from skyloop.logfile.listing import ENDING, describe, shown_name
+    from skyloop.recording.listing import ENDING, describe, shown_name
 
     try:
         paths = sorted(path for path in folder.iterdir() if path.suffix == ENDING)
@@ -153,7 +153,7 @@ def export(
     that Rerun's viewer opens, of all drones.
     """
     from skyloop.cli import log_tables
-    from skyloop.recording.review import export as ways
+    from skyloop.recording.review import tables as ways
     from skyloop.recording.review.video import export_mp4
 
     if to is Form.LEROBOT:
@@ -227,7 +227,7 @@ def compare(
     else:
         console().print(log_tables.comparison(found, str(old), str(new)))
     if output is not None:
-        from skyloop.recording.review.compare_page import write_comparison
+        from skyloop.recording.review.compare import write_comparison
 
         write_comparison(found, str(old), str(new), output)
         _print(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
@@ -243,7 +243,7 @@ def recover(
 ) -> None:
     """Write what can be read of a cut or damaged recording to a new file, with its index; the old one is left alone."""
     from skyloop.cli import log_tables
-    from skyloop.recording.review import recover as mending
+    from skyloop.recording.review import summary as mending
 
     recording = _open(file)
     with _progress("looking") as progress:
@@ -297,7 +297,7 @@ def _export_lerobot(
 
 
 def _export_rrd(recording: Recording, target: Path, drone: str | None) -> None:
-    from skyloop.recording.review.rrd import export_rrd
+    from skyloop.recording.rerun_viewer import export_rrd
 
     with _progress("exporting") as progress:
         found = export_rrd(recording, target, drone=drone, progress=progress)
@@ -309,7 +309,7 @@ def _export_rrd(recording: Recording, target: Path, drone: str | None) -> None:
 
 
 def _open(file: Path) -> Recording:
-    from skyloop.logfile.reader import Recording
+    from skyloop.recording.reader import Recording
 
     return Recording.open(file)
 
@@ -323,7 +323,7 @@ def _first_camera(recording: Recording, drone: str) -> str:
 
 def _channels(names: list[str] | None) -> list[Channel] | None:
     from skyloop.errors import UnknownNameError
-    from skyloop.logfile.layout import Channel
+    from skyloop.recording.layout import Channel
 
     known = {channel.value for channel in Channel}
     for name in names or ():

@@ -18,7 +18,7 @@ from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.recording.live.view import Screen, View
+    from skyloop.recording.view import Screen, View
 
 _LOOK_S: Final = 0.5
 
@@ -62,7 +62,7 @@ def view(
         signal.signal(signal.SIGTERM, _interrupt)
     with ExitStack() as stack, suppress(KeyboardInterrupt):  # how it is meant to end
         from skyloop.client import connect as connect_to
-        from skyloop.recording.live.view import View, give_way
+        from skyloop.recording.view import View, give_way
 
         give_way()
         known = [stack.enter_context(connect_to(name, access="observe", name="skyloop view")) for name in chosen]
@@ -75,7 +75,7 @@ def view(
 
 
 def _foxglove(known: Sequence[Drone], host: str, port: int | None, priority: int | None) -> Screen:
-    from skyloop.recording.live.foxglove_server import PORT, FoxgloveServer, is_loopback
+    from skyloop.recording.foxglove_server import PORT, FoxgloveServer, is_loopback
 
     server = FoxgloveServer(known, host=host, port=PORT if port is None else port, priority=priority)
     typer.echo(f"In Foxglove: Open connection, Foxglove WebSocket, {server.url}")
@@ -85,7 +85,7 @@ def _foxglove(known: Sequence[Drone], host: str, port: int | None, priority: int
 
 
 def _rerun(known: Sequence[Drone], host: str, port: int | None, connect: str | None, save: Path | None) -> Screen:
-    from skyloop.recording.live.rerun_viewer import RerunViewer
+    from skyloop.recording.rerun_viewer import RerunViewer
 
     viewer = RerunViewer(known, host=host, port=port, connect=connect, save=save)
     typer.echo(f"Rerun: {viewer.target}")

@@ -18,8 +18,8 @@ import msgspec
 
 from skyloop import files
 from skyloop.errors import RefusedError, UnknownNameError, UsageError
-from skyloop.logfile.listing import ENDING
 from skyloop.messages import Refusal
+from skyloop.recording.listing import ENDING
 
 TRASH: Final = "trash"
 NOTES_ENDING: Final = ".notes.json"

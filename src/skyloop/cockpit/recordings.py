@@ -21,8 +21,8 @@ from skyloop.cockpit.recorders import Recorder, Replay, Running, progress, start
 from skyloop.cockpit.recording_files import Mark, Notes
 from skyloop.cockpit.reports import Reports
 from skyloop.errors import FileFormatError, RefusedError, UnknownNameError, UsageError
-from skyloop.logfile.listing import ENDING, Described, describe, shown_name
 from skyloop.messages import Refusal
+from skyloop.recording.listing import ENDING, Described, describe, shown_name
 
 if TYPE_CHECKING:
     from skyloop.client import Drone

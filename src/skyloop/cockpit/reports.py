@@ -22,7 +22,7 @@ from skyloop.errors import LinkError, RefusedError, SkyloopError, UsageError
 from skyloop.messages import Refusal
 
 if TYPE_CHECKING:
-    from skyloop.logfile.reader import Recording
+    from skyloop.recording.reader import Recording
 
 REPORT_S: Final = 120.0  #: for one report, before the next one has its turn
 MAX_WAITING: Final = 4  #: who comes later would wait for minutes
@@ -119,7 +119,7 @@ def run_child(arguments: Sequence[str], make: Callable[[Recording, str, Path], N
     """
     os.nice(NICENESS)
     on_parent_end(partial(os._exit, 1))
-    from skyloop.logfile.reader import Recording
+    from skyloop.recording.reader import Recording
 
     file, target, *drone = arguments
     try:

@@ -16,12 +16,12 @@ import msgspec
 from skyloop.clock import seconds
 from skyloop.cockpit.reports import run_child
 from skyloop.cockpit.values import flat_values, truth_values, vector
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.times import Course
 from skyloop.messages import Event, EventKind, Feedback, LogEntry, Severity
+from skyloop.recording.layout import Channel
+from skyloop.recording.plain import Course
 
 if TYPE_CHECKING:
-    from skyloop.logfile.reader import Recording
+    from skyloop.recording.reader import Recording
 
 MARK: Final = "mark"  #: name of a logged text that is a mark
 MAX_EVENTS: Final = 300  #: the most severe ones

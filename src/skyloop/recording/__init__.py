@@ -6,13 +6,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from skyloop.recording.options import RecorderState, Status
     from skyloop.recording.recorder import Recorder, record
-    from skyloop.recording.status import RecorderState, Status
 
 _HOMES = {
     "Recorder": "skyloop.recording.recorder",
-    "RecorderState": "skyloop.recording.status",
-    "Status": "skyloop.recording.status",
+    "RecorderState": "skyloop.recording.options",
+    "Status": "skyloop.recording.options",
     "record": "skyloop.recording.recorder",
 }
 

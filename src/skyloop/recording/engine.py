@@ -10,11 +10,10 @@ from typing import Any, Final
 from skyloop.child_process import leave_to_parent
 from skyloop.client import Drone
 from skyloop.errors import UsageError
-from skyloop.logfile.layout import ClockPair, DroneRecord, to_plain
 from skyloop.messages import Severity
 from skyloop.recording.backlog import Backlog
-from skyloop.recording.options import MB, Options
-from skyloop.recording.status import RecorderEvent, Status
+from skyloop.recording.layout import ClockPair, DroneRecord, to_plain
+from skyloop.recording.options import MB, Options, RecorderEvent, Status
 from skyloop.recording.taps import Tap
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter

@@ -1,6 +1,6 @@
 """Messages for viewers, in Foxglove's public protobuf schemas: images, calibrations, poses, drawings, texts.
 
-Pure. Needs the extra ``record``. Times are Unix ns; frames are named as in :mod:`skyloop.logfile.layout`.
+Pure. Needs the extra ``record``. Times are Unix ns; frames are named as in :mod:`skyloop.recording.layout`.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import MissingExtraError
-from skyloop.logfile.layout import WORLD, optical_frame
 from skyloop.messages import Annotation, CameraInfo, Feedback, Intrinsics, Points, Polyline, Severity
 from skyloop.messages.annotation import Colour, Point, Shape, Text
 from skyloop.messages.encoded import H264
 from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.recording.layout import WORLD, optical_frame
 
 try:
     from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -253,30 +253,6 @@ def _colour(colour: Colour) -> Color:
 
 
 def log(drone: str, at_ns: int, severity: Severity, text: str, source: str) -> bytes:
-    """Encode a line of text.
-
-    Args:
-        drone: The drone's name.
-        at_ns: Unix time.
-        severity: Becomes the level.
-        text: The line.
-        source: Who wrote it.
-    """
+    """Encode a line of text."""
     message = Log(timestamp=timestamp(at_ns), level=_LEVELS[severity], message=text, name=drone, file=source)
     return message.SerializeToString()
-
-
-# Decoding ------------------------------------------------------------------------------------------------------
-
-
-def read_image(data: bytes | memoryview) -> tuple[bytes, str]:
-    """Decode an image: its bytes and their format."""
-    message = CompressedImage.FromString(bytes(data))
-    return message.data, message.format
-
-
-def read_pose(data: bytes) -> tuple[Vector, tuple[float, float, float, float]]:
-    """Decode a pose in the world: position [m] and quaternion (x, y, z, w)."""
-    place: Any = PoseInFrame.FromString(data).pose
-    at, turned = place.position, place.orientation
-    return (at.x, at.y, at.z), (turned.x, turned.y, turned.z, turned.w)

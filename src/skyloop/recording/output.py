@@ -12,8 +12,8 @@ from typing import IO, TYPE_CHECKING, Any, Final, Protocol, cast
 import msgspec
 
 from skyloop.errors import MissingExtraError
-from skyloop.logfile import layout
-from skyloop.logfile.layout import META_CLOCK, META_END, META_RECORDING, PROFILE, ClockPair, End, Start, to_metadata
+from skyloop.recording import layout
+from skyloop.recording.layout import META_CLOCK, META_END, META_RECORDING, PROFILE, ClockPair, End, Start, to_metadata
 from skyloop.recording.options import MB
 
 if TYPE_CHECKING:

@@ -23,7 +23,6 @@ from typing import Any, Final
 import numpy as np
 
 from skyloop.errors import LinkError, MissingExtraError, UsageError
-from skyloop.logfile.layout import FrameRecord
 from skyloop.messages import (
     ACTION_NAMES,
     Annotation,
@@ -42,6 +41,7 @@ from skyloop.messages.annotation import Text
 from skyloop.messages.command import SET_POINTS
 from skyloop.messages.encoded import H264
 from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.recording.layout import FrameRecord
 from skyloop.recording.translation import Path as Trail
 
 TIMELINE: Final = "capture"

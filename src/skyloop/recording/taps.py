@@ -18,7 +18,6 @@ from skyloop.client.mailbox import Mailbox
 from skyloop.clock import nanoseconds
 from skyloop.errors import MissingExtraError, SkyloopError
 from skyloop.extend import Known, stream_channel, video_channel
-from skyloop.logfile.layout import Channel, Drops, FrameRecord
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -35,6 +34,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Backlog, Item, Rank
+from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import VIDEO, Options
 from skyloop.recording.translation import Picture
 

@@ -8,8 +8,6 @@ from typing import Any, Final
 import numpy as np
 
 from skyloop.errors import DecodeError
-from skyloop.logfile import layout
-from skyloop.logfile.layout import Channel, ClockPair, Drops, FrameRecord, ResultRecord, Topic
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -26,8 +24,9 @@ from skyloop.messages import (
 from skyloop.messages.encoded import H264
 from skyloop.messages.log import MOCAP
 from skyloop.messages.payload import unpack
-from skyloop.recording import foxglove
+from skyloop.recording import foxglove, layout
 from skyloop.recording.backlog import Item
+from skyloop.recording.layout import Channel, ClockPair, Drops, FrameRecord, ResultRecord, Topic
 from skyloop.recording.output import Message
 
 _SEQUENCES: Final = 1 << 32

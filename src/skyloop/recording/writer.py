@@ -15,13 +15,12 @@ import msgspec
 
 from skyloop.clock import nanoseconds
 from skyloop.errors import UsageError
-from skyloop.logfile.layout import VERSION, ClockPair, DroneRecord, End, Start
 from skyloop.messages import Severity
 from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Backlog, Item, Rank
-from skyloop.recording.options import MB, Options, numbered
+from skyloop.recording.layout import VERSION, ClockPair, DroneRecord, End, Start
+from skyloop.recording.options import MB, Options, RecorderState, Room, judge_room, numbered
 from skyloop.recording.output import CHUNK, Message, Opener, RecordingFile, open_target
-from skyloop.recording.status import RecorderState, Room, judge_room
 from skyloop.recording.translation import Picture, Translator
 
 BEAT_S: Final = 0.05  #: period of polling the backlog, so that receiving threads need not wake the writer

@@ -16,18 +16,17 @@ import pytest
 from skyloop.client import Drone
 from skyloop.drivers.base import Sink
 from skyloop.errors import LinkError, MissingExtraError, UsageError
-from skyloop.logfile import layout
-from skyloop.logfile.layout import FrameRecord
 from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Polyline
 from skyloop.recording import foxglove as schemas
-from skyloop.recording import taps
+from skyloop.recording import layout, taps
+from skyloop.recording import parameters as module
 from skyloop.recording.backlog import Item, Rank
-from skyloop.recording.live import parameters as module
-from skyloop.recording.live.origin_door import MAX_HEAD, OriginDoor, hidden_host
-from skyloop.recording.live.parameters import ParameterDesk
+from skyloop.recording.foxglove_access import MAX_HEAD, OriginDoor, ParameterDesk, hidden_host
+from skyloop.recording.layout import FrameRecord
 from skyloop.recording.translation import Picture
 from tests.integration.fake_vehicle import PERIOD_S, FakeVehicle
 from tests.integration.test_fabric import Node, far
+from tests.recording.files import read_image
 from tests.recording.live.conftest import WAIT_S, Fly
 from tests.recording.live.viewer import Viewer
 from tests.recording.streams import film
@@ -36,8 +35,8 @@ pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: skyloop i
 
 import itertools
 
-from skyloop.recording.live.foxglove_server import WAITING, FoxgloveServer
-from skyloop.recording.live.view import View
+from skyloop.recording.foxglove_server import WAITING, FoxgloveServer
+from skyloop.recording.view import View
 
 __all__ = ["far"]
 Show = Callable[..., tuple[View, FoxgloveServer]]
@@ -130,7 +129,7 @@ def test_messages_are_those_of_a_recording(fly: Fly, show: Show) -> None:
         assert viewer.topics[IMAGE]["schemaName"] == "foxglove.CompressedImage"
         sample = layout.decode(viewer.of(own)[0], Feedback)
         assert sample.position_m is not None
-        data, form = schemas.read_image(viewer.of(IMAGE)[0])
+        data, form = read_image(viewer.of(IMAGE)[0])
         assert (form, data[:2]) == ("jpeg", b"\xff\xd8")
         assert schemas.CameraCalibration.FromString(viewer.of(calibration)[0]).K[0] == 30.0
         assert schemas.Log.FromString(viewer.of("/log")[0]).message == "found it"

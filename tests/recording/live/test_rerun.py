@@ -19,8 +19,6 @@ import pytest
 
 import skyloop
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
-from skyloop.logfile.layout import FrameRecord
-from skyloop.logfile.reader import Recording
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -35,14 +33,14 @@ from skyloop.messages import (
 )
 from skyloop.messages.annotation import Text
 from skyloop.messages.encoded import H264
-from skyloop.recording import rerun_log
+from skyloop.recording import rerun_log, rerun_viewer
 from skyloop.recording.backlog import Item, Rank
-from skyloop.recording.live import rerun_viewer
-from skyloop.recording.live.rerun_viewer import RerunViewer
-from skyloop.recording.live.view import View
+from skyloop.recording.layout import FrameRecord
+from skyloop.recording.reader import Recording
 from skyloop.recording.rerun_log import RerunLog, Shown
-from skyloop.recording.review.rrd import export_rrd
+from skyloop.recording.rerun_viewer import RerunViewer, export_rrd
 from skyloop.recording.translation import Picture
+from skyloop.recording.view import View
 from tests.cli.conftest import Ended
 from tests.recording.flights import CAPABILITIES, MS, UNIX_NS
 from tests.recording.live import fake_rerun

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 from skyloop.files import replacing
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Recording
 from skyloop.pyav import require_pyav
-from skyloop.recording.review.episodes import Episode, Form, episodes, form_of
-from skyloop.recording.review.film import Film, numbers_stats
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Recording
+from skyloop.recording.review.episodes import Episode, Film, Form, episodes, form_of, numbers_stats
 from skyloop.recording.review.tables import tables
 
 VERSION: Final = "v3.0"

@@ -11,14 +11,13 @@ from typing import Final
 import numpy as np
 
 from skyloop.clock import NS_PER_S
-from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Progress, Recording
 from skyloop.messages import FlightState
+from skyloop.recording.layout import Channel
+from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review import flight
-from skyloop.recording.review.keyframes import figures
-from skyloop.recording.review.page import Page, facts, table
+from skyloop.recording.review.charts import Floats, Line, Page, TimeAxis, band_chart, facts, limits, map_chart, table
+from skyloop.recording.review.flight import figures
 from skyloop.recording.review.summary import Summary, summarise
-from skyloop.recording.review.svg import Floats, Line, TimeAxis, band_chart, limits, map_chart
 from skyloop.recording.review.tables import Table, tables
 
 _TABLES: Final = (Channel.FEEDBACK, Channel.COMMANDS, Channel.EVENTS, Channel.FRAMES, Channel.LOGS)
@@ -109,7 +108,7 @@ def _losses(summary: Summary, drone: str) -> Iterator[str]:
 
 
 def _path(page: Page, feedback: Table, way: flight.Way) -> None:
-    page.way(way)
+    page.way(way.t_s, way.x, way.y)
     t_s = feedback.numbers("t_s")
     high = Line("altitude", t_s, feedback.numbers("altitude_m"))
     page.add(

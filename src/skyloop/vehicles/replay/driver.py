@@ -10,8 +10,6 @@ from skyloop.clock import Clock
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError, UsageError
-from skyloop.logfile.layout import DroneRecord
-from skyloop.logfile.reader import Recording
 from skyloop.messages import (
     AnyAction,
     Capabilities,
@@ -23,6 +21,8 @@ from skyloop.messages import (
     Severity,
     Value,
 )
+from skyloop.recording.layout import DroneRecord
+from skyloop.recording.reader import Recording
 from skyloop.vehicles.replay.options import options_of
 from skyloop.vehicles.replay.playback import NAMES, Playback
 from skyloop.vehicles.replay.player import Player, StepPlayer

@@ -11,7 +11,6 @@ import msgspec
 from skyloop.clock import Clock, seconds
 from skyloop.drivers.base import Sink
 from skyloop.errors import SkyloopError
-from skyloop.logfile.pictures import Picture
 from skyloop.messages import (
     AnyAction,
     Applied,
@@ -23,6 +22,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
+from skyloop.recording.pictures import Picture
 from skyloop.vehicles.replay.playback import PAUSED, POSITION, SPEED, Playback
 from skyloop.vehicles.replay.source import Moment, TimedSample, Timeline
 

@@ -11,11 +11,11 @@ from itertools import chain, takewhile
 from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.logfile.layout import Channel, DroneRecord
-from skyloop.logfile.pictures import Picture
-from skyloop.logfile.reader import Item, Recording
-from skyloop.logfile.times import Course, shifted
 from skyloop.messages import Applied, CameraInfo, Capabilities, Encoding, Event, Feedback, Parameter
+from skyloop.recording.layout import Channel, DroneRecord
+from skyloop.recording.pictures import Picture
+from skyloop.recording.plain import Course, shifted
+from skyloop.recording.reader import Item, Recording
 
 #: What is replayed. Annotations and logs are an application's own: it makes new ones.
 CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)

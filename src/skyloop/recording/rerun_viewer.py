@@ -1,4 +1,4 @@
-"""Rerun as a screen: its viewer, which is started or runs already, or a file."""
+"""Rerun as a screen: its viewer, which is started or runs already, or a file; and a recording as a file for it."""
 
 from __future__ import annotations
 
@@ -11,19 +11,22 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from skyloop.client import Drone
 from skyloop.clock import nanoseconds
-from skyloop.errors import LinkError, NoAnswerError, SkyloopError
-from skyloop.logfile.layout import ClockPair, FrameRecord
+from skyloop.errors import FileFormatError, LinkError, NoAnswerError, SkyloopError
 from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Item
-from skyloop.recording.live.view import Source, check_names
+from skyloop.recording.layout import Channel, ClockPair, DroneRecord, FrameRecord
 from skyloop.recording.options import MB, VIDEO
+from skyloop.recording.pictures import Picture as RecordedPicture
+from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.rerun_log import RerunLog, Shown, rerun_sdk
 from skyloop.recording.translation import Picture
+from skyloop.recording.view import Source, check_names
 
 PORT: Final = 9876  #: of Rerun's viewer
 _START_S: Final = 20.0
@@ -38,7 +41,7 @@ _log = logging.getLogger(__name__)
 
 
 class RerunViewer:
-    """A :class:`skyloop.recording.live.view.Screen` of everything: Rerun does not say what is looked at."""
+    """A :class:`skyloop.recording.view.Screen` of everything: Rerun does not say what is looked at."""
 
     def __init__(
         self,
@@ -131,7 +134,7 @@ class RerunViewer:
         return chain.follows(record.header.seq, key=record.key)
 
 
-def _unix(clock: ClockPair, drone: Drone) -> Callable[[int], int]:
+def _unix(clock: ClockPair, drone: Drone | DroneRecord) -> Callable[[int], int]:
     return lambda proxy_ns: clock.unix(proxy_ns, drone.clock_offset_ns)
 
 
@@ -172,3 +175,73 @@ def _free_port(host: str) -> int:
             return int(free.getsockname()[1])
     except OSError as error:
         raise LinkError(f"can't listen on {host}: {error}") from None
+
+
+# A file ---------------------------------------------------------------------------------------------------------
+
+
+_CHANNELS: Final = (
+    Channel.FEEDBACK,
+    Channel.COMMANDS,
+    Channel.EVENTS,
+    Channel.ANNOTATIONS,
+    Channel.LOGS,
+    Channel.FRAMES,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """What an export wrote."""
+
+    drones: tuple[str, ...]
+    samples: int
+    pictures: int
+    left_out: int  #: pictures that can't be decoded, or are damaged
+
+
+def export_rrd(
+    recording: Recording, path: Path, *, drone: str | None = None, progress: Progress | None = None
+) -> Exported:
+    """Write a recording for Rerun.
+
+    Args:
+        recording: The recording.
+        path: The file; an existing one is replaced.
+        drone: The only one to export; None: all of them.
+        progress: Called with the share that was read, 0 to 1.
+
+    Raises:
+        UnknownNameError: The recording has no such drone.
+        UsageError: The file can't be written.
+        FileFormatError: The recording has no drone.
+        MissingExtraError: The extra ``[rerun]`` is not installed.
+    """
+    chosen = [recording.drone(drone)] if drone is not None or not recording.drones else list(recording.drones)
+    shown = [Shown(each.name, each.described, _unix(recording.clock, each)) for each in chosen]
+    log = RerunLog(shown, f"{recording.path.stem}-{recording.start.started_unix_ns}")
+    log.save(path)
+    samples = pictures = left_out = 0
+    for number, each in enumerate(chosen):
+        first = number / len(chosen)
+        report = None if progress is None else _part_of(progress, first, len(chosen))
+        for item in recording.items_and_pictures(each.name, _CHANNELS, report):
+            if not isinstance(item, RecordedPicture):
+                log.add(number, item.value)
+                samples += 1
+                continue
+            try:
+                data = item.compressed if item.can_be_decoded else None
+            except FileFormatError:
+                data = None
+            if data is None:
+                left_out += 1
+            else:
+                log.add_picture(number, item.record, data)
+                pictures += 1
+    log.close()
+    return Exported(tuple(each.name for each in chosen), samples, pictures, left_out)
+
+
+def _part_of(progress: Progress, first: float, parts: int) -> Progress:
+    return lambda share: progress(first + share / parts)

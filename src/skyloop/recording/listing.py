@@ -31,7 +31,7 @@ def shown_name(path: Path) -> str:
 def describe(path: Path) -> Described:
     """Describe a file without unpacking anything. Never raises because of what is in it."""
     try:
-        from skyloop.logfile.reader import Recording
+        from skyloop.recording.reader import Recording
 
         recording = Recording.open(path)
         return Described(

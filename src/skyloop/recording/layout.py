@@ -18,7 +18,6 @@ import msgspec
 from msgspec import inspect
 
 from skyloop.errors import FileFormatError
-from skyloop.logfile.plain import decode, encode, from_json, from_plain, limited, schema, schema_name, to_plain
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -29,6 +28,7 @@ from skyloop.messages import (
     LogEntry,
     Parameter,
 )
+from skyloop.recording.plain import decode, encode, from_json, from_plain, limited, schema, schema_name, to_plain
 
 __all__ = [
     "Channel",

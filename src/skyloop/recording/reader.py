@@ -14,9 +14,8 @@ from typing import IO, Any, TypeGuard
 
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, UnknownNameError
-from skyloop.logfile.h264 import Groups
-from skyloop.logfile.index import indexed
-from skyloop.logfile.layout import (
+from skyloop.messages.encoded import H264
+from skyloop.recording.layout import (
     META_CLOCK,
     META_END,
     META_RECORDING,
@@ -35,9 +34,19 @@ from skyloop.logfile.layout import (
     parse_topic,
     video_topic,
 )
-from skyloop.logfile.pictures import Picture, compressed
-from skyloop.logfile.scan import MAX_TIME_NS, Message, Piece, Scan, find_channels, note, open_file, records, scan
-from skyloop.messages.encoded import H264
+from skyloop.recording.pictures import Groups, Picture, compressed
+from skyloop.recording.scan import (
+    MAX_TIME_NS,
+    Message,
+    Piece,
+    Scan,
+    find_channels,
+    indexed,
+    note,
+    open_file,
+    records,
+    scan,
+)
 
 #: Called with the share of a file that has been read, from 0 to 1.
 Progress = Callable[[float], object]
@@ -56,7 +65,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One sample of a drone. ``value`` is of the channel's type in ``skyloop.logfile.layout.TYPES``."""
+    """One sample of a drone. ``value`` is of the channel's type in ``skyloop.recording.layout.TYPES``."""
 
     channel: Channel
     camera: str  #: of frames; else empty

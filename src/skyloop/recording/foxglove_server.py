@@ -11,24 +11,25 @@ import ipaddress
 import logging
 import threading
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from time import monotonic_ns
 from typing import Any, Final
 
 from skyloop.client import Drone
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UsageError
 from skyloop.extend import Known
-from skyloop.logfile.layout import ClockPair
-from skyloop.messages import Value
+from skyloop.messages import CameraInfo, Capabilities, Value
 from skyloop.messages.encoded import H264, Chain
+from skyloop.recording import foxglove, layout
 from skyloop.recording.backlog import Item
 from skyloop.recording.foxglove import CompressedVideo
-from skyloop.recording.live.origin_door import OriginDoor, hidden_host
-from skyloop.recording.live.parameters import ParameterDesk, Written
-from skyloop.recording.live.topics import ViewTopic, topics
-from skyloop.recording.live.view import Source, check_names
+from skyloop.recording.foxglove_access import OriginDoor, ParameterDesk, Written, hidden_host
+from skyloop.recording.layout import Channel, ClockPair, FrameRecord, Topic
+from skyloop.recording.options import VIDEO
 from skyloop.recording.output import Message, Schema
 from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.view import Source, check_names
 
 PORT: Final = 8765  #: that Foxglove asks for by itself
 WAITING: Final = 512  #: messages that may wait for a viewer; then its oldest are dropped
@@ -36,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 
 class FoxgloveServer:
-    """A :class:`skyloop.recording.live.view.Screen` of any number of viewers."""
+    """A :class:`skyloop.recording.view.Screen` of any number of viewers."""
 
     def __init__(
         self, drones: Sequence[Drone], *, host: str = "127.0.0.1", port: int = PORT, priority: int | None = None
@@ -285,3 +286,58 @@ def _sdk() -> Any:
     except ImportError as error:
         raise MissingExtraError("viewing in Foxglove", "foxglove", cause=str(error)) from None
     return foxglove
+
+
+# Topics ---------------------------------------------------------------------------------------------------------
+
+
+_OTHERS: Final = (Channel.FRAMES, Channel.DROPS)  # a topic for each camera; of files alone
+
+
+@dataclass(frozen=True, slots=True)
+class ViewTopic:
+    """A topic that can be subscribed to."""
+
+    name: str
+    kind: type[Any]  #: the class of its messages, of :class:`skyloop.recording.output.Message`
+    channels: tuple[str, ...]  #: what its drone is subscribed to for it; empty for what is known before
+    at_once: bool = True  #: whether it is announced before there is a message
+
+    @property
+    def shared(self) -> bool:
+        """Whether it is one topic for all drones."""
+        return self.name in (layout.TF, layout.LOG)
+
+
+def topics(drone: str, capabilities: Capabilities, *, far: bool) -> Iterator[ViewTopic]:
+    """Yield the topics of a drone.
+
+    Args:
+        drone: The drone's name.
+        capabilities: Of the drone.
+        far: Whether its frames are encoded for the way.
+    """
+    for channel, kind in layout.TYPES.items():
+        if channel not in _OTHERS:
+            yield ViewTopic(str(Topic(drone, channel)), kind, (channel.value,))
+    state, logs = (Channel.FEEDBACK.value,), (Channel.LOGS.value,)
+    yield ViewTopic(layout.pose_topic(drone), foxglove.PoseInFrame, state)
+    yield ViewTopic(layout.path_topic(drone), foxglove.PosesInFrame, state)
+    yield ViewTopic(layout.TF, foxglove.FrameTransform, state)
+    yield ViewTopic(layout.mocap_topic(drone), foxglove.PoseInFrame, logs)
+    yield ViewTopic(layout.LOG, foxglove.Log, (Channel.EVENTS.value, *logs))
+    for camera in capabilities.cameras:
+        yield from _of_camera(drone, camera, far)
+
+
+def _of_camera(drone: str, camera: CameraInfo, far: bool) -> Iterator[ViewTopic]:
+    frames = (f"{VIDEO}.{camera.name}",)
+    encoded = far or camera.stream == H264
+    yield ViewTopic(str(Topic(drone, Channel.FRAMES, camera.name)), FrameRecord, frames)
+    yield ViewTopic(layout.video_topic(drone, camera.name), foxglove.CompressedVideo, frames, encoded)
+    yield ViewTopic(layout.image_topic(drone, camera.name), foxglove.CompressedImage, frames, not encoded)
+    known = camera.intrinsics is not None
+    calibration = layout.calibration_topic(drone, camera.name)
+    yield ViewTopic(calibration, foxglove.CameraCalibration, () if known else frames)
+    drawings = layout.drawing_topic(drone, camera.name)
+    yield ViewTopic(drawings, foxglove.ImageAnnotations, (Channel.ANNOTATIONS.value,))
