@@ -230,7 +230,8 @@ def test_callbacks_follow_a_proxy_that_is_restarted_with_another_camera(
                 break
             assert seq < 100 * WAIT_S, "no frame came"
             time.sleep(0.01)
-        assert frame is not None and frame.camera == "top"
+        assert frame is not None
+        assert frame.camera == "top"
         assert set(frames) == set(inline) == {"top"}
         assert named == []
         stream = VideoRequest("top", encoding="h264", kbit_s=100).stream_topic
