@@ -31,8 +31,9 @@ class AuthorityReport:
         self._station = station
         self._app = app
         self._gone_s = gone_s
-        #: As the page was sent it last: state, holder, its priority, position in the queue, how control was lost.
-        self._sent: tuple[str, str | None, int | None, QueuePosition | None, str | None] | None = None
+        #: As the page was sent it last: state, holder, its priority, position in the queue, how control was lost, who
+        #: waits.
+        self._sent: tuple[str, str | None, int | None, QueuePosition | None, str | None, list[str]] | None = None
         self._was_mine = False
         self._given, self._given_ns = False, 0  # to who asked for it, and when
         self._loss: str | None = None  # how the control that this page had was lost; None: it was not
@@ -73,9 +74,10 @@ class AuthorityReport:
             self._given = False  # it was given at another time, or whoever asked did not take it
         self._was_mine = mine
         why = None if self._loss is None else self._why(self._loss, holder, lost)
-        if (state, holder, priority, place, why) == self._sent:
+        waiting = sorted(session.app for session in self._station.sessions if session.waits)
+        if (state, holder, priority, place, why, waiting) == self._sent:
             return None
-        self._sent = state, holder, priority, place, why
+        self._sent = state, holder, priority, place, why, waiting
         line = None if place is None else place.to_json(monotonic_ns())
         return {
             "type": "authority",
@@ -87,7 +89,16 @@ class AuthorityReport:
             "given": self._given and not mine and self._loss not in ("link", "silent"),
             "app": self._app,
             "line": line,
+            "waiting": waiting,
         }
+
+    def outranks(self, priority: int) -> bool:
+        """Return whether a priority is higher than that of who has control, as far as is known."""
+        try:
+            held = self._station.feedback().owner_priority
+        except LinkError:
+            return True
+        return held is None or priority < held
 
     def busy(self, priority: int) -> str:
         """Return why control can't be taken with a priority, in words."""

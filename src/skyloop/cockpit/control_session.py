@@ -160,6 +160,11 @@ class ControlSession:
             Write: lambda command: self._run_in_turn(command, self._write),
         }
 
+    @property
+    def waits(self) -> bool:
+        """Whether the page waits for the authority: in the queue, or to have it back."""
+        return self._pilot is not None and self._pilot.authority.state in ("queued", "preempted")
+
     async def run(self) -> None:
         """Serve the page until it is gone, then leave the vehicle in a safe state."""
         update = self._update
@@ -361,6 +366,9 @@ class ControlSession:
         elif not pilot.is_linked:
             raise LinkError("the link to the proxy is lost: control can be taken when it is back")
         pilot.present_until(monotonic_ns() + nanoseconds(GONE_S))
+        if self.waits and not command.ask and not self._authority.outranks(command.priority):
+            # To ask the proxy would be to leave the queue.
+            raise AuthorityError(f"{self._authority.busy(command.priority)}; you keep your place in line", code="busy")
         self._takeover.request(ask=command.ask)
         self._acknowledge(command)
         try:

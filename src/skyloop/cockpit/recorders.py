@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 from urllib.parse import quote
 
+from skyloop.errors import NoAnswerError
+
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.recording import Status
 
-REPLAY_S: Final = 20.0  #: for the proxy of a replay to answer
+REPLAY_S: Final = 60.0  #: for the proxy of a replay to answer: on a busy computer it takes long, and the page says so
 
 
 class Recorder(Protocol):
@@ -55,7 +57,13 @@ def start_replay(path: Path, drone: str | None = None) -> Drone:
     from skyloop.client import connect
 
     which = "" if drone is None else f"?drone={quote(drone)}"
-    return connect(f"replay://{quote(str(path))}{which}", access="observe", name="cockpit", timeout_s=REPLAY_S)
+    try:
+        return connect(f"replay://{quote(str(path))}{which}", access="observe", name="cockpit", timeout_s=REPLAY_S)
+    except NoAnswerError as error:
+        raise NoAnswerError(
+            f"the replay of {path.name} has not started within {REPLAY_S:g} s: this computer is too busy. "
+            "End other replays and programs, and try again"
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

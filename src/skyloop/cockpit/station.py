@@ -39,6 +39,12 @@ RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
 class FlyingSession(Protocol):
     """What a page flies the drone by."""
 
+    app: str  #: the name under which everybody sees who flies
+
+    @property
+    def waits(self) -> bool:
+        """Whether the page waits for the authority."""
+
     def stand_down(self, why: str) -> None:
         """Command nothing any more."""
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from skyloop.messages import CameraInfo, Feedback, Value
 
 LIMITS: Final = ("speed", "climb", "altitude")
+RECORDED: Final = "recorded."  #: before the names of recorded parameters: docs/replay.md
 
 
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
@@ -128,7 +129,9 @@ def _newest(drone: Drone) -> Feedback | None:
 def _reader(drone: Drone) -> Callable[[str], Value | None]:
     """Return what reads a parameter's value; None where there is no such parameter."""
     found = {parameter.name: parameter.value for parameter in drone.config.parameters()}
-    return found.get
+    # The limits and zones of a replay's own proxy are those of nothing: what the recorded vehicle had is shown.
+    prefix = RECORDED if drone.uri.startswith("replay:") else ""
+    return lambda name: found.get(prefix + name)
 
 
 def _known(text: Value | None) -> WorldGeometry | None:
