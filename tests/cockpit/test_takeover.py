@@ -11,7 +11,7 @@ import pytest
 
 from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.drone import open_drone
-from skyloop.cockpit import authority_report
+from skyloop.cockpit import takeover
 from skyloop.cockpit.commands import decode_command
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
@@ -158,7 +158,7 @@ def test_control_that_was_offered_in_vain_and_taken_later_is_lost_all_the_same(
 ) -> None:
     """Who is pre-empted was told, as of something that went well, to have handed control over."""
     monkeypatch.setattr(PilotConnection, "answer_takeover", lambda *_: None)
-    monkeypatch.setattr(authority_report, "GIVEN_S", 0.0)
+    monkeypatch.setattr(takeover, "GIVEN_S", 0.0)
     with page(client) as pilot:
         pilot.take(8)
         with asks(node) as drone:

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, Final
 from starlette.websockets import WebSocket
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.authority_report import AuthorityReport
 from skyloop.cockpit.broadcast import call_soon
 from skyloop.cockpit.commands import (
     SETTLED_NS,
@@ -56,10 +55,9 @@ from skyloop.cockpit.commands import (
     untimely,
 )
 from skyloop.cockpit.follow_session import NO_CONTROL, FollowerFactory, FollowSession
-from skyloop.cockpit.place_flight import UP, Leg, PlaceFlight, to_place, to_start
-from skyloop.cockpit.route_session import RouteSession
+from skyloop.cockpit.place_flight import UP, Leg, PlaceFlight, RouteSession, to_place, to_start
 from skyloop.cockpit.stream import PageSocket
-from skyloop.cockpit.takeover import TakeoverDialog
+from skyloop.cockpit.takeover import AuthorityReport, TakeoverDialog
 from skyloop.control.route_flight import check_for
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
