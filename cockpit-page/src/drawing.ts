@@ -2,6 +2,27 @@
 
 import type { Shape } from "./model.js";
 
+/** Drawings of a frame further away than this are of another moment [ns]. */
+export const REACH_NS = 300_000_000n;
+/** Those that come later than this after the picture that they were drawn on are not shown: things are elsewhere by now [ns]. */
+export const LATEST_NS = 1_000_000_000n;
+
+/** What is older was not late: a page that is opened gets the last that was ever drawn [ns]. */
+const LEFT_OVER_NS = 10_000_000_000n;
+
+/** How long after its picture a drawing comes; 0 for one in time. Pure. */
+export function lateness(drawing: { captured_ns: string }, shown: bigint | null): bigint {
+  const late = shown === null ? 0n : shown - BigInt(drawing.captured_ns);
+  return late < REACH_NS || late > LEFT_OVER_NS ? 0n : late;
+}
+
+/** Whether a drawing that came so late belongs over a picture: `live`, over its own; `late`, over a newer one; or not. Pure. */
+export function belongs(drawing: { captured_ns: string }, late: bigint, shown: bigint): "live" | "late" | "" {
+  const apart = shown - BigInt(drawing.captured_ns);
+  if (apart < REACH_NS && apart > -REACH_NS) return "live";
+  return late > 0n && late <= LATEST_NS && apart > 0n && apart < late + REACH_NS ? "late" : "";
+}
+
 /** From pixels of the frame to pixels of the canvas. */
 export interface Fit {
   scale: number;

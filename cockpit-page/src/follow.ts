@@ -1,6 +1,6 @@
 // Marking what is to be followed: pointers to pixels of the frame, boxes, and what was detected. Pure.
 
-import type { Fit } from "./drawing.js";
+import { type Fit, REACH_NS } from "./drawing.js";
 import type { Drawing, Shape } from "./model.js";
 
 /** x, y of the upper left corner, width, height, in pixels of a frame: its edges, so that 0 is the left edge of the first column. */
@@ -54,8 +54,6 @@ export interface Found {
 
 /** A smaller box has too little in it to be tracked [pixels of the frame]. */
 export const LEAST_PX = 6;
-/** Drawings of a frame further away than this are of another moment. */
-export const REACH_NS = 300_000_000n;
 /** What is drawn of the target itself. */
 export const SOURCE = "follow";
 const NAMED = /^(.+) [01]?\.\d+$/;

@@ -232,6 +232,7 @@ export class FollowTool {
     this.still.width = canvas.width;
     this.still.height = canvas.height;
     this.still.getContext("2d", { alpha: false })?.drawImage(canvas, 0, 0);
+    setAttribute(this.still, "data-captured", frame.captured_ns);
     setHidden(this.still, false);
     return { ...frame, found: this.found.filter((one) => this.isKept(one.captured_ns)) };
   }

@@ -39,6 +39,8 @@ export class Hold {
 /** What is done when it was held, and whose motors it is about, in words. */
 export interface Deadly {
   what: string;
+  /** The only drone that it is about; null: all. */
+  drone: string | null;
   act: () => void;
 }
 
@@ -61,6 +63,11 @@ export class Countdown {
 
   get isHeld(): boolean {
     return this.hold.isHeld;
+  }
+
+  /** The only drone that what is held is about; null: nothing is held, or it is about all. */
+  get drone(): string | null {
+    return this.held?.drone ?? null;
   }
 
   /** What is held already goes on. */
@@ -115,29 +122,33 @@ export class Countdown {
 /** A button that is held: by pointer, or by the space bar or Enter. `deadly` is asked when the press begins. */
 export function holdButton(countdown: Countdown, deadly: () => Deadly | null, attributes: Record<string, string>, ...children: (Node | string)[]): HTMLButtonElement {
   const button = h("button", { type: "button", ...attributes }, ...children);
-  const press = (): void => {
+  let held: number | string | null = null; // by which finger or key: to let go of another one ends nothing
+  const press = (by: number | string): void => {
     const meant = deadly();
     if (meant === null || button.disabled) return;
+    if (!countdown.isHeld) held = by; // also where the release of the one before was not seen
     setAttribute(button, "data-held", "true");
     countdown.press(meant);
   };
-  const release = (): void => {
-    if (button.getAttribute("data-held") !== "true") return;
+  const release = (by: number | string | null): void => {
+    if (held === null || (by !== null && by !== held)) return;
+    held = null;
     setAttribute(button, "data-held", "false");
     countdown.release();
   };
   button.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;
     button.setPointerCapture(event.pointerId);
-    press();
+    press(event.pointerId);
   });
-  for (const end of ["pointerup", "pointercancel", "lostpointercapture", "blur"] as const) button.addEventListener(end, release);
+  for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) button.addEventListener(end, (event) => release(event.pointerId));
+  button.addEventListener("blur", () => release(null));
   button.addEventListener("contextmenu", (event) => event.preventDefault()); // a long press on a touch screen
   button.addEventListener("keydown", (event) => {
     if (event.code !== "Space" && event.code !== "Enter" && event.code !== "NumpadEnter") return;
     event.preventDefault();
-    if (!event.repeat && !event.ctrlKey) press();
+    if (!event.repeat && !event.ctrlKey) press(event.code);
   });
-  button.addEventListener("keyup", release);
+  button.addEventListener("keyup", (event) => release(event.code));
   return button;
 }

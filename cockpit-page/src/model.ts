@@ -147,6 +147,8 @@ export interface Authority {
   app: string;
   /** Where this page waits; null while it does not. */
   line: QueuePosition | null;
+  /** The pages of this cockpit that wait for control, by the names under which others see them; this one, too. */
+  waiting: readonly string[];
 }
 
 export interface QueuePosition {

@@ -25,7 +25,7 @@ import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
 import { Preflight } from "./preflight.js";
 import { ReplayBar } from "./replaybar.js";
-import { before, type Playback, playbackOf, type Timeline } from "./replaytime.js";
+import { before, momentOf, type Playback, playbackOf, type Timeline } from "./replaytime.js";
 import { titleOf } from "./row.js";
 import { isRecording, type Target } from "./safety.js";
 import type { SceneView } from "./scene.js";
@@ -129,7 +129,7 @@ export class Pane {
     this.stage = new Stage(name, this.controls, pilots ? this.marking() : null);
     this.strip = new Strip(name, (deed) => this.act(deed), (id, grant, reason) => this.pilot?.answer(id, grant, reason), {
       countdown: host.countdown,
-      deadly: () => (this.target === null ? null : { what: t.safety.motorsOff(name), act: () => this.target?.stop() }),
+      deadly: () => (this.target === null ? null : { what: t.safety.motorsOff(name), drone: name, act: () => this.target?.stop() }),
       understood: () => this.pilot?.understood(),
     });
     this.writes = new Writes((parameter, value) => this.pilot?.write(parameter, value));
@@ -353,6 +353,8 @@ export class Pane {
   private remember(state: State): void {
     const before_it = this.playback;
     this.playback = this.bar ? playbackOf(state.values) : null;
+    // Zones and limits are as they were recorded up to there.
+    if (this.playback && momentOf(this.playback) !== (before_it && momentOf(before_it))) this.map.surroundings.reload();
     if (this.playback && this.playback.jumps !== before_it?.jumps) this.rebuild();
     else if (this.playback && this.playback.position_s === before_it?.position_s) return;
     this.history.add(this.moment_s, state.values);

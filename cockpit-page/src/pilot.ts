@@ -28,7 +28,7 @@ export interface PilotListener {
   follow?(message: FollowMessage | null): void;
 }
 
-const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, why: null, given: false, app: "", line: null };
+const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, why: null, given: false, app: "", line: null, waiting: [] };
 
 export class Pilot {
   authority: Authority = NOBODY;

@@ -2,15 +2,15 @@
 // anew, so that nothing is lost of what somebody types in it.
 
 import { errorText, get, post } from "./api.js";
-import { h, setAttribute, setHidden, setText } from "./dom.js";
+import { h, setAttribute, setDisabled, setHidden, setText } from "./dom.js";
 import { bytes, clock } from "./format.js";
 import { t } from "./language/index.js";
 import type { PastRecording } from "./model.js";
 
 export interface RowHost {
   readonly pilots: boolean;
-  /** Do it, show what went wrong, and read the list anew. */
-  act(work: () => Promise<unknown>): Promise<boolean>;
+  /** Do it, show what went wrong, and read the list anew; `doing`: what to say meanwhile, after so many seconds. */
+  act(work: () => Promise<unknown>, doing?: (seconds: number) => string): Promise<boolean>;
   replayed(drone: string): void;
   /** It is in the trash, under this name. */
   thrown(name: string): void;
@@ -51,7 +51,13 @@ export class RecordingRow {
 
   private replayButton(drone: string | null): HTMLElement {
     const label = drone ?? t.recordings.replay;
-    return h("button", { type: "button", class: "small", "aria-label": t.recordings.replayOf(drone ?? this.one.name), onclick: () => void this.host.act(() => this.replay(drone)) }, label);
+    const button = h("button", { type: "button", class: "small", "aria-label": t.recordings.replayOf(drone ?? this.one.name), onclick: () => void start() }, label);
+    const start = async (): Promise<void> => {
+      setDisabled(button, true); // a second press would start a second one
+      await this.host.act(() => this.replay(drone), (seconds) => t.recordings.starting(this.title.textContent ?? "", seconds));
+      setDisabled(button, false);
+    };
+    return button;
   }
 
   private async replay(drone: string | null): Promise<void> {

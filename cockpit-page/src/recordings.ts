@@ -107,7 +107,7 @@ export class RecordingList {
   private row(one: PastRecording): RecordingRow {
     const known = this.rows.get(one.name);
     if (known) known.update(one);
-    const row = known ?? new RecordingRow(one, { pilots: this.pilots, act: (work) => this.act(work), replayed: this.replayed, thrown: (name) => this.offerUndo(name) });
+    const row = known ?? new RecordingRow(one, { pilots: this.pilots, act: (work, doing) => this.act(work, "", doing), replayed: this.replayed, thrown: (name) => this.offerUndo(name) });
     this.rows.set(one.name, row);
     return row;
   }
@@ -141,18 +141,23 @@ export class RecordingList {
     await this.act(() => post("/api/recordings", { drones: this.drones() }));
   }
 
-  /** `done`: what to say afterwards. */
-  private async act(work: () => Promise<unknown>, done = ""): Promise<boolean> {
-    setText(this.note, "…");
+  /** `done`: what to say afterwards; `doing`: meanwhile, after so many seconds. */
+  private async act(work: () => Promise<unknown>, done = "", doing: (seconds: number) => string = () => "…"): Promise<boolean> {
+    const began_ms = performance.now();
+    let said = "";
+    const say = (): void => setText(this.note, (said = doing(Math.floor((performance.now() - began_ms) / 1000))));
+    say();
+    const saying = setInterval(say, PERIOD_MS);
     let error: unknown = null;
     try {
       await work();
     } catch (caught) {
       error = caught;
     }
+    clearInterval(saying);
     // What the work itself has written stays.
     if (error !== null) setText(this.note, errorText(error));
-    else if (this.note.textContent === "…") setText(this.note, done);
+    else if (this.note.textContent === said) setText(this.note, done);
     await this.load();
     return error === null;
   }

@@ -48,6 +48,9 @@ export function playbackOf(values: State["values"]): Playback | null {
   return { position_s, duration_s, speed, paused: value("paused") === 1, jumps: value("jumps") ?? 0 };
 }
 
+/** Changes where what was recorded of the surroundings may: with each jump, and each second of the recording. */
+export const momentOf = ({ jumps, position_s }: Playback): string => `${jumps} ${Math.floor(position_s)}`;
+
 export const clamped = (position_s: number, duration_s: number): number => Math.min(duration_s, Math.max(0, position_s));
 
 /** Everything that the bar shows, by time. */

@@ -32,7 +32,7 @@ export const WORDS: Readonly<Record<Deed, string>> = { land_all: t.safety.landAl
 export function outcome(deed: Deed, drones: readonly string[], each: ReadonlyMap<string, { state: string; why: string }>): { text: string; bad: boolean } {
   const of = (state: string): string[] => drones.filter((name) => (each.get(name)?.state ?? "pending") === state);
   const failed = of("refused").map((name) => `${name}: ${each.get(name)?.why}`);
-    const parts = [
+  const parts = [
     failed.length ? t.safety.failed[deed](failed.join("; ")) : "",
     of("pending").length ? t.safety.pending(of("pending").join(", ")) : "",
     of("sent").length ? t.safety.sent(of("sent").join(", ")) : "",
@@ -77,7 +77,8 @@ export class Safety {
 
   /** Which drone is stopped by its own button, by keys and by the gamepad; null: none that flies is seen. */
   aim(target: Target | null): void {
-    if (target?.name !== this.target?.name && this.countdown.isHeld) this.countdown.release(); // that was meant for another one
+    const { drone } = this.countdown;
+    if (drone !== null && drone !== target?.name) this.countdown.release(); // that was meant for another one
     this.target = target;
     this.show();
   }
@@ -101,13 +102,13 @@ export class Safety {
 
   private one(): Deadly | null {
     const { target } = this;
-    return target && { what: t.safety.motorsOff(target.name), act: () => target.stop() };
+    return target && { what: t.safety.motorsOff(target.name), drone: target.name, act: () => target.stop() };
   }
 
   private every(deed: Deed): Deadly {
     const count = this.flying;
     const which = count === 1 ? t.safety.theOnly : t.safety.allOf(count);
-    return { what: deed === "land_all" ? t.safety.landThese(which) : t.safety.motorsOff(which), act: () => this.send(deed) };
+    return { drone: null, what: deed === "land_all" ? t.safety.landThese(which) : t.safety.motorsOff(which), act: () => this.send(deed) };
   }
 
   private send(deed: Deed): void {

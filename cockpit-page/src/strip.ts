@@ -6,7 +6,7 @@ import { type Countdown, type Deadly, holdButton } from "./hold.js";
 import { holderText, oldHolderText } from "./instruments.js";
 import type { Deed } from "./keys.js";
 import { t } from "./language/index.js";
-import type { Authority, State, Vehicle } from "./model.js";
+import type { Authority, Question, State, Vehicle } from "./model.js";
 import type { Pilot } from "./pilot.js";
 import { QuestionPanel } from "./question.js";
 import { showFate } from "./safety.js";
@@ -28,6 +28,18 @@ export function lineText({ state, holder, line }: Authority): string {
   return answer ? t.strip.answered(answer, place) : t.strip.you(place);
 }
 
+/** One sentence: who has control, who waits for it, and what this page can do about it. `asks`: it would ask first. */
+export function nowText(authority: Authority, questions: readonly Question[], asks: boolean, priority: number): string {
+  const { app, holder, mine, state } = authority;
+  const names = [...new Set([...authority.waiting.filter((name) => name !== app), ...questions.map(({ by }) => by)])];
+  if (mine) return t.strip.now.mine(names.length ? t.strip.now.wait(names, false) : t.strip.now.nobody, questions.some(({ declined }) => !declined));
+  if (state === "queued" || state === "preempted") return t.strip.now.inLine(holder ?? t.strip.theHolder, t.strip.now.wait(names, true), state === "preempted");
+  if (holder === null) return t.strip.now.free(names.length ? t.strip.now.wait(names, false) : "");
+  const wins = authority.priority !== null && priority < authority.priority;
+  const may = asks ? t.strip.now.ask : wins ? t.strip.now.higher(priority) : t.strip.now.noHigher(priority);
+  return t.strip.now.others(holder, names.length ? t.strip.now.wait(names, false) : t.strip.now.nobody, may);
+}
+
 export class Strip {
   readonly element: HTMLElement;
   readonly question: QuestionPanel;
@@ -39,6 +51,7 @@ export class Strip {
   private readonly line = h("span", { role: "status", "aria-label": t.strip.line });
   private readonly wait = h("span", { class: "wait", role: "timer", "aria-live": "off" });
   private readonly waiting = h("p", { class: "waiting" }, this.line, this.wait);
+  private readonly now = h("p", { class: "now" });
   private readonly take: HTMLButtonElement;
   private readonly release: HTMLButtonElement;
   private readonly takeOff: HTMLButtonElement;
@@ -73,7 +86,7 @@ export class Strip {
     this.stop = holdButton(stop.countdown, stop.deadly, { class: "stop", title: t.safety.hold }, h("span", {}, t.safety.off), h("span", { class: "stop-name" }, drone), h("span", { class: "fate" }));
     this.ended = h("p", { class: "ended", role: "alert", "data-tone": "bad", hidden: true }, this.endedText, h("button", { type: "button", class: "small", onclick: stop.understood }, t.strip.understood));
     this.buttons = [["take", this.take], ["release", this.release], ["takeoff", this.takeOff], ["hover", this.hover], ["land", this.land], ["return", this.back], ["reset", this.reset], ["stop", this.stop]];
-    this.element = h("div", { class: "strip", role: "group", "aria-label": t.strip.label }, this.question.voice, this.question.element, this.ended, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.back, this.reset), this.why, this.stop);
+    this.element = h("div", { class: "strip", role: "group", "aria-label": t.strip.label }, this.question.voice, this.question.element, this.ended, this.waiting, this.now, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.back, this.reset), this.why, this.stop);
   }
 
   /** What was chosen, within its range. */
@@ -103,6 +116,9 @@ export class Strip {
     setText(this.release.firstElementChild as Element, pilot?.waits ? t.strip.stopWaiting : t.strip.release);
     setText(this.line, pilot?.waits ? lineText(pilot.authority) : "");
     setHidden(this.waiting, !this.line.textContent);
+    const known = pilot !== null && pilot.isReady && flies && !old && state?.links.application !== "lost";
+    setText(this.now, known ? nowText(pilot.authority, pilot.questions, this.asks, this.wanted) : "");
+    setHidden(this.now, pilot === null || !flies); // else it has its place also while nothing is known
     this.question.update(pilot, performance.now());
     this.count(pilot);
     setDisabled(this.take, !can);

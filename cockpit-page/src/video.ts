@@ -3,8 +3,8 @@
 import type { CameraControls } from "./cameracontrols.js";
 import { fit, h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { ServerClock } from "./clock.js";
-import { contain, draw } from "./drawing.js";
-import { type FollowMessage, REACH_NS, SOURCE } from "./follow.js";
+import { belongs, contain, draw, LATEST_NS, lateness } from "./drawing.js";
+import { type FollowMessage, SOURCE } from "./follow.js";
 import { type FollowHost, FollowTool } from "./followtool.js";
 import { duration } from "./format.js";
 import { type Encoding, Pace, StreamDecoder, type WhyJpeg, whyJpeg } from "./h264.js";
@@ -20,6 +20,8 @@ const RATE_MS = 2000;
 const TELL_MS = 90;
 /** When a picture's width differs by more than this share from what was asked for, another size is. */
 const OTHER = 0.15;
+const TOLD_LATE_MS = 3000; // so long after a drawing that came too late the page says so
+const FADED = 0.45; // of what was drawn on an earlier picture
 const NEAR = "300px"; // pictures come before they are scrolled into sight
 
 interface Shown extends FrameHead {
@@ -43,7 +45,11 @@ export class VideoView {
   /** Why the picture is smaller, or coarser, than it could be. */
   private readonly smaller = h("p", { class: "chip smaller", role: "status" });
   private readonly nothing = h("p", { class: "nothing" }, t.video.waiting);
+  /** What was drawn on these pictures, and came too late to be shown, or much later than they did. */
+  private readonly late = h("p", { class: "chip drawn-late", role: "status" });
   private readonly drawings = new Map<string, Drawing>();
+  /** How late each of them came, and when. */
+  private readonly delays = new Map<string, { late: bigint; came_ms: number }>();
   private socket: LastingSocket | null = null;
   private frames: NewestFrame<ImageBitmap> | null = null;
   private shown: Shown | null = null;
@@ -66,7 +72,7 @@ export class VideoView {
     host: FollowHost | null,
   ) {
     this.canvas = h("canvas", { class: "video", role: "img", "aria-label": t.video.none(camera.name), width: camera.width, height: camera.height });
-    this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.smaller, this.nothing);
+    this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.smaller, this.late, this.nothing);
     this.follow = host && new FollowTool(this, host);
     this.tools = new VideoTools(this, this.follow?.button ?? null);
     // What nobody sees asks for no pictures: a hidden page, or a place that is scrolled away.
@@ -131,6 +137,13 @@ export class VideoView {
     const isSmaller = width < (1 - OTHER) * Math.min(this.camera.width, this.asked_px || this.camera.width);
     setText(this.smaller, cause ? t.video.reduced(isSmaller ? t.video.smaller(width, height) : t.video.coarser, cause) : "");
     setAttribute(this.canvas, "aria-label", t.video.showing(this.camera.name, stale));
+    setText(this.late, this.overlay ? this.lateText(now_ms) : "");
+  }
+
+  /** Whose drawings come late now, and whether they are shown. */
+  private lateText(now_ms: number): string {
+    const late = [...this.delays].filter(([, { late, came_ms }]) => late > 0n && now_ms - came_ms < TOLD_LATE_MS);
+    return late.map(([source, { late }]) => t.video.late(source, (Number(late) / 1e9).toFixed(1), late <= LATEST_NS)).join(" · ");
   }
 
   redraw(): void {
@@ -146,9 +159,11 @@ export class VideoView {
     if (!this.shown) return;
     for (const drawing of this.drawings.values()) {
       if (only !== undefined && drawing.source !== only) continue;
-      const apart = this.shown.captured - BigInt(drawing.captured_ns);
-      if (apart < REACH_NS && apart > -REACH_NS) draw(pen, drawing.shapes, contain(drawing.width, drawing.height, box, density));
+      const how = belongs(drawing, this.delays.get(drawing.source)?.late ?? 0n, this.shown.captured);
+      pen.globalAlpha = how === "late" ? FADED : 1;
+      if (how) draw(pen, drawing.shapes, contain(drawing.width, drawing.height, box, density));
     }
+    pen.globalAlpha = 1;
   }
 
   /** Pictures are asked for while somebody sees them: on the page, in a window apart, or in a clip later. */
@@ -193,6 +208,7 @@ export class VideoView {
     if (typeof data === "string") {
       const drawing = JSON.parse(data) as Drawing;
       this.drawings.set(drawing.source, drawing);
+      this.delays.set(drawing.source, { late: lateness(drawing, this.shown?.captured ?? null), came_ms: performance.now() });
       this.redraw();
     } else this.receive(unpack(data), performance.now());
   }

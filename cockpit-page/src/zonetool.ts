@@ -227,7 +227,7 @@ export class ZoneTool implements MapTool {
     if (state === this.shown) return;
     this.shown = state;
     const option = (value: string, text: string): HTMLElement => h("option", { value }, text);
-    this.list.replaceChildren(option("box", bounds.box ? t.zones.box : t.zones.noBox), ...bounds.zones.map((zone, number) => option(String(number), t.zones.named(zoneName(zone), t.zones.kinds[zone.kind]))));
+    this.list.replaceChildren(option("box", bounds.box ? t.zones.box : t.zones.noBox), ...bounds.zones.map((zone, number) => option(String(number), zone.name ? t.zones.named(zone.name, t.zones.kinds[zone.kind]) : zoneName(zone))));
     this.list.value = String(this.edited);
     for (const button of this.buttons) setDisabled(button, !this.can);
     const has = this.edited === "box" ? bounds.box !== null : bounds.zones[this.edited] !== undefined;

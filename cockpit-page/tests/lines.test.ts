@@ -204,7 +204,7 @@ function flown(): Flown {
   };
 }
 
-const held = (mine: boolean, holder: string | null = mine ? "cockpit 1" : null): Authority => ({ type: "authority", state: mine ? "held" : "none", holder, priority: 8, mine, why: null, given: false, app: "cockpit 1", line: null });
+const held = (mine: boolean, holder: string | null = mine ? "cockpit 1" : null): Authority => ({ type: "authority", state: mine ? "held" : "none", holder, priority: 8, mine, why: null, given: false, app: "cockpit 1", line: null, waiting: [] });
 const doings = (sent: Record<string, unknown>[]): unknown[] => sent.map((message) => message["do"]).filter((one) => one !== "ping");
 const FORWARD = { ...CENTRED, forward: 0.5 };
 

@@ -2,6 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
+import { belongs, LATEST_NS, lateness, REACH_NS } from "../src/drawing.js";
 import { passes } from "../src/events.js";
 import { ServerClock } from "../src/clock.js";
 import { bytes, clock, duration, figure, heading, headingText, lasting, plain, short } from "../src/format.js";
@@ -17,7 +18,7 @@ import { explained, pending, wins } from "../src/question.js";
 import { lacking } from "../src/recordings.js";
 import { isRecording, outcome } from "../src/safety.js";
 import { CENTRED, DEAD_BAND, deadBand, Hands, isCentred, Latch, merge, PACES, type Pace, ramp, RAMP_S, scale } from "../src/sticks.js";
-import { lineText } from "../src/strip.js";
+import { lineText, nowText } from "../src/strip.js";
 import { ONE_PRESS_MS, parse, Presses, rangeText } from "../src/values.js";
 import { othersOf } from "../src/world.js";
 import { around, gridStep, toMetres, toPixels, zoomed } from "../src/view.js";
@@ -347,13 +348,46 @@ test("a question for control says what becomes of it", () => {
 
 test("the place in the line, with what was answered", () => {
   const waits = (line: Partial<QueuePosition>, state: Authority["state"] = "queued"): string =>
-    lineText({ type: "authority", state, holder: "follow.py", priority: 16, mine: false, why: null, given: false, app: "cockpit 1", line: { position: 2, wait_s: null, asked: false, declined: null, ...line } });
+    lineText({ type: "authority", state, holder: "follow.py", priority: 16, mine: false, why: null, given: false, app: "cockpit 1", waiting: [], line: { position: 2, wait_s: null, asked: false, declined: null, ...line } });
   assert.equal(waits({}), "You are number 2 in line");
   assert.equal(waits({ position: null }, "preempted"), "You wait in line");
   assert.equal(waits({ asked: true }), "follow.py was asked · you are number 2 in line");
   assert.equal(waits({ asked: true, declined: "" }), "follow.py keeps it for now · you are number 2 in line");
   assert.equal(waits({ asked: true, declined: "landing" }), "follow.py keeps it for now: “landing” · you are number 2 in line");
   assert.equal(waits({}, "none"), "");
+});
+
+test("one sentence says who has control, who waits, and what can be done", () => {
+  const none: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, why: null, given: false, app: "cockpit 1", waiting: [], line: null };
+  const says = (authority: Partial<Authority>, questions: Question[] = [], wanted = { asks: false, priority: 8 }): string => nowText({ ...none, ...authority }, questions, wanted.asks, wanted.priority);
+  assert.equal(says({}), "Nobody has control: take it to fly.");
+  assert.equal(says({ waiting: ["cockpit 2"] }), "Nobody has control, and cockpit 2 waits for it: take it to fly.");
+  const mine: Partial<Authority> = { state: "held", mine: true, holder: "cockpit 1", priority: 8 };
+  assert.equal(says(mine), "You have control, and nobody waits for it: fly, or release it.");
+  assert.equal(says({ ...mine, waiting: ["cockpit 2"] }, [asks({ by: "cockpit 2" })]), "You have control, and cockpit 2 waits for it: hand it over, keep it, or fly on.");
+  assert.equal(says({ ...mine, waiting: ["cockpit 2"] }, [asks({ by: "survey.py", declined: true })]), "You have control, and cockpit 2 and survey.py wait for it: fly, or release it.");
+  const other: Partial<Authority> = { holder: "cockpit 2", priority: 8 };
+  assert.equal(says(other), "cockpit 2 has control, and nobody waits for it: choose “Ask first” to ask for it, as your priority 8 is no higher.");
+  assert.equal(says({ ...other, waiting: ["cockpit 3"] }, [], { asks: false, priority: 4 }), "cockpit 2 has control, and cockpit 3 waits for it: you can take it at once, as your priority 4 is higher.");
+  assert.equal(says(other, [], { asks: true, priority: 8 }), "cockpit 2 has control, and nobody waits for it: ask for it, and it may be handed over.");
+  const line = { position: 1, wait_s: null, asked: true, declined: null };
+  assert.equal(says({ ...other, state: "queued", waiting: ["cockpit 1"], line }), "cockpit 2 has control, and you wait for it: it is yours when it is released and you are first.");
+  assert.equal(says({ ...other, state: "preempted", waiting: ["cockpit 1", "cockpit 3"], line }), "cockpit 2 has control, and you and cockpit 3 wait for it: it is yours again when it is released and you are first.");
+});
+
+test("a drawing that comes late is shown with later pictures, up to a limit", () => {
+  const drawn = { captured_ns: "5000000000" };
+  const [own, soon, later, much] = [5_000_000_000n, 5_200_000_000n, 5_700_000_000n, 6_500_000_000n];
+  assert.equal(lateness(drawn, null), 0n);
+  assert.equal(lateness(drawn, soon), 0n, "with its own picture, or the next");
+  assert.equal(lateness(drawn, later), 700_000_000n);
+  assert.equal(lateness(drawn, 60_000_000_000n), 0n, "what somebody drew a minute ago is not late");
+  for (const shown of [own, soon]) assert.equal(belongs(drawn, 0n, shown), "live");
+  assert.equal(belongs(drawn, 0n, later), "", "one that came in time goes with its picture");
+  assert.equal(belongs(drawn, 700_000_000n, later), "late");
+  assert.equal(belongs(drawn, 700_000_000n, later + REACH_NS), "", "until the next one should be there");
+  assert.equal(belongs(drawn, 1_500_000_000n, much), "", "things are elsewhere by now");
+  assert.equal(belongs(drawn, LATEST_NS, 6_100_000_000n), "late");
 });
 
 test("what lies under a pointer, and how far a waypoint is", () => {

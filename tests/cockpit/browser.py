@@ -150,32 +150,38 @@ class DronePage:
         self.until(lambda: not self.pane.locator(".taking .primary").is_disabled(), "the line is open")
         self.press("c")
 
-    def take_control(self) -> None:
-        """As a person does it: press again if nothing came of it, as when the page had just been opened."""
+    def press_until(
+        self,
+        key: str,
+        condition: Callable[[], bool],
+        what: str,
+        timeout_s: float = PATIENCE_S,
+        *,
+        again: Callable[[], bool] = lambda: True,
+    ) -> None:
+        """As a person does it: press again if nothing came of it, as when it came too late on a busy machine."""
         pressed_s = 0.0
 
-        def mine() -> bool:
+        def done() -> bool:
             nonlocal pressed_s
-            if time.monotonic() - pressed_s > 3.0:
+            if condition():
+                return True
+            if time.monotonic() - pressed_s > 3.0 and again():
                 pressed_s = time.monotonic()
-                self.press("c")
-            return bool(self.pane.get_attribute("data-mine") == "true")
+                self.press(key)
+            return False
 
-        self.until(mine, "this page has control")
+        self.until(done, what, timeout_s)
+
+    def take_control(self) -> None:
+        """Press until this page has control."""
+        self.press_until("c", lambda: self.pane.get_attribute("data-mine") == "true", "this page has control")
 
     def take_off(self) -> None:
-        """Take control, and wait until it hovers: pressed again if it came too late to count, as on a busy machine."""
+        """Take control, and wait until it hovers."""
         self.take_control()
-        pressed_s = 0.0
-
-        def up() -> bool:
-            nonlocal pressed_s
-            if "anded" in self.says(".pill") and time.monotonic() - pressed_s > 3.0:
-                pressed_s = time.monotonic()
-                self.press("t")
-            return "hovering" in self.says(".pill")
-
-        self.until(up, "it hovers", timeout_s=2 * PATIENCE_S)
+        hovers, stands = (lambda: "hovering" in self.says(".pill")), (lambda: "anded" in self.says(".pill"))
+        self.press_until("t", hovers, "it hovers", 2 * PATIENCE_S, again=stands)
 
 
 @contextmanager

@@ -21,13 +21,12 @@ from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.statistics import ChannelStats, Distribution
 from skyloop.cockpit.access import Gate, OpenGate
-from skyloop.cockpit.alarms import USUAL
+from skyloop.cockpit.alarms import PARAMETERS, USUAL
 from skyloop.cockpit.app import create_app
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.security import own_names
-from skyloop.cockpit.thresholds import PARAMETERS
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import LinkError, NoAnswerError

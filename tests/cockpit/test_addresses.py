@@ -12,8 +12,7 @@ import pytest
 
 from skyloop.cockpit import addresses
 from skyloop.cockpit.access import PAIRING_S, Pairing, Token, TokenGate
-from skyloop.cockpit.addresses import bind, listener_of, own_addresses, qr_code, reachable
-from skyloop.cockpit.announcing import Announcer
+from skyloop.cockpit.addresses import Announcer, bind, listener_of, own_addresses, qr_code, reachable
 from skyloop.cockpit.security import own_names
 from skyloop.cockpit.server import Access
 from skyloop.errors import UsageError

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from skyloop.cockpit.alarms import USUAL, DegradedTimes, Thresholds, alarms
+from skyloop.cockpit.alarms import PARAMETERS, USUAL, DegradedTimes, Thresholds, alarms, thresholds_of
 from skyloop.cockpit.telemetry import encode_json
-from skyloop.cockpit.thresholds import PARAMETERS, thresholds_of
 from skyloop.errors import UnknownNameError
 from skyloop.messages import Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.proxy.parameters import OWN

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyloop.cockpit.camera_feed import FPS
 from skyloop.cockpit.commands import FollowTarget
 from skyloop.cockpit.encoded_feed import KEPT, RATES, SCALES, EncodedFeed, Form, form_for
 from skyloop.cockpit.follow_session import in_frame
@@ -26,7 +27,6 @@ from skyloop.cockpit.page_stream import (
     PagePath,
     PageStream,
 )
-from skyloop.cockpit.small_feed import FPS
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.messages import CameraInfo, Encoding, FrameHeader

@@ -265,6 +265,32 @@ def test_land_all_and_stop_all_are_there_with_nothing_opened(deck: Deck) -> None
             page.until(lambda: one.feedback().state is FlightState.EMERGENCY, "all motors are off")
 
 
+def test_a_stop_that_is_held_is_ended_by_no_other_key_or_finger(deck: Deck) -> None:
+    """To let go of the key that flew, or to touch another drone with the other hand, kept all motors running."""
+    for name in ("left", "right"):
+        deck.proxy(name, SMALL)
+    page = deck.page("left", "right")
+    stop = page.page.get_by_role("button", name="Stop all")
+    with skyloop.connect("left", name="a", on_exit="hover") as drone:
+        drone.takeoff()
+        page.until(lambda: not stop.is_disabled(), "there are drones")
+        stop.focus()
+        page.page.keyboard.down("w")
+        with page.holding(" "):
+            page.page.keyboard.up("w")
+            page.until(lambda: drone.feedback().state is FlightState.EMERGENCY, "all motors are off")
+        drone.reset_emergency()
+        drone.wait("landed", 10)
+        drone.takeoff()
+        stop.hover()
+        page.page.mouse.down()
+        other = page.page.locator('.pane[data-selected="false"]')
+        other.dispatch_event("pointerdown", {"pointerId": 7, "button": 0})
+        stop.dispatch_event("pointerup", {"pointerId": 7, "button": 0})
+        page.until(lambda: drone.feedback().state is FlightState.EMERGENCY, "all motors are off again")
+        page.page.mouse.up()
+
+
 def test_a_recording_has_no_flight_controls_and_ends_neutrally(deck: Deck) -> None:
     deck.proxy("taped", SMALL)
     page = deck.page("taped")

@@ -5,25 +5,72 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import skyloop
 from skyloop.client import Drone, Frame
-from skyloop.messages import FlightState, Polyline, Text
+from skyloop.messages import Feedback, FlightState, Polyline, Text
 from tests.cockpit import fingers
 from tests.cockpit.browser import Deck, DronePage
 from tests.cockpit.test_page_touch import FINGER_PX, PORTRAIT, SMALL, tap_until, touched
 from tests.cockpit.test_page_touch import take_control as tap_control
-from tests.cockpit.walker import Walker
+from tests.cockpit.walker import Box, Walker
 
 pytestmark = pytest.mark.process
+Edges = tuple[float, float, float, float]  #: left, top, right, bottom [CSS pixels]
 
 
-def on_screen(page: DronePage, walker: Walker, drone: Drone) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom of the person in the picture on the screen, a little loosely [CSS pixels]."""
-    x, y, width, height = walker.box(drone.feedback())
+class Sight:
+    """Where the person is in the pictures that the page shows, which are old on a busy machine."""
+
+    def __init__(self, page: DronePage, walker: Walker, drone: Drone) -> None:
+        self._page, self._walker = page, walker
+        self._states: deque[Feedback] = deque(maxlen=2000)
+        drone.on_feedback(self._states.append, inline=True)
+        page.until(lambda: bool(self._states), "it is known where the drone is")
+
+    def on_screen(self, captured: str = "") -> Edges:
+        """Where the person is in the picture of a capture; without one, in that which is on the screen."""
+        captured_ns = int(captured or self._page.attribute(".camera", "data-drawn"))
+        state = min(list(self._states), key=lambda state: abs(state.captured_ns - captured_ns))
+        return on_screen(self._page, self._walker.box(state))
+
+    def draw(
+        self, press: Callable[[float, float], None], drag: Callable[[float, float], None], lift: Callable[[], None]
+    ) -> None:
+        """Drag a box around the person as the picture shows it that stands still; anew if it is another one by then."""
+        page = self._page
+        still = page.pane.locator(".still")
+
+        def pressed() -> bool:
+            left, top, right, _ = self.on_screen()
+            press(left, top)
+            page.until(
+                lambda: still.is_visible() or "One moment" in page.says(".follow-hint"), "the picture stands still"
+            )
+            if not still.is_visible():  # the cockpit has not kept that one
+                lift()
+                return False
+            stands = self.on_screen(page.attribute(".still", "data-captured"))
+            if abs(stands[0] - left) < 0.15 * (right - left):
+                return True
+            lift()  # which is no box
+            page.until(lambda: not still.is_visible(), "it goes on")
+            return False
+
+        page.until(pressed, "the picture is the one that was looked at")
+        left, _, right, bottom = self.on_screen(page.attribute(".still", "data-captured"))
+        drag((left + right) / 2, bottom)
+        drag(right, bottom)
+
+
+def on_screen(page: DronePage, box: Box) -> Edges:
+    """Left, top, right and bottom of a box of the picture on the screen, a little loosely [CSS pixels]."""
+    x, y, width, height = box
     picture = page.pane.locator(".video").first.bounding_box()
     assert picture is not None
     columns, rows = (int(page.attribute(".video", side)) for side in ("width", "height"))
@@ -65,16 +112,16 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
     with skyloop.connect("chaser", access="observe", name="test") as drone:
         page.take_off()
         page.wait_for_new_picture()
+        sight, mouse = Sight(page, walker, drone), page.page.mouse
         began_m = place_x(drone)
         page.press("f")
         page.wait_for_text(".follow-hint", "Drag a box")
-        left, top, right, bottom = on_screen(page, walker, drone)
-        mouse = page.page.mouse
-        mouse.move(left, top)
-        mouse.down()
-        mouse.move((left + right) / 2, bottom, steps=3)
-        mouse.move(right, bottom)
-        page.until(lambda: page.pane.locator(".still").is_visible(), "the picture stands still")
+
+        def press(x: float, y: float) -> None:
+            mouse.move(x, y)
+            mouse.down()
+
+        sight.draw(press, lambda x, y: mouse.move(x, y, steps=3), mouse.up)
         picture(page, "follow-drag")
         mouse.up()
         panel = page.pane.get_by_role("region", name="Target")
@@ -106,7 +153,7 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
         page.wait_for_text(".follow-hint", "Drag a box")
 
         def hover_over_it() -> bool:
-            left, top, right, bottom = on_screen(page, walker, drone)
+            left, top, right, bottom = sight.on_screen()
             mouse.move((left + right) / 2, (top + bottom) / 2)
             return bool(page.pane.locator(".follow-box", has_text="person").is_visible())
 
@@ -134,6 +181,7 @@ def test_a_person_is_marked_with_a_finger_and_followed(deck: Deck, tmp_path: Pat
     deck.proxy("pocket", walker.uri)
     page = touched(deck, "pocket", PORTRAIT)
     with skyloop.connect("pocket", access="observe", name="test") as drone:
+        sight = Sight(page, walker, drone)
         page.wait_for_new_picture()
         tap_control(page)
         tap_until(page, "Take off", "hovering")
@@ -141,11 +189,12 @@ def test_a_person_is_marked_with_a_finger_and_followed(deck: Deck, tmp_path: Pat
         page.pane.get_by_role("button", name="Follow something in camera front").tap()
         page.wait_for_text(".follow-hint", "Drag a box")
         picture(page, "follow-phone-hint")
-        left, top, right, bottom = on_screen(page, walker, drone)
         with fingers.on(page.page) as hand:
-            hand.put("finger", left, top)
-            hand.put("finger", (left + right) / 2, bottom)
-            hand.put("finger", right, bottom)
+
+            def put(x: float, y: float) -> None:
+                hand.put("finger", x, y)
+
+            sight.draw(put, put, lambda: hand.lift("finger"))
             hand.lift("finger")
         page.wait_for_text(".follow-phase", "Tracked: nothing flies")
         picture(page, "follow-phone-marked")

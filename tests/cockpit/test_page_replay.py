@@ -76,6 +76,9 @@ def test_a_flight_is_recorded_kept_in_order_and_replayed(deck: Deck, tmp_path: P
 
     page = replay(deck, "First flight.mcap")
     page.until(lambda: position(page) > 0.2, "it plays", LONG_S)
+    shown = page.pane.get_attribute("data-drone")
+    surroundings = f"fetch('/api/drones/{shown}/world').then((answer) => answer.json())"
+    page.until(lambda: page.page.evaluate(surroundings)["room"] is not None, "its map has the recorded room", LONG_S)
     page.pane.locator(".replay-slider").focus()
     page.press("Space")
     page.until(lambda: page.attribute(".replay", "data-paused") == "true", "it is paused")

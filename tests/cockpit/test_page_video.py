@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 import skyloop
+from skyloop.client import Frame
 from skyloop.drivers.registry import make_driver
-from skyloop.messages import FlightState
+from skyloop.messages import FlightState, Polyline
 from skyloop.proxy import Proxy
 from skyloop.transport.local import LocalServer
 from tests.cockpit.browser import WATCHED, Deck, DronePage
@@ -24,6 +25,13 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 pytestmark = pytest.mark.process
+#: How much of the overlay is drawn on.
+DRAWN_ON: Final = """(sheet) => {
+  const { data } = sheet.getContext("2d").getImageData(0, 0, sheet.width, sheet.height);
+  let most = 0;
+  for (let at = 3; at < data.length; at += 4) most = Math.max(most, data[at]);
+  return most;
+}"""
 pytest.importorskip("av", reason="H.264 needs: skyloop install video")
 
 NO_DECODER: Final = "delete window.VideoDecoder"
@@ -230,3 +238,29 @@ def test_a_stopped_page_harms_neither_the_pilot_nor_other_pages(open_cockpit: tu
     frozen.until(lambda: frozen.attribute(".camera", "data-stale") == "false", "it is live again")
     frozen.wait_for_new_picture()
     assert (live.problems, frozen.problems) == ([], [])
+
+
+def test_drawings_that_come_late_are_shown_pale_or_the_page_says_why_not(deck: Deck) -> None:
+    """Those of a detector that takes half a second were never seen, and nobody knew why."""
+    deck.proxy("slow")
+    page = deck.page("slow")
+    late_s = 0.6
+    frames: list[Frame] = []
+    with skyloop.connect("slow", access="observe", name="test") as drone:
+
+        def draw(frame: Frame) -> None:
+            frames.append(frame)
+            while drone.now_ns - frames[0].captured_ns > late_s * 1e9:
+                old = frames.pop(0)
+                drone.annotate(old, [Polyline(((40, 40), (200, 40), (200, 160)), closed=True)], source="detector")
+
+        drone.on_frame(draw)
+        page.until(lambda: "shown pale" in page.says(".drawn-late"), "it says that they are late")
+        assert re.search(r"detector draws 0\.[6-9] s late", page.says(".drawn-late"))
+        overlay = page.pane.locator(".overlay").first
+        page.until(lambda: 0 < overlay.evaluate(DRAWN_ON) < 200, "they are shown, pale")
+        late_s = 1.6
+        page.until(lambda: "not shown" in page.says(".drawn-late"), "it says why they are not")
+        page.until(lambda: overlay.evaluate(DRAWN_ON) == 0, "things are elsewhere by then")
+    page.until(lambda: page.says(".drawn-late") == "", "nothing is late any more")
+    assert page.problems == []

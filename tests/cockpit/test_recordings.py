@@ -13,7 +13,7 @@ from starlette.websockets import WebSocketDisconnect
 from skyloop.client import Drone
 from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.recordings import Recordings
-from skyloop.errors import LinkError, UnknownNameError
+from skyloop.errors import LinkError, NoAnswerError, UnknownNameError
 from skyloop.recording import Recorder, record
 from skyloop.recording.listing import Described, describe
 from tests.cockpit.fake import ORIGIN, FakeRecorder, Node, Nodes, cockpit, open_socket, until
@@ -160,6 +160,22 @@ def test_a_real_recording_is_listed_and_reported_on(nodes: Nodes, folder: Path) 
         assert policy.startswith("sandbox allow-scripts;"), "its script runs without this page's rights"
         assert "connect-src" not in policy
         assert client.get("/api/recordings/flight.mcap/report?drone=beta").status_code == 400
+
+
+def test_a_replay_that_does_not_start_in_time_says_what_to_do(
+    nodes: Nodes, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def busy(uri: str, *, timeout_s: float, **_: Any) -> Drone:
+        assert timeout_s >= 60.0, "a computer under load takes long"
+        raise NoAnswerError(f"the proxy for {uri} did not start in time")
+
+    monkeypatch.setattr("skyloop.client.connect", busy)
+    folder.mkdir()
+    (folder / "flight.mcap").write_bytes(b"")
+    with serve(nodes, folder) as client:
+        answer = post(client, "recordings/flight.mcap/replay")
+    assert answer.status_code == 502
+    assert answer.json()["error"].startswith("the replay of flight.mcap has not started within 60 s: this computer is")
 
 
 def test_a_replay_shows_up_and_can_be_ended(nodes: Nodes, folder: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.drone import open_drone
-from skyloop.cockpit import authority_report
+from skyloop.cockpit import takeover
 from skyloop.cockpit.commands import decode_command
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
@@ -158,7 +158,7 @@ def test_control_that_was_offered_in_vain_and_taken_later_is_lost_all_the_same(
 ) -> None:
     """Who is pre-empted was told, as of something that went well, to have handed control over."""
     monkeypatch.setattr(PilotConnection, "answer_takeover", lambda *_: None)
-    monkeypatch.setattr(authority_report, "GIVEN_S", 0.0)
+    monkeypatch.setattr(takeover, "GIVEN_S", 0.0)
     with page(client) as pilot:
         pilot.take(8)
         with asks(node) as drone:
@@ -225,6 +225,35 @@ def test_a_page_that_asked_takes_over_when_it_can_wait_no_longer(client: TestCli
         pilot.say("take", priority=8, ask=True)
         waits(pilot, asked=True, position=1)
         pilot.take(8)
+
+
+def test_who_presses_take_control_in_line_stays_there_unless_it_has_it(client: TestClient, node: Node) -> None:
+    """The page left the line without a word: the press was refused, and with it went its connection."""
+    with node.connect("demo", priority=4) as demo, page(client) as pilot:
+        demo.on_takeover(lambda _: "measuring")
+        pilot.say("take", priority=8, ask=True)
+        waits(pilot, declined="measuring", position=1)
+        pilot.say("take", priority=8)
+        why = pilot.wait("refused", do="take")["why"]
+        assert "demo has control with priority 4" in why
+        assert "you keep your place in line" in why
+        pilot.say("ping")
+        pilot.wait("pong")
+        assert [told["state"] for told in pilot.told if told["type"] == "authority"][-1] == "queued"
+        demo.release_authority()
+        pilot.wait("authority", mine=True)
+
+
+def test_every_page_knows_which_pages_wait(client: TestClient, node: Node) -> None:
+    with page(client) as first, page(client) as second, page(client) as third:
+        mine = first.take(8).told[-1]
+        assert mine["waiting"] == []
+        second.say("take", priority=9, ask=True)
+        app = first.wait("authority", waiting=[question(first)["by"]])["waiting"][0]
+        assert third.wait("authority", waiting=[app])["holder"] == mine["app"]
+        second.say("release")
+        for one in (first, third):
+            one.wait("authority", waiting=[])
 
 
 def test_a_page_that_dies_waits_no_more(client: TestClient, node: Node) -> None:

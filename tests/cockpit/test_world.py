@@ -26,6 +26,7 @@ def drone_with(**values: Value) -> Any:
     feedback = Feedback(captured_ns=1, position_m=(0.0, 0.0, 1.0), altitude_m=1.0, yaw_rad=0.0)
     return SimpleNamespace(
         config=SimpleNamespace(parameters=lambda: found),
+        uri="sim://",
         capabilities=Capabilities("test"),
         feedback=lambda max_hz: feedback,
         now_ns=2,
@@ -38,6 +39,24 @@ def test_a_world_survives_its_text(name: str) -> None:
     text = encode_world(world)
     assert len(text) <= MAX_TEXT
     assert decode_world(text) == world
+
+
+def test_a_replay_shows_what_stood_around_the_recorded_flight() -> None:
+    """Its map was empty: the recorded parameters have a prefix, and those without are of the replay's own proxy."""
+    world = geometry_of(load_world("gates"))
+    drone = drone_with(
+        recorded__world__geometry=encode_world(world),
+        recorded__safety__zones="box 0 0 0 1 1 2",
+        recorded__limits__speed=2.0,
+        limits__speed=9.0,
+        safety__zones="",
+    )
+    assert world_values(drone, None)["source"] is None, "one that flies has recorded nothing"
+    drone.uri = "replay:///flights/one.mcap"
+    values = world_values(drone, None)
+    assert (values["name"], values["source"]) == ("gates", "vehicle")
+    assert [zone["kind"] for zone in values["zones"]] == ["box"]
+    assert values["limits"]["speed"] == 2.0
 
 
 def test_a_world_that_is_too_large_says_what_is_missing() -> None:

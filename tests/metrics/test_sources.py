@@ -10,7 +10,7 @@ import pytest
 
 from skyloop.client.drone import open_drone
 from skyloop.cockpit.fleet import Fleet
-from skyloop.cockpit.metrics import fleet_sources
+from skyloop.cockpit.server import fleet_sources
 from skyloop.messages import EventKind, LinkState, Role, Velocity
 from skyloop.metrics import FAMILIES, Reading, client_readings, proxy_readings, router_readings
 from skyloop.network import FabricServer, FabricSettings

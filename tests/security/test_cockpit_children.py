@@ -127,7 +127,7 @@ def test_a_page_that_is_closed_ends_its_report(tmp_path: Path, monkeypatch: pyte
 def test_a_report_ends_with_the_process_that_wanted_it(tmp_path: Path) -> None:
     fifo = tmp_path / "never.mcap"
     os.mkfifo(fifo)  # who opens it waits for ever
-    command = [sys.executable, "-m", "skyloop.cockpit.reports", str(fifo), str(tmp_path / "report.html")]
+    command = [sys.executable, "-m", "skyloop.cockpit.reports", "report", str(fifo), str(tmp_path / "report.html")]
     with subprocess.Popen(command, stdin=subprocess.PIPE) as child:
         assert child.stdin is not None
         with pytest.raises(subprocess.TimeoutExpired):

@@ -101,6 +101,7 @@ export const en = {
         computer: `${what}: this computer is busy`,
         source: `${what}: pictures come late to the cockpit`,
       })[why],
+    late: (source: string, time: string, isShown: boolean) => `${source} draws ${time} s late: ${isShown ? "shown pale" : "not shown"}`,
     cameras: "Cameras",
     overlay: "Overlay",
     noCamera: "No camera",
@@ -174,6 +175,7 @@ export const en = {
     orders: { newest: "Newest", name: "By name", longest: "Longest", largest: "Largest" },
     replay: "Replay",
     replayOf: (name: string) => `Replay ${name}`,
+    starting: (name: string, seconds: number) => `Starting the replay of ${name}…${seconds < 3 ? "" : ` ${seconds} s. A busy computer takes up to a minute.`}`,
     report: "Report",
     reportOf: (name: string) => `Report of ${name}`,
     more: "More",
@@ -598,6 +600,20 @@ export const en = {
     askLong: "Who has control is asked first, and may say no; a higher priority has it after a time all the same",
     ask: "Ask first",
     line: "Your place in the line",
+    now: {
+      nobody: "nobody waits for it",
+      wait: (names: readonly string[], youToo: boolean) => {
+        const all = youToo ? ["you", ...names] : names;
+        return `${all.join(" and ")} ${all.length > 1 || youToo ? "wait" : "waits"} for it`;
+      },
+      mine: (waits: string, isAsked: boolean) => `You have control, and ${waits}: ${isAsked ? "hand it over, keep it, or fly on" : "fly, or release it"}.`,
+      inLine: (holder: string, waits: string, isBack: boolean) => `${holder} has control, and ${waits}: it is ${isBack ? "yours again" : "yours"} when it is released and you are first.`,
+      free: (waits: string) => `Nobody has control${waits && `, and ${waits}`}: take it to fly.`,
+      others: (holder: string, waits: string, may: string) => `${holder} has control, and ${waits}: ${may}.`,
+      ask: "ask for it, and it may be handed over",
+      higher: (own: number) => `you can take it at once, as your priority ${own} is higher`,
+      noHigher: (own: number) => `choose “Ask first” to ask for it, as your priority ${own} is no higher`,
+    },
     control: "Who has control",
     take: "Take control",
     release: "Release",

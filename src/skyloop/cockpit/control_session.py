@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, Final
 from starlette.websockets import WebSocket
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.authority_report import AuthorityReport
 from skyloop.cockpit.broadcast import call_soon
 from skyloop.cockpit.commands import (
     SETTLED_NS,
@@ -56,10 +55,9 @@ from skyloop.cockpit.commands import (
     untimely,
 )
 from skyloop.cockpit.follow_session import NO_CONTROL, FollowerFactory, FollowSession
-from skyloop.cockpit.place_flight import UP, Leg, PlaceFlight, to_place, to_start
-from skyloop.cockpit.route_session import RouteSession
+from skyloop.cockpit.place_flight import UP, Leg, PlaceFlight, RouteSession, to_place, to_start
 from skyloop.cockpit.stream import PageSocket
-from skyloop.cockpit.takeover import TakeoverDialog
+from skyloop.cockpit.takeover import AuthorityReport, TakeoverDialog
 from skyloop.control.route_flight import check_for
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
@@ -159,6 +157,11 @@ class ControlSession:
             StopFollowing: self._stop_following,
             Write: lambda command: self._run_in_turn(command, self._write),
         }
+
+    @property
+    def waits(self) -> bool:
+        """Whether the page waits for the authority: in the queue, or to have it back."""
+        return self._pilot is not None and self._pilot.authority.state in ("queued", "preempted")
 
     async def run(self) -> None:
         """Serve the page until it is gone, then leave the vehicle in a safe state."""
@@ -361,6 +364,9 @@ class ControlSession:
         elif not pilot.is_linked:
             raise LinkError("the link to the proxy is lost: control can be taken when it is back")
         pilot.present_until(monotonic_ns() + nanoseconds(GONE_S))
+        if self.waits and not command.ask and not self._authority.outranks(command.priority):
+            # To ask the proxy would be to leave the queue.
+            raise AuthorityError(f"{self._authority.busy(command.priority)}; you keep your place in line", code="busy")
         self._takeover.request(ask=command.ask)
         self._acknowledge(command)
         try:

@@ -1,22 +1,31 @@
-"""One page's flight to a place, or back to the start: what is commanded, and when it is over. On the event loop."""
+"""One page's flights, to a place, back to the start, along a route: what is commanded, and when it is over.
+
+The course of a route is :class:`skyloop.control.route_law.RouteLaw`'s. On the event loop.
+"""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.client.commands import position_action
 from skyloop.client.completion import ReturnWatch
+from skyloop.control.route_flight import save_photo
+from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto
 from skyloop.control.waypoint import Waypoint, lacking, reached
-from skyloop.errors import RefusedError, SkyloopError
-from skyloop.messages import Feedback, FlightState, Position, ReturnPhase, ReturnToStart
+from skyloop.errors import LinkError, RefusedError, SkyloopError
+from skyloop.messages import Feedback, FlightState, Hover, Land, Position, ReturnPhase, ReturnToStart
 
 if TYPE_CHECKING:
+    from skyloop.client import Drone
     from skyloop.cockpit.commands import GoTo
     from skyloop.cockpit.pilot_connection import PilotConnection
     from skyloop.cockpit.station import Station
+    from skyloop.control.route import Route
 
 GOTO_M_S: Final = 1.0  #: greatest speed on the way to a place
 PERIOD_S: Final = 0.05  #: between looks whether it is there
@@ -145,3 +154,143 @@ def _fit_for_places(pilot: PilotConnection, what: str) -> Feedback:
     if not feedback.state.airborne:
         raise RefusedError(f"{what}: it is not in the air, take off first")
     return feedback
+
+
+OLD_S: Final = 1.0  #: feedback that is older pauses the route
+
+
+class RouteSession:
+    """A page's flight along a route.
+
+    Args:
+        route: Checked.
+        pilot: Holds the authority.
+        drone: Whose frames are saved.
+        folder: Where photos are saved.
+        send: Sends a message to the page.
+        aim: Called with where it flies to now; None for nowhere.
+    """
+
+    def __init__(
+        self,
+        route: Route,
+        pilot: PilotConnection,
+        drone: Drone,
+        folder: Path,
+        send: Callable[[dict[str, Any]], None],
+        aim: Callable[[Waypoint | None], None],
+    ) -> None:
+        self.law = RouteLaw(route)
+        self._pilot = pilot
+        self._drone = drone
+        self._folder = folder
+        self._send = send
+        self._aim = aim
+        self._action: Position | None = None
+        self._photos: set[asyncio.Task[None]] = set()
+        self._job: asyncio.Task[None] | None = None
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether it commands the vehicle now."""
+        return self.law.is_under_way
+
+    def begin(self) -> None:
+        """Fly to the first waypoint, and watch the flight on a task until :meth:`end`.
+
+        Raises:
+            SkyloopError: The drone is on the ground, its position is not known, or the command was not sent.
+        """
+        self._carry_out(self.law.start(self._pilot.feedback(max_age_s=OLD_S)))
+        self._job = asyncio.create_task(self._watch())
+
+    def pause(self, why: str = "", *, hover: bool = True) -> None:
+        """Pause; without ``hover`` because something else was commanded, or the control is gone."""
+        self._carry_out(self.law.pause(why), send=hover)
+
+    def resume(self) -> None:
+        """Fly on."""
+        self._ask(self.law.resume)
+
+    def skip(self) -> None:
+        """Leave the present waypoint out."""
+        self._ask(self.law.skip)
+
+    def end(self, *, hover: bool = True) -> None:
+        """End it for good; without ``hover`` because something else was commanded, or the control is gone."""
+        if self._job is not None:
+            self._job.cancel()
+        self._carry_out(self.law.stop(), send=hover)
+
+    def _ask(self, what: Callable[[], list[Effect]]) -> None:
+        try:
+            self._carry_out(what())
+        except SkyloopError as error:
+            self.pause(str(error), hover=False)
+            raise
+
+    async def _watch(self) -> None:
+        while not self.law.over:
+            await asyncio.sleep(PERIOD_S)
+            if self.is_under_way:
+                self._step()
+
+    def _step(self) -> None:
+        try:
+            if self._action is not None and self._pilot.has_ended(self._action):
+                raise RefusedError("it was ended on the way, by a failsafe or a lost link")
+            feedback = self._pilot.feedback(max_age_s=OLD_S)
+            if feedback.others:
+                raise RefusedError(feedback.others)
+            self._carry_out(self.law.update(feedback, feedback.captured_ns), automatic=True)
+        except SkyloopError as error:
+            self.pause(str(error), hover=False)
+            self._pilot.let_go(str(error))
+
+    def _carry_out(self, effects: list[Effect], *, send: bool = True, automatic: bool = False) -> None:
+        for effect in effects:
+            if isinstance(effect, Command):
+                self._action = effect.action if isinstance(effect.action, Position) else None
+                if send:
+                    self._command(effect.action, automatic=automatic)
+            elif isinstance(effect, TakePhoto):
+                task = asyncio.create_task(self._photograph(effect))
+                self._photos.add(task)
+                task.add_done_callback(self._photos.discard)
+            else:
+                self._tell(effect)
+        if effects:
+            self._aim(self.law.goal if self.law.is_under_way else None)
+
+    def _command(self, action: Position | Hover | Land, *, automatic: bool) -> None:
+        pilot = self._pilot
+        if automatic and not isinstance(action, Position):  # nobody decides that now
+            pilot.let_go("of its route", land=isinstance(action, Land))
+            return
+        if pilot.command(action):
+            return
+        with suppress(SkyloopError):
+            pilot.idle()  # or it would be done after all when the link is back soon
+        raise LinkError(f"{action.name} was not sent: the link to the proxy is {pilot.link.application}")
+
+    def _tell(self, step: Progress) -> None:
+        law = self.law
+        self._send(
+            {
+                "type": "route",
+                "state": str(law.state),
+                "kind": step.kind,
+                "waypoint": step.waypoint,
+                "of": len(law.route.waypoints),
+                "text": step.text,
+                "problem": law.problem,
+            }
+        )
+
+    async def _photograph(self, wanted: TakePhoto) -> None:
+        try:
+            await asyncio.to_thread(save_photo, self._drone, self._folder, wanted)
+        except SkyloopError as error:
+            self.law.photo_done(str(error))
+        else:
+            self.law.photo_done()

@@ -11,23 +11,100 @@ import asyncio
 import itertools
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from urllib.parse import quote
 
 import msgspec
 
-from skyloop.cockpit import recording_files, timeline
-from skyloop.cockpit.recorders import Recorder, Replay, Running, progress, start_recorder, start_replay
-from skyloop.cockpit.recording_files import Mark, Notes
-from skyloop.cockpit.reports import Reports
-from skyloop.errors import FileFormatError, RefusedError, UnknownNameError, UsageError
+from skyloop.cockpit import recording_files
+from skyloop.cockpit.recording_files import Notes
+from skyloop.cockpit.reports import Reports, timeline_command
+from skyloop.errors import FileFormatError, NoAnswerError, RefusedError, UnknownNameError, UsageError
 from skyloop.messages import Refusal
 from skyloop.recording.listing import ENDING, Described, describe, shown_name
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
+    from skyloop.recording import Status
+
+REPLAY_S: Final = 60.0  #: for the proxy of a replay to answer: on a busy computer it takes long, and the page says so
+
+
+class Recorder(Protocol):
+    """What records; :class:`skyloop.recording.Recorder` is one."""
+
+    @property
+    def status(self) -> Status: ...
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """A recording that goes on."""
+
+    drones: tuple[str, ...]
+    recorder: Recorder
+
+
+def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
+    """Record proxies to a new file of a folder.
+
+    Raises:
+        SkyloopError: It can't start.
+    """
+    from skyloop.recording import record
+
+    return record(drones, folder)
+
+
+def start_replay(path: Path, drone: str | None = None) -> Drone:
+    """Start a private proxy that plays a file, and connect to it.
+
+    Args:
+        path: The file.
+        drone: Which of the recorded ones; None for the first.
+
+    Raises:
+        SkyloopError: It can't start.
+    """
+    from skyloop.client import connect
+
+    which = "" if drone is None else f"?drone={quote(drone)}"
+    try:
+        return connect(f"replay://{quote(str(path))}{which}", access="observe", name="cockpit", timeout_s=REPLAY_S)
+    except NoAnswerError as error:
+        raise NoAnswerError(
+            f"the replay of {path.name} has not started within {REPLAY_S:g} s: this computer is too busy. "
+            "End other replays and programs, and try again"
+        ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """A recording that is played again."""
+
+    drone: Drone  #: the observer that keeps its proxy running
+    path: Path
+    recorded: str | None  #: the drone's name in the recording; None: the first
+
+
+def progress(status: Status) -> dict[str, Any]:
+    """Return how far a recording is, as JSON values."""
+    return {
+        "path": status.path,
+        "state": str(status.state),
+        "reason": status.reason,
+        "seconds": round(status.seconds, 3),
+        "bytes": status.bytes,
+        "dropped": status.dropped,
+        "missed": status.missed,
+    }
+
 
 Json = dict[str, Any]
+T = TypeVar("T")
 
 MAX_CHILDREN: Final = 8  #: recordings at one time, and as many replays: each is a process
 MOST_LISTED: Final = 500
@@ -53,8 +130,8 @@ class Recordings:
         self.replays: dict[str, Replay] = {}  #: by the name of the proxy
         self._record = record
         self._replay = replay
-        self._reports = Reports()
-        self._timelines = Reports(timeline.child_command, "time line")
+        self.reports = Reports()
+        self._timelines = Reports(timeline_command, "time line")
         self._made: dict[tuple[Path, float, str | None], str] = {}  # time lines, the newest last
         self._changing = asyncio.Lock()
         self._starting = asyncio.Lock()
@@ -122,19 +199,6 @@ class Recordings:
             trash = await asyncio.to_thread(recording_files.trash_of, self.folder)
         return {"folder": str(self.folder), "running": running, "past": past, "trash": trash}
 
-    async def report(self, name: str, drone: str | None = None) -> str:
-        """Return the page that ``skyloop log report`` makes.
-
-        Args:
-            name: The file's, in the folder.
-            drone: Which of the recorded ones; None for the only one.
-
-        Raises:
-            UnknownNameError: There is no such file.
-            SkyloopError: What :meth:`skyloop.cockpit.reports.Reports.make` raises.
-        """
-        return await self._reports.make(await self.path(name), drone)
-
     def mark(self, number: str, text: str) -> tuple[str, ...]:
         """Check a mark for a running recording, and return the drones that it is for.
 
@@ -157,61 +221,32 @@ class Recordings:
         """
         return await asyncio.to_thread(self._path, name)
 
-    async def rename(self, name: str, new: str) -> str:
-        """Rename a recording, and return its name.
+    async def move(self, name: str, change: Callable[[Path], str]) -> str:
+        """Rename a recording that nobody here writes or plays, or throw it away; return its name then.
 
         Raises:
             UnknownNameError: There is no such file.
-            RefusedError: It is in use, or there is a file of that name.
-            UsageError: It can't be a name.
+            RefusedError: It is in use, or ``change`` refuses it.
         """
-        recording_files.check_name(new)
-        return await self._change(name, lambda path: recording_files.rename(path, new))
+        async with self._starting, self._changing:
+            for running in self._running.values():
+                if name in (Path(file).name for file in running.recorder.status.files):
+                    raise RefusedError(f"{name} is being recorded: stop that first", code=Refusal.BUSY)
+            path = (await self.path(name)).absolute()
+            for played, replay in self.replays.items():
+                if replay.path == path:
+                    raise RefusedError(f"{name} is being replayed as {played}: end that first", code=Refusal.BUSY)
+            return await asyncio.to_thread(change, path)
 
-    async def delete(self, name: str) -> str:
-        """Move a recording to the trash, and return its name there.
-
-        Raises:
-            UnknownNameError: There is no such file.
-            RefusedError: It is in use.
-        """
-        return await self._change(name, recording_files.throw_away)
-
-    async def restore(self, name: str) -> str:
-        """Bring a recording back from the trash, and return its name.
-
-        Raises:
-            UnknownNameError: It is not in the trash.
-            RefusedError: There is a file of that name.
-        """
+    async def annotate(self, name: str, write: Callable[[Path], Notes]) -> Notes:
+        """Change what people wrote about a recording; :class:`UnknownNameError` if there is no such file."""
         async with self._changing:
-            return await asyncio.to_thread(recording_files.bring_back, self.folder, name)
+            return await asyncio.to_thread(write, await self.path(name))
 
-    async def empty_trash(self) -> None:
-        """Delete what is in the trash, for good."""
+    async def in_trash(self, work: Callable[[Path], T]) -> T:
+        """Bring something back from the trash of the folder, or empty it."""
         async with self._changing:
-            await asyncio.to_thread(recording_files.empty_trash, self.folder)
-
-    async def notes(self, name: str) -> Notes:
-        """Return what people wrote about a recording.
-
-        Raises:
-            UnknownNameError: There is no such file.
-            FileFormatError: The notes can't be read.
-        """
-        return await asyncio.to_thread(recording_files.read_notes, await self.path(name))
-
-    async def write_note(self, name: str, text: str) -> Notes:
-        """Write the note of a recording; see :func:`skyloop.cockpit.recording_files.write_text`."""
-        return await self._annotate(name, lambda path: recording_files.write_text(path, text))
-
-    async def add_mark(self, name: str, at_s: float, text: str) -> Notes:
-        """Add a mark to a recording; see :func:`skyloop.cockpit.recording_files.add_mark`."""
-        return await self._annotate(name, lambda path: recording_files.add_mark(path, at_s, text))
-
-    async def remove_mark(self, name: str, mark: Mark) -> Notes:
-        """Remove a mark from a recording; see :func:`skyloop.cockpit.recording_files.remove_mark`."""
-        return await self._annotate(name, lambda path: recording_files.remove_mark(path, mark))
+            return await asyncio.to_thread(work, self.folder)
 
     # Replays ---------------------------------------------------------------------------------------------------
 
@@ -244,7 +279,7 @@ class Recordings:
             name: Of the proxy.
 
         Returns:
-            The file's name, what :func:`skyloop.cockpit.timeline.timeline` returns, and the notes, as JSON values.
+            The file's name, what :func:`skyloop.cockpit.reports.timeline` returns, and the notes, as JSON values.
 
         Raises:
             UnknownNameError: No such replay was started here.
@@ -282,22 +317,6 @@ class Recordings:
     def _entry(self, number: str) -> Json:
         running = self._running[number]
         return {"id": number, "drones": list(running.drones), **progress(running.recorder.status)}
-
-    async def _change(self, name: str, change: Callable[[Path], str]) -> str:
-        """Move a file that nobody here writes or plays."""
-        async with self._starting, self._changing:
-            for running in self._running.values():
-                if name in (Path(file).name for file in running.recorder.status.files):
-                    raise RefusedError(f"{name} is being recorded: stop that first", code=Refusal.BUSY)
-            path = (await self.path(name)).absolute()
-            for played, replay in self.replays.items():
-                if replay.path == path:
-                    raise RefusedError(f"{name} is being replayed as {played}: end that first", code=Refusal.BUSY)
-            return await asyncio.to_thread(change, path)
-
-    async def _annotate(self, name: str, write: Callable[[Path], Notes]) -> Notes:
-        async with self._changing:
-            return await asyncio.to_thread(write, await self.path(name))
 
     def _path(self, name: str) -> Path:
         known = {shown_name(path): path for path in self._files()}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
@@ -10,13 +12,14 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, Response
 from starlette.routing import Route
 
+from skyloop.cockpit import recording_files
 from skyloop.cockpit.answers import answer_json, answered, body_of, check_json, while_wanted
-from skyloop.cockpit.recording_files import Mark
-from skyloop.cockpit.timeline import MARK
+from skyloop.cockpit.reports import MARK
 from skyloop.errors import UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.recording_files import Notes
     from skyloop.cockpit.recordings import Recordings
     from skyloop.cockpit.station import Station
 
@@ -136,57 +139,62 @@ class RecordingsApi:
     @answered
     async def report(self, request: Request) -> Response:
         """Answer with the report on a recording, as a page."""
-        report = self._recordings.report(request.path_params["name"], request.query_params.get("drone"))
-        page = await while_wanted(request, report)
+        path = await self._recordings.path(request.path_params["name"])
+        page = await while_wanted(request, self._recordings.reports.make(path, request.query_params.get("drone")))
         return HTMLResponse(page, headers={"content-security-policy": _REPORT_POLICY})
 
     @answered
     async def notes(self, request: Request) -> Response:
         """Answer with what people wrote about a recording."""
-        return answer_json(await self._recordings.notes(request.path_params["name"]))
+        path = await self._recordings.path(request.path_params["name"])
+        return answer_json(await asyncio.to_thread(recording_files.read_notes, path))
 
     @answered
     async def write_note(self, request: Request) -> Response:
         """Write the note of a recording."""
         text = (await body_of(request, _Words)).text
-        return answer_json(await self._recordings.write_note(request.path_params["name"], text))
+        return await self._annotate(request, lambda path: recording_files.write_text(path, text))
 
     @answered
     async def add_mark(self, request: Request) -> Response:
         """Add a mark to a recording."""
         mark = await body_of(request, _Mark)
-        return answer_json(await self._recordings.add_mark(request.path_params["name"], mark.at_s, mark.text), 201)
+        return await self._annotate(request, lambda path: recording_files.add_mark(path, mark.at_s, mark.text), 201)
 
     @answered
     async def remove_mark(self, request: Request) -> Response:
         """Remove a mark from a recording."""
         mark = await body_of(request, _Mark)
-        name = request.path_params["name"]
-        return answer_json(await self._recordings.remove_mark(name, Mark(mark.at_s, mark.text)))
+        return await self._annotate(
+            request, lambda path: recording_files.remove_mark(path, recording_files.Mark(mark.at_s, mark.text))
+        )
 
     @answered
     async def rename(self, request: Request) -> Response:
         """Rename a recording."""
-        name = (await body_of(request, _Name)).name
-        return answer_json({"name": await self._recordings.rename(request.path_params["name"], name)})
+        new = (await body_of(request, _Name)).name
+        recording_files.check_name(new)
+        return await self._move(request, lambda path: recording_files.rename(path, new))
 
     @answered
     async def delete(self, request: Request) -> Response:
         """Move a recording to the trash."""
         check_json(request)
-        return answer_json({"name": await self._recordings.delete(request.path_params["name"])})
+        return await self._move(request, recording_files.throw_away)
 
     @answered
     async def restore(self, request: Request) -> Response:
         """Bring a recording back from the trash."""
         check_json(request)
-        return answer_json({"name": await self._recordings.restore(request.path_params["name"])})
+        name = request.path_params["name"]
+        back = await self._recordings.in_trash(lambda folder: recording_files.bring_back(folder, name))
+        return answer_json({"name": back})
 
     @answered
     async def empty_trash(self, request: Request) -> Response:
         """Delete what is in the trash."""
         check_json(request)
-        await self._recordings.empty_trash()
+        await self._recordings.in_trash(recording_files.empty_trash)
         return answer_json({})
 
     # Replays ---------------------------------------------------------------------------------------------------
@@ -230,6 +238,12 @@ class RecordingsApi:
         await self._recordings.end_replay(name)
         self._fleet.let_go(name)
         return answer_json({"drone": name})
+
+    async def _annotate(self, request: Request, write: Callable[[Path], Notes], status: int = 200) -> Response:
+        return answer_json(await self._recordings.annotate(request.path_params["name"], write), status)
+
+    async def _move(self, request: Request, change: Callable[[Path], str]) -> Response:
+        return answer_json({"name": await self._recordings.move(request.path_params["name"], change)})
 
     def _station(self, name: str) -> Station:
         stations = self._fleet.stations

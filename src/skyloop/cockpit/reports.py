@@ -3,7 +3,9 @@
 A report keeps a core busy for seconds, and everybody who may watch may ask for one. So requests wait in a short queue,
 and are refused when it is full; if who asked goes away, the request leaves the queue, or the work ends.
 
-``python -m skyloop.cockpit.reports FILE TARGET [DRONE]`` is the child.
+What a replay's bar shows, a *timeline*, is made in the same way: events and marks, and how the flight went, thinned.
+
+``python -m skyloop.cockpit.reports report|timeline FILE TARGET [DRONE]`` is the child.
 """
 
 from __future__ import annotations
@@ -15,15 +17,23 @@ import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
 
 from skyloop.child_process import on_parent_end
+from skyloop.clock import seconds
+from skyloop.cockpit.values import flat_values, truth_values, vector
 from skyloop.errors import LinkError, RefusedError, SkyloopError, UsageError
-from skyloop.messages import Refusal
+from skyloop.messages import Event, EventKind, Feedback, LogEntry, Refusal, Severity
+from skyloop.recording.layout import Channel
+from skyloop.recording.plain import Course
 
 if TYPE_CHECKING:
     from skyloop.recording.reader import Recording
 
+REPORT: Final = "report"
+TIMELINE: Final = "timeline"
 REPORT_S: Final = 120.0  #: for one report, before the next one has its turn
 MAX_WAITING: Final = 4  #: who comes later would wait for minutes
 NICENESS: Final = 5  #: of the child, besides the cockpit's own: pages come before reports
@@ -34,8 +44,18 @@ Command = Callable[[Path, Path, str | None], Sequence[str]]
 
 
 def child_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
+    """Return the command of the child that makes a report."""
+    return _child(REPORT, file, target, drone)
+
+
+def timeline_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
+    """Return the same for what :func:`timeline` returns, as JSON."""
+    return _child(TIMELINE, file, target, drone)
+
+
+def _child(what: str, file: Path, target: Path, drone: str | None) -> Sequence[str]:
     """Return the command that runs this module as a program."""
-    return [sys.executable, "-m", "skyloop.cockpit.reports", str(file), str(target), *([drone] if drone else [])]
+    return [sys.executable, "-m", "skyloop.cockpit.reports", what, str(file), str(target), *([drone] if drone else [])]
 
 
 class Reports:
@@ -107,12 +127,11 @@ class Reports:
             return await asyncio.to_thread(target.read_text, encoding="utf-8")
 
 
-def run_child(arguments: Sequence[str], make: Callable[[Recording, str, Path], None]) -> int:
+def run_child(arguments: Sequence[str]) -> int:
     """Make a file of a recording, unless standard input ends before: then who wanted it is gone.
 
     Args:
-        arguments: FILE TARGET [DRONE], of the command line.
-        make: Makes the target of the recording and the drone's name in it.
+        arguments: ``report`` or ``timeline``, FILE TARGET [DRONE], of the command line.
 
     Returns:
         The exit code: 0, or 2 with a line of explanation.
@@ -121,7 +140,8 @@ def run_child(arguments: Sequence[str], make: Callable[[Recording, str, Path], N
     on_parent_end(partial(os._exit, 1))
     from skyloop.recording.reader import Recording
 
-    file, target, *drone = arguments
+    what, file, target, *drone = arguments
+    make = _report if what == REPORT else _write_timeline
     try:
         recording = Recording.open(Path(file))
         make(recording, recording.drone(drone[0] if drone else None).name, Path(target))
@@ -137,5 +157,59 @@ def _report(recording: Recording, drone: str, target: Path) -> None:
     write_report(recording, drone, target, pictures=8)
 
 
+MARK: Final = "mark"  #: name of a logged text that is a mark
+MAX_EVENTS: Final = 300  #: the most severe ones
+MAX_MARKS: Final = 300
+MAX_SAMPLES: Final = 1200
+PERIOD_S: Final = 0.1  #: between samples, at least
+MAX_TEXT: Final = 200
+_SEVERITIES: Final = (Severity.ERROR, Severity.WARNING)
+#: Events that tell nothing about the flight.
+_LEFT_OUT: Final = frozenset({EventKind.PARAMETER_CHANGED})
+
+
+def timeline(recording: Recording, drone: str) -> dict[str, Any]:
+    """Return what happened in a recording, with positions as ``replay.position_s``, as JSON values.
+
+    Args:
+        recording: The recording.
+        drone: The name of one of its drones.
+    """
+    course = Course()
+    events: list[dict[str, Any]] = []
+    marks: list[dict[str, Any]] = []
+    times: list[float] = []
+    track: list[Any] = []
+    values: dict[str, list[float | None]] = {}
+    period_s = max(PERIOD_S, recording.seconds / MAX_SAMPLES)
+    channels = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.LOGS)
+    for item in recording.items(drone, channels):
+        if isinstance(item.value, LogEntry) and course.first_ns is None:
+            continue  # replays don't play logs: they begin with another sample
+        at_s = round(seconds(course.follow(item.value, item.entry.log_ns) - (course.first_ns or 0)), 3)
+        value = item.value
+        if isinstance(value, Event) and value.kind not in _LEFT_OUT:
+            text = value.text[:MAX_TEXT]
+            events.append({"at_s": at_s, "kind": value.kind, "severity": value.severity, "text": text})
+        elif isinstance(value, LogEntry) and value.name == MARK and value.text is not None:
+            marks.append({"at_s": at_s, "text": value.text[:MAX_TEXT]})
+        elif isinstance(value, Feedback) and (not times or at_s >= times[-1] + period_s):
+            for name, one in flat_values(msgspec.structs.replace(value, native=None), {}, None).items():
+                values.setdefault(name, [None] * len(times)).append(None if one is None else float(f"{one:.5g}"))
+            times.append(at_s)
+            for column in values.values():
+                column += [None] * (len(times) - len(column))
+            truth = truth_values(value.native)
+            place = vector(value.position_m) or (truth and truth["position"])
+            track.append(place)
+    events.sort(key=lambda event: event["severity"] not in _SEVERITIES)
+    shown = sorted(events[:MAX_EVENTS], key=lambda event: float(event["at_s"]))
+    return {"events": shown, "marks": marks[:MAX_MARKS], "times": times, "track": track, "values": values}
+
+
+def _write_timeline(recording: Recording, drone: str, target: Path) -> None:
+    target.write_bytes(msgspec.json.encode(timeline(recording, drone)))
+
+
 if __name__ == "__main__":
-    sys.exit(run_child(sys.argv[1:], _report))
+    sys.exit(run_child(sys.argv[1:]))

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,8 @@ from skyloop.cockpit.admission import Admission, Connection
 from skyloop.cockpit.listening import Listener, ProtocolFactory, limit_messages, places_here
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Role
+from skyloop.metrics.catalogue import Reading
+from skyloop.metrics.sources import client_readings
 
 if TYPE_CHECKING:
     import uvicorn
@@ -28,9 +31,13 @@ if TYPE_CHECKING:
 
     from skyloop.cockpit.access import Gate
     from skyloop.cockpit.discovery import Finder
+    from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.sessions import SessionFile
+    from skyloop.cockpit.station import Station
     from skyloop.messages.world import WorldGeometry
+    from skyloop.metrics.endpoint import Source
     from skyloop.network import FabricSettings
+
 
 NICENESS = 10  #: of the serving thread and of those that it starts: programs that fly come first
 RECORDINGS = Path("recordings")  #: where recordings go by default
@@ -127,7 +134,7 @@ def serve_cockpit(
     except ImportError as error:
         raise MissingExtraError("the cockpit", "cockpit", cause=str(error)) from error
     from skyloop.cockpit.access import TokenGate
-    from skyloop.cockpit.announcing import Announcer
+    from skyloop.cockpit.addresses import Announcer
     from skyloop.cockpit.security import bind_address
 
     access = access or Access()
@@ -298,7 +305,6 @@ def _serve(
     listener = Listener(listening, admission, http_protocol(server, admission), tls)
     with ExitStack() as beside:
         if metrics is not None:
-            from skyloop.cockpit.metrics import fleet_sources
             from skyloop.metrics import serve
 
             endpoint = beside.enter_context(serve(lambda: fleet_sources(fleet), metrics))
@@ -413,3 +419,18 @@ async def _run(
     await serving
     if not listening.cancelled():
         await listening  # what ended it
+
+
+def fleet_sources(fleet: Fleet) -> list[Source]:
+    """Return what there is to read of a fleet now: one source for each drone, and one for the fleet."""
+    stations = fleet.stations.copy()
+    return [partial(_fleet_readings, fleet), *(partial(_readings, name, one) for name, one in stations.items())]
+
+
+def _fleet_readings(fleet: Fleet) -> Iterator[Reading]:
+    yield Reading("skyloop_cockpit_unreachable", float(len(fleet.problems)))
+
+
+def _readings(name: str, station: Station) -> Iterator[Reading]:
+    yield Reading("skyloop_cockpit_pilots", float(len(station.pilots)), (name,))
+    yield from client_readings(name, station.drone)

@@ -17,9 +17,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import monotonic_ns, seconds
 from skyloop.cockpit.broadcast import Wake
-from skyloop.cockpit.camera_feed import pack
+from skyloop.cockpit.camera_feed import FPS, SmallFeed, SmallFrame, pack, rounded_width
 from skyloop.cockpit.page_stream import PageStream
-from skyloop.cockpit.small_feed import FPS, SmallFeed, SmallFrame, rounded_width
 from skyloop.cockpit.stream import encoding_values
 from skyloop.errors import SkyloopError
 from skyloop.messages import EncodedFrame

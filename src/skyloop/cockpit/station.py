@@ -9,15 +9,14 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Protocol
 
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
+from skyloop.cockpit.alarms import ThresholdReader
 from skyloop.cockpit.broadcast import ROW_HZ, Cancellable, PeriodicBroadcast
-from skyloop.cockpit.camera_feed import CameraFeed
+from skyloop.cockpit.camera_feed import CameraFeed, SmallFeed
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.encoded_feed import EncodedFeed, Form
 from skyloop.cockpit.feeds import EventFeed, LogFeed
 from skyloop.cockpit.routes import CheckedRoutes
-from skyloop.cockpit.small_feed import SmallFeed
 from skyloop.cockpit.telemetry import TelemetryView
-from skyloop.cockpit.thresholds import ThresholdReader
 from skyloop.control.waypoint import Waypoint
 from skyloop.errors import LinkError, NoAnswerError, RefusedError, SkyloopError
 from skyloop.messages import EventKind, FlightState
@@ -38,6 +37,12 @@ RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
 
 class FlyingSession(Protocol):
     """What a page flies the drone by."""
+
+    app: str  #: the name under which everybody sees who flies
+
+    @property
+    def waits(self) -> bool:
+        """Whether the page waits for the authority."""
 
     def stand_down(self, why: str) -> None:
         """Command nothing any more."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
-from skyloop.cockpit.kept_frames import KEPT_S
+from skyloop.cockpit.frame_keeper import KEPT_S
 from skyloop.control.follow_target import detections_of
 from skyloop.errors import DecodeError, MissingExtraError, SkyloopError, UsageError
 from skyloop.estimation import assignment

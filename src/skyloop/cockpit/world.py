@@ -1,16 +1,26 @@
-"""What maps show around a drone: what stands there, where it may fly, how fast, and where its cameras look."""
+"""What is around a drone: what stands there, where it may fly, where its cameras look; and whether it is ready.
+
+All requests only read.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
 
+from skyloop.client import Level, PreflightFinding
+from skyloop.cockpit.answers import BadRequest, answer_json, answered
 from skyloop.cockpit.broadcast import ROW_HZ
 from skyloop.cockpit.values import Json, number, vector
-from skyloop.errors import NoAnswerError, ParameterError
+from skyloop.errors import NoAnswerError, ParameterError, UnknownNameError
 from skyloop.messages import Position
 from skyloop.messages.world import WORLD, WorldGeometry, decode_world
 from skyloop.proxy.core.airspace import Airspace, AirspaceSettings
@@ -19,9 +29,13 @@ from skyloop.zones import FAR_M, Box, Space, Zone, space_of
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
+    from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.recordings import Recordings
     from skyloop.messages import CameraInfo, Feedback, Value
+    from skyloop.messages.world import WorldGeometry
 
 LIMITS: Final = ("speed", "climb", "altitude")
+RECORDED: Final = "recorded."  #: before the names of recorded parameters: docs/replay.md
 
 
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
@@ -128,7 +142,9 @@ def _newest(drone: Drone) -> Feedback | None:
 def _reader(drone: Drone) -> Callable[[str], Value | None]:
     """Return what reads a parameter's value; None where there is no such parameter."""
     found = {parameter.name: parameter.value for parameter in drone.config.parameters()}
-    return found.get
+    # The limits and zones of a replay's own proxy are those of nothing: what the recorded vehicle had is shown.
+    prefix = RECORDED if drone.uri.startswith("replay:") else ""
+    return lambda name: found.get(prefix + name)
 
 
 def _known(text: Value | None) -> WorldGeometry | None:
@@ -160,3 +176,73 @@ def _zone(zone: Zone) -> Json:
 
 def _fields(thing: Any) -> Json:
     return {name: getattr(thing, name) for name in thing.__struct_fields__}
+
+
+_OURS: Final = PreflightFinding("control", Level.OK, "a page of this cockpit has control")
+MAX_ASKING: Final = 4  #: drones that are asked at one time; each may take its thread for seconds
+
+
+class WorldApi:
+    """The routes ``world``, ``way`` and ``preflight`` of each drone.
+
+    Args:
+        fleet: The drones.
+        recordings: Where they are recorded to.
+        given: What stands around drones that don't know it themselves.
+    """
+
+    def __init__(self, fleet: Fleet, recordings: Recordings, given: WorldGeometry | None) -> None:
+        self._fleet = fleet
+        self._recordings = recordings
+        self._given = given
+        self._asking = asyncio.Semaphore(MAX_ASKING)
+
+    def routes(self) -> list[Route]:
+        """Return the routes."""
+        return [
+            Route("/api/drones/{name}/world", self.world),
+            Route("/api/drones/{name}/way", self.way),
+            Route("/api/drones/{name}/preflight", self.preflight),
+        ]
+
+    @answered
+    async def world(self, request: Request) -> Response:
+        """Answer with what maps show around a drone."""
+        return await self._ask(request, lambda drone: world_values(drone, self._given))
+
+    @answered
+    async def way(self, request: Request) -> Response:
+        """Answer with what speaks against flying straight to a place, ``?to=X,Y,Z``."""
+        place = _place(request.query_params.get("to", ""))
+        return await self._ask(request, lambda drone: way_values(drone, place))
+
+    @answered
+    async def preflight(self, request: Request) -> Response:
+        """Answer with the checklist before a flight."""
+        folder = self._recordings.folder
+        station = self._fleet.stations.get(request.path_params["name"])
+        ours = station is not None and bool(station.view.overview()["me"])
+
+        def check(drone: Drone) -> list[Any]:
+            findings = drone.preflight(folder=folder)
+            return [asdict(_OURS if ours and one.check == "control" else one) for one in findings]
+
+        return await self._ask(request, check)
+
+    async def _ask(self, request: Request, question: Callable[[Drone], Any]) -> Response:
+        """Ask a drone on a thread, as its answer may take a while."""
+        name, stations = request.path_params["name"], self._fleet.stations
+        if name not in stations:
+            raise UnknownNameError("drone", name, stations)
+        async with self._asking:
+            return answer_json(await asyncio.to_thread(question, stations[name].drone))
+
+
+def _place(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise BadRequest(400, f"to must be three finite numbers in metres, as 1.5,0,1, not {text!r:.60}")
+    return x, y, z
