@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
@@ -30,6 +32,7 @@ from skyloop.cockpit.commands import (
 )
 from skyloop.cockpit.control_session import ControlSession
 from skyloop.cockpit.pilot_connection import PilotConnection
+from skyloop.cockpit.stream import PageSocket
 from skyloop.messages import (
     EmergencyStop,
     Event,
@@ -126,6 +129,39 @@ def test_old_sticks_fly_nothing_and_are_no_sign_of_life(client: TestClient, node
         assert time.monotonic() - begin_s < 5.0, "the page counts as silent all the same"
         assert not count(node, Velocity(left=0.4))
         pilot.wait("refused", do="fly")
+
+
+def test_what_waited_is_handled_together() -> None:
+    """The sockets of a cockpit that gets too little of its computer."""
+    coming = [{"type": "websocket.receive", "text": text} for text in "abc"]
+
+    class Socket:
+        async def receive(self) -> dict[str, str]:
+            return coming.pop(0) if coming else {"type": "websocket.disconnect"}
+
+    handled: list[tuple[str | bytes, ...]] = []
+    asyncio.run(PageSocket(Socket()).serve(lambda messages: handled.append(tuple(messages))))  # type: ignore[arg-type]
+    assert handled == [("a", "b", "c")]
+
+
+def test_of_sticks_that_waited_only_the_newest_fly(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of them flew, one after the other, each up to 0.5 s old, and so did those from before an emergency stop."""
+    handle = ControlSession._on_messages
+
+    def handle_all(session: ControlSession, messages: Sequence[str | bytes]) -> None:
+        at_s = time.monotonic()
+        waited = [json.dumps({"do": "fly", "left": tenths / 10, "at_s": at_s}) for tenths in range(1, 9)]
+        handle(session, [*(waited if '"hover"' in str(messages) else ()), *messages])
+
+    monkeypatch.setattr(ControlSession, "_on_messages", handle_all)
+    with page(client) as pilot:
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.say("hover")
+            until(lambda: count(node, Velocity(left=0.8)))
+        assert not any(count(node, Velocity(left=tenths / 10)) for tenths in range(1, 8))
 
 
 def test_sticks_that_were_let_go_hover_however_late_that_is_heard(client: TestClient, node: Node) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -170,7 +170,7 @@ class ControlSession:
         self._station.sessions.add(self)
         self._station.broadcast.subscribe(update)
         try:
-            await self._page.serve(self._on_message)
+            await self._page.serve(self._on_messages)
         finally:
             self._station.broadcast.unsubscribe(update)
             self._on_page_gone()
@@ -181,12 +181,20 @@ class ControlSession:
 
     # Messages of the page ----------------------------------------------------------------------------------------
 
-    def _on_message(self, text: str | bytes) -> None:
-        try:
-            command = decode_command(text)
-        except DecodeError as error:
-            self._refuse("", str(error))
-            return
+    def _on_messages(self, texts: Sequence[str | bytes]) -> None:
+        """Carry out what the page asks for, of sticks that waited behind one another the newest only."""
+        commands: list[AnyCommand] = []
+        for text in texts:
+            try:
+                commands.append(decode_command(text))
+            except DecodeError as error:
+                self._refuse("", str(error))
+        while commands:
+            command = commands.pop(0)
+            if not (isinstance(command, Fly) and commands and isinstance(commands[0], Fly)):
+                self._on_command(command)
+
+    def _on_command(self, command: AnyCommand) -> None:
         now_ns = self._clock()
         problem = untimely(command, seconds(now_ns))
         if not problem and not _is_deaf(command, now_ns):

@@ -45,7 +45,7 @@ class FleetSession:
 
     async def run(self) -> None:
         """Serve the page until it is gone."""
-        await self._page.serve(self._on_message)
+        await self._page.serve(lambda messages: [self._on_message(text) for text in messages])
 
     def _on_message(self, text: str | bytes) -> None:
         now_s = seconds(self._clock())

@@ -8,7 +8,7 @@ Telemetry: the newest state about twenty times a second, as far as the socket ta
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -306,18 +306,31 @@ class PageSocket:
         with suppress(asyncio.QueueFull):
             self._outbox.put_nowait(message)
 
-    async def serve(self, handle: Callable[[str | bytes], None]) -> None:
-        """Call ``handle`` with each message of the page until it is gone."""
-        writing = asyncio.create_task(self._write())
+    async def serve(self, handle: Callable[[Sequence[str | bytes]], None]) -> None:
+        """Call ``handle`` with what the page has sent since the last call, oldest first, until the page is gone.
+
+        More than one message where this process got to none for a while: the newest is known before the oldest acts.
+        """
+        came: list[str | bytes] = []
+        some = asyncio.Event()
+
+        async def read() -> None:
+            with suppress(WebSocketDisconnect):
+                while (message := await self._socket.receive())["type"] != "websocket.disconnect":
+                    came.append(message.get("text") or message.get("bytes") or "")
+                    some.set()  # what has come already is received without a turn of the loop
+
+        reading, writing = asyncio.create_task(read()), asyncio.create_task(self._write())
+        reading.add_done_callback(lambda _: some.set())
         try:
-            while True:
-                message = await self._socket.receive()
-                if message["type"] == "websocket.disconnect":
-                    break
-                handle(message.get("text") or message.get("bytes") or "")
-        except WebSocketDisconnect:
-            pass
+            while not reading.done() or came:
+                await some.wait()
+                some.clear()
+                messages, came[:] = tuple(came), ()
+                handle(messages)
+            reading.result()
         finally:
+            reading.cancel()
             writing.cancel()
 
     async def _write(self) -> None:
