@@ -99,7 +99,10 @@ class Scene:
     def station(self, command: int, *arguments: float) -> None:
         """The other ground station says this."""
         padded = (*arguments, *[0.0] * (7 - len(arguments)))
-        frame = self._codec.encode(m.MAVLink_command_long_message(1, 1, command, 0, *padded))
+        self.station_says(m.MAVLink_command_long_message(1, 1, command, 0, *padded))
+
+    def station_says(self, said: Message) -> None:
+        frame = self._codec.encode(said)
         (message,) = Codec(1, 1).decode(frame, whole=True)
         running = self.firmware._started
         running._loop.post(partial(running._on_message, running.autopilot.ports[0], message))
@@ -193,6 +196,40 @@ def _land_when_up(scene: Scene) -> None:
     while scene.height < 4.0 and time.monotonic() < deadline:
         time.sleep(0.01)
     scene.station_mode("LAND")
+
+
+def test_sticks_that_a_pilot_moves_during_a_take_off_keep_the_vehicle_and_its_own_failsafe_too(note: Path) -> None:
+    """PX4 alone: an ArduCopter in GUIDED looks at no sticks."""
+    with Scene(Kind.PX4, note) as scene:
+        proxy = scene.proxy()
+        scene.firmware.autopilot.parameters["COM_RC_LOSS_T"] = 3.0  # the tests' own threads may be late
+        let_go = threading.Event()
+        with scene.drone() as drone:
+            drone.wait(lambda f: bool((f.native or {}).get("mavlink.ready")), timeout_s=WAIT_S)
+            holds = threading.Thread(target=_hold_sticks, args=(scene, let_go))
+            holds.start()
+            try:
+                with pytest.raises(RefusedError, match="POSCTL, which was not chosen here"):
+                    drone.takeoff(timeout_s=WAIT_S)
+                at = len(scene.ours)
+                scene.watched(proxy)
+                assert scene.mode == "POSCTL"
+                assert scene.height < 6.0, "it did not go on to the 8 m that were asked for"
+            finally:
+                let_go.set()
+                holds.join()
+            wait_until(lambda: not scene.armed, "without sticks it holds, returns and lands by itself")
+            assert scene.ours[at:] == []
+
+
+def _hold_sticks(scene: Scene, let_go: threading.Event) -> None:
+    """Centred ones, of which one is moved when the vehicle is 2 m up, and centred again."""
+    moved_s: float | None = None
+    while not let_go.wait(0.02):
+        if moved_s is None and scene.height > 2.0:
+            moved_s = time.monotonic()
+        moving = moved_s is not None and time.monotonic() - moved_s < 0.3
+        scene.station_says(m.MAVLink_manual_control_message(1, 0, 700 if moving else 0, 500, 0, 0))
 
 
 @KINDS

@@ -34,6 +34,11 @@ def flying() -> Rig:
     return it
 
 
+def sticks(*, forward: int = 0, throttle: int = 500) -> Message:
+    """A ground station's joystick [1/1000]; the throttle's middle is 500."""
+    return m.MAVLink_manual_control_message(1, forward, 0, throttle, 0, 0)
+
+
 def test_everything_streams_unasked() -> None:
     it = rig()
     it.go_on(1.0)
@@ -239,3 +244,80 @@ def test_it_comes_home_at_the_return_altitude_or_within_its_cone(away: float, co
     assert it.command(m.MAV_CMD_NAV_RETURN_TO_LAUNCH) == 0
     assert it.until(lambda: not it.autopilot.armed, 30.0) == pytest.approx(height, abs=0.4)
     assert (*it.place, it.height) == pytest.approx((0.0, 0.0, 0.0), abs=0.5)
+
+
+def rising() -> Rig:
+    """In a take-off to 3 m, beside somebody who holds centred sticks."""
+    it = rig()
+    it.go_on(1.5, sticks())
+    assert it.arm() == 0
+    nan = math.nan
+    assert it.command(m.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, nan, nan, HOME_M + 3.0) == 0
+    while it.height < 0.8:
+        it.go_on(0.1, sticks())
+    assert it.autopilot.mode == "AUTO.TAKEOFF"
+    return it
+
+
+def test_moved_sticks_take_it_over_in_a_take_off() -> None:
+    it = rising()
+    it.texts()
+    it.go_on(0.3, sticks(forward=500))
+    assert it.autopilot.mode == "POSCTL"
+    assert it.texts() == ["Pilot took over using sticks"]
+    it.go_on(2.0, sticks(forward=500))
+    assert it.height < 1.8, "it does not rise to the height that was commanded"
+    assert math.hypot(*it.place) > 1.0, "it follows the stick"
+
+
+def test_sticks_that_rest_take_nothing_over() -> None:
+    it = rising()
+    assert it.of("SYS_STATUS")[-1].onboard_control_sensors_present & 0x10000, "they count as a remote control"
+    it.go_on(6.0, sticks())
+    assert it.autopilot.mode == "AUTO.LOITER"
+    assert it.height == pytest.approx(3.0, abs=0.4)
+
+
+def test_an_axis_out_of_range_is_one_that_is_not_there() -> None:
+    it = rising()
+    it.go_on(0.5, sticks(forward=32767))
+    assert it.autopilot.mode == "AUTO.TAKEOFF"
+
+
+@pytest.mark.parametrize(("override", "mode"), [(1, "OFFBOARD"), (3, "POSCTL")])
+def test_sticks_take_over_from_a_program_only_where_that_is_set(override: int, mode: str) -> None:
+    it = flying()
+    it.autopilot.parameters["COM_RC_OVERRIDE"] = override
+    it.go_on(0.5, it.velocity(0, 0, 0), sticks())
+    it.go_on(0.5, it.velocity(0, 0, 0), sticks(forward=600))
+    assert it.autopilot.mode == mode
+
+
+def test_whoever_holds_sticks_may_select_position_mode() -> None:
+    it = flying()
+    it.go_on(0.5, it.velocity(0, 0, 0), sticks())
+    assert it.mode(3) == 0
+    it.go_on(2.0, it.velocity(0, 0, 1.0), sticks())
+    assert it.autopilot.mode == "POSCTL"
+    assert it.height == pytest.approx(3.0, abs=0.4), "centred sticks hold the height"
+
+
+def test_sticks_that_end_in_flight_make_it_hold_and_then_return() -> None:
+    it = flying()
+    it.go_on(0.5, it.velocity(0, 0, 0), sticks())
+    it.texts()
+    it.go_on(1.0, it.velocity(0, 0, 0))
+    assert it.autopilot.mode == "AUTO.LOITER", "also out of OFFBOARD"
+    assert "Failsafe activated" in it.texts()
+    it.go_on(3.5, it.velocity(0, 0, 0))
+    assert it.autopilot.mode == "AUTO.LOITER", "set-points alone do not bring OFFBOARD back"
+    it.go_on(1.5, it.velocity(0, 0, 0))
+    assert it.autopilot.mode == "AUTO.RTL"
+
+
+def test_sticks_that_come_back_in_time_end_that() -> None:
+    it = flying()
+    it.go_on(0.5, it.velocity(0, 0, 0), sticks())
+    it.go_on(2.0, it.velocity(0, 0, 0))
+    it.go_on(0.5, it.velocity(0, 0, 0), sticks())
+    assert it.autopilot.mode == "OFFBOARD"

@@ -156,6 +156,11 @@ class Autopilot(ABC):
         return True
 
     @property
+    def remote(self) -> bool:
+        """Whether it reports that it receives a remote control."""
+        return False
+
+    @property
     def base_mode(self) -> int:
         """``MAV_MODE_FLAG`` of the heartbeat."""
         return int(ModeFlag.CUSTOM | (ModeFlag.ARMED if self.armed else 0))

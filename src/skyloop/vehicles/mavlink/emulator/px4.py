@@ -13,6 +13,7 @@ from skyloop.vehicles.mavlink.emulator.autopilot import (
     CRITICAL,
     DENIED,
     FAILED,
+    INFO,
     TEMPORARILY_REJECTED,
     UNSUPPORTED,
     Arguments,
@@ -38,6 +39,10 @@ from skyloop.vehicles.mavlink.wire.modes import PX4_MODES, px4_custom
 from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
 SINK_IN_POSCTL_M_S: Final = -0.7  #: without a remote control
+STICK_SPEED_M_S: Final = 10.0  #: of a stick that is all the way out (MPC_VEL_MANUAL)
+STICK_EXPO: Final = 0.6  #: how much flatter a stick is about its middle (MPC_XY_MAN_EXPO, MPC_Z_MAN_EXPO)
+STICK_FILTER_S: Final = 0.1  #: of the speed of a stick
+LIFTS_OFF_AT: Final = 0.2  #: of the throttle stick's way up
 _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
 _WORDS: Final = {
     "armed": "Armed by external command",
@@ -93,6 +98,10 @@ class Px4(Autopilot):
         self._target: Target | AttitudeTarget | None = None
         self._target_s = -math.inf
         self._lost_gcs = False
+        self._stick = (0.0, 0.0, 0.0, 0.0)  # forward, left, up, turning left; the whole way is 1
+        self._stick_moves = (0.0, 0.0, 0.0, 0.0)  # [1/s], filtered
+        self._stick_s = -math.inf
+        self._lost_stick_s: float | None = None  # when a remote control in use went silent
 
     @property
     def custom_mode(self) -> int:
@@ -117,7 +126,13 @@ class Px4(Autopilot):
 
     # Modes -----------------------------------------------------------------------------------------------------
 
+    @property
+    def remote(self) -> bool:
+        """Whether it receives a remote control; a ground station's joystick is one."""
+        return self.time_s - self._stick_s <= self.parameters["COM_RC_LOSS_T"]
+
     def _fly(self) -> None:
+        self._look_at_sticks()
         self._look_at_set_points()
         if self.mode == "OFFBOARD":
             self._fly_offboard()
@@ -128,6 +143,8 @@ class Px4(Autopilot):
             self.flight.land()
         elif self.mode == "AUTO.RTL":
             self._manoeuvres.return_home(self._speeds)
+        elif self.mode in _STICKS and self.remote:
+            self._fly_by_sticks()
         elif self.mode in _STICKS:
             self.flight.move_body(0.0, 0.0, SINK_IN_POSCTL_M_S, 0.0)
             if self.flight.place[2] < 0.1:
@@ -140,9 +157,14 @@ class Px4(Autopilot):
             self.failsafe = True
             self.send_text("Failsafe activated", CRITICAL)
             self._enter("AUTO.LOITER" if round(self.parameters["COM_OBL_RC_ACT"]) == 5 else "POSCTL")
-        elif self.failsafe and self._intended == "OFFBOARD" and self._fresh and not self._lost_gcs:
+        elif self.failsafe and self._intended == "OFFBOARD" and self._fresh and not self._lost:
             self.failsafe = False  # back by itself: the user wanted it
             self._enter("OFFBOARD")
+
+    @property
+    def _lost(self) -> bool:
+        """Return whether a ground station or a remote control has gone silent: OFFBOARD does not come back then."""
+        return self._lost_gcs or self._lost_stick_s is not None
 
     def _fly_offboard(self) -> None:
         target = self._target
@@ -185,7 +207,7 @@ class Px4(Autopilot):
         )
 
     def _set_mode(self, mode: str) -> None:
-        self._intended, self.failsafe = mode, False
+        self._intended, self.failsafe, self._lost_stick_s = mode, False, None
         self._enter(mode)
 
     def _split(self, custom_mode: int) -> Arguments:
@@ -199,7 +221,7 @@ class Px4(Autopilot):
             return ACCEPTED
         if mode == "OFFBOARD" and not self._fresh:
             self.send_text("Switching to Offboard is currently not available", CRITICAL)
-        elif mode in _STICKS and self.armed:
+        elif mode in _STICKS and self.armed and not self.remote:
             self.send_text("Switching to Position is currently not available", CRITICAL)
         elif mode == "AUTO.MISSION":
             self.send_text("Switching to Mission is currently not available: no valid mission", CRITICAL)
@@ -316,8 +338,61 @@ class Px4(Autopilot):
         port.send(m.MAVLink_ping_message(message.time_usec, message.seq, *sender))
         return True
 
+    # A remote control over MAVLink --------------------------------------------------------------------------------
+
     def _sticks(self, message: Message) -> None:
-        """Ignore a remote control over MAVLink."""
+        """Read a ground station's joystick. Overrides of a receiver's channels have no effect: none is mapped."""
+        if message.get_type() != "MANUAL_CONTROL" or message.target not in (0, self.system):
+            return
+        throttle = 2 * message.z - 1000
+        ways = (message.x, -message.y, throttle, -message.r)
+        forward, left, up, turn = (each / 1000 if abs(each) <= 1000 else 0.0 for each in ways)  # beyond: no such axis
+        stick = (forward, left, up, turn)
+        since_s = self.time_s - self._stick_s
+        if not self.remote:
+            self._stick_moves = (0.0, 0.0, 0.0, 0.0)
+        elif since_s > 0.0:
+            share = since_s / (since_s + STICK_FILTER_S)
+            axes = zip(self._stick_moves, self._stick, stick, strict=True)
+            a, b, c, d = (was + share * ((now - then) / since_s - was) for was, then, now in axes)
+            self._stick_moves = (a, b, c, d)
+        self._stick, self._stick_s = stick, self.time_s
+        if self.armed and max(map(abs, self._stick_moves)) > self.parameters["COM_RC_STICK_OV"] / 100.0:
+            self._take_over()
+
+    def _take_over(self) -> None:
+        """Enter position mode for the pilot, unless the present mode ignores sticks."""
+        mode_bit = 2 if self.mode == "OFFBOARD" else 1
+        if self.mode not in _STICKS and round(self.parameters["COM_RC_OVERRIDE"]) & mode_bit:
+            self._set_mode("POSCTL")
+            self.send_text("Pilot took over using sticks\t", INFO)
+
+    def _fly_by_sticks(self) -> None:
+        forward, left, up, turn = ((1 - STICK_EXPO) * each + STICK_EXPO * each**3 for each in self._stick)
+        if not self.flight.airborne:
+            if self._stick[2] > LIFTS_OFF_AT:
+                self.flight.lift_off()
+            return
+        fastest = self.parameters["MPC_Z_VEL_MAX_UP" if up > 0 else "MPC_Z_VEL_MAX_DN"]
+        yaw_rate = turn * math.radians(self.parameters["MPC_MAN_Y_MAX"])
+        self.flight.move_body(forward * STICK_SPEED_M_S, left * STICK_SPEED_M_S, up * fastest, yaw_rate)
+
+    def _look_at_sticks(self) -> None:
+        """Hold, and then return, in any mode, once a remote control that was in use has gone silent."""
+        if self.remote:
+            if self._lost_stick_s is not None:  # back before it returned
+                self.failsafe, self._lost_stick_s = False, None
+                self._enter(self._intended)
+            return
+        if self._stick_s != -math.inf and self.mode not in ("AUTO.LAND", "AUTO.RTL") and not self.flight.standing:
+            self.send_text("Failsafe activated", CRITICAL)
+            self.failsafe, self._lost_stick_s = True, self.time_s
+            self._enter("AUTO.LOITER")
+        self._stick_s = -math.inf
+        if self._lost_stick_s is not None and self.time_s - self._lost_stick_s > self.parameters["COM_FAIL_ACT_T"]:
+            actions = {1: "AUTO.LOITER", 3: "AUTO.LAND"}
+            self._intended, self._lost_stick_s = actions.get(round(self.parameters["NAV_RCL_ACT"]), "AUTO.RTL"), None
+            self._enter(self._intended)
 
     # Losing the ground station ---------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import Landed
 
 PREARM: Final = 0x10000000
+REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _SENSORS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x20  #: gyro, accelerometer, magnetometer, pressure, GPS
 _BATTERY: Final = 0x2000000
 #: Flags of an estimator that knows where it is: the position, relative and absolute, and the predictions that both will
@@ -57,6 +58,8 @@ class AutopilotState(Protocol):
     def ready(self) -> bool: ...
     @property
     def settled(self) -> bool: ...
+    @property
+    def remote(self) -> bool: ...
     @property
     def channels(self) -> list[int] | None: ...
 
@@ -102,7 +105,7 @@ def _global(a: AutopilotState) -> Message | None:
 
 def _status(a: AutopilotState) -> Message:
     believed = a.report.believed
-    present = _SENSORS | _BATTERY | (PREARM if a.REPORTS_PREARM else 0)
+    present = _SENSORS | _BATTERY | (PREARM if a.REPORTS_PREARM else 0) | (REMOTE if a.remote else 0)
     health = (present & ~PREARM) | (PREARM if a.ready else 0)
     charge, volts = round(believed.battery * 100), round(believed.battery_v * 1000)
     return m.MAVLink_sys_status_message(present, present, health, 250, volts, 500, charge, 0, 0, 0, 0, 0, 0)
