@@ -258,6 +258,21 @@ def test_a_take_off_ends_without_the_altimeter(position: bool) -> None:
     assert told == Velocity(), "it does not climb to where the altimeter should be"
 
 
+def test_a_take_off_that_has_not_risen_when_its_time_is_over_lands() -> None:
+    """Seen on a real Betaflight that got too little of its computer: it was told as hovering, at 0.04 m."""
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Takeoff(), 0, None)
+    now = 0
+    while autopilot.flight.state(FlightState.FLYING) is FlightState.TAKING_OFF:
+        now += STEP_NS
+        told = seen(autopilot, FlightState.FLYING, now, 0.04 + 0.01 * (now // STEP_NS % 3))
+        assert now < 10 * NS_PER_S
+    assert autopilot.flight.state(FlightState.FLYING) is FlightState.LANDING
+    assert told == Attitude(climb=-0.4)
+    seen(autopilot, FlightState.LANDED, now + 2 * NS_PER_S, 0.04)
+    assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
+
+
 def test_a_vehicle_that_reports_to_stand_has_not_taken_off_whatever_its_altimeter_says() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)

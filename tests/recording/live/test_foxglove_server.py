@@ -18,8 +18,8 @@ from skyloop.drivers.base import Sink
 from skyloop.errors import LinkError, MissingExtraError, UsageError
 from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Polyline
 from skyloop.recording import foxglove as schemas
+from skyloop.recording import foxglove_access as module
 from skyloop.recording import layout, taps
-from skyloop.recording import parameters as module
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.foxglove_access import MAX_HEAD, OriginDoor, ParameterDesk, hidden_host
 from skyloop.recording.layout import FrameRecord

@@ -100,6 +100,7 @@ class Autopilot:
         self._stepped_ns: int | None = None
         self._lifted_ns: int | None = None  # when the take-off left the ground
         self._from_height: float | None = None  # its position's height then [m]
+        self._altitudes: set[float] = set()  # the lowest and the highest that were read since then [m]
         self._hold_altitude: float | None = None
         self._hold_position: tuple[float, float] | None = None
         self._hold_yaw: float | None = None
@@ -172,9 +173,12 @@ class Autopilot:
         altitude = known.altitude_m if known is not None else None
         height = known.position_m[2] if known is not None and known.position_m is not None else None
         if self._lifted_ns is None and lifted:
-            self._lifted_ns, self._from_height = now_ns, height
+            self._lifted_ns, self._from_height, self._altitudes = now_ns, height, set()
         if self._lifted_ns is None:
             return Velocity(up=settings.climb)
+        if altitude is not None:
+            read = self._altitudes | {altitude}
+            self._altitudes = {min(read), max(read)}
         rising_s, needed_s = seconds(now_ns - self._lifted_ns), settings.takeoff_altitude / settings.climb
         there = altitude is not None and altitude >= settings.takeoff_altitude - ARRIVED
         if height is not None and self._from_height is not None:
@@ -183,6 +187,13 @@ class Autopilot:
             arrived = there or (altitude is None and rising_s >= needed_s)
         if not arrived and rising_s < LONGEST_RISE * needed_s + LONGEST_RISE_S:
             return Velocity(up=settings.climb)
+        # An altimeter that is stuck reads the same all the time. One that moves, and says that the vehicle is still down
+        # when the time is over, is right: its motors turn, and it has not left the ground, as a real Betaflight on a
+        # slow computer.
+        if not arrived and len(self._altitudes) > 1 and max(self._altitudes) < settings.takeoff_altitude / 2:
+            self.mode = Mode.LAND
+            self.flight.steer(FlightState.LANDING, now_ns)
+            return Velocity(up=-settings.descent)
         self.mode = Mode.HOVER
         self.flight.steer(FlightState.HOVERING, now_ns)
         self._hold_altitude = settings.takeoff_altitude if there else altitude
