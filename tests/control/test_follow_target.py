@@ -490,6 +490,21 @@ def test_the_end_of_the_leash_is_a_problem() -> None:
     assert follower.status.problem == "at the end of the leash"
 
 
+def test_of_a_box_alone_it_says_that_the_range_is_not_known_and_only_turns() -> None:
+    follower = follower_of(settings=ChaseSettings(distance_m=3.0))
+    command, drawn = flown(follower, 1.0)
+    assert follower.phase is TargetPhase.RANGING
+    assert isinstance(command, Velocity)
+    assert command.yaw_rate < -0.05, "to the right"
+    assert (command.forward, command.left) == pytest.approx((0.0, 0.0), abs=0.02)
+    assert command.up > 0.1, "to see it from another height"
+    status = follower.status
+    assert status.phase == "range not yet known: turns only"
+    assert status.range_deviation_m is not None
+    assert status.range_deviation_m > 0.3 * (status.range_m or 0.0)
+    assert any(status.phase in one.text for one in drawn if isinstance(one, Text))
+
+
 def test_a_frame_that_was_stamped_ahead_is_not_flown_by() -> None:
     """It counted as seen for eight seconds, and the vehicle flew on to where the target had been."""
     follower = follower_of(class_name="person", settings=ChaseSettings(distance_m=2.5))
