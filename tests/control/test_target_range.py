@@ -282,7 +282,7 @@ def test_a_picture_on_a_wall_is_not_flown_into(tmp_path: File) -> None:
     file.write_text(ROOM)
     with rehearse(f"sim://?world={file}&cameras=front&fps=10&seed=1&wind=0") as drone:
         drone.takeoff()
-        drone.go_to(z=2.1)
+        drone.go_to(x=0.3, y=0.0, z=2.1)
         frame = next(iter(drone.frames()))
         assert frame.feedback is not None
         assert frame.intrinsics is not None
