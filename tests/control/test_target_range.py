@@ -116,6 +116,16 @@ def test_of_what_stands_on_the_ground_it_confirms_the_range(seed: int, speed_m_s
     assert watching.estimator.on_ground is not False
 
 
+def test_while_the_vehicle_stays_no_guess_wins() -> None:
+    """The one that counted on the least motion did: a person came to hang in the air, and nearer."""
+    watching = Watching(PERSON, z=1.2)
+    watching.run(12.0, bobbing)
+    found = watching.run(20.0)
+    assert isinstance(watching.estimator, RangeEstimator)
+    assert watching.estimator.on_ground is not False
+    assert found.range_m == pytest.approx(PERSON[0], rel=0.2)
+
+
 def test_what_hangs_above_the_vehicle_does_not_stand_on_the_ground() -> None:
     watching = Watching((4.0, 2.2, 0.3), z=1.2)
     watching.run(PERIOD_S)

@@ -30,8 +30,9 @@ _WORST: Final = 50.0  # cost of a box, by which a guess may lose at most
 _LEAST: Final = 1e-3  # a guess that is less likely is dropped
 _KNOWN: Final = 0.2  # deviation of the range, as a share of it, from which on it is known
 _UNKNOWN: Final = 0.4  # and above which it is not any more
-_STIRRED_M: Final = 0.1  # a vehicle that has moved less learns nothing
-_BASELINE: Final = 0.02  # how far the vehicle must have moved across the line of sight for that, by range
+_STIRRED_M: Final = 0.1  # off from where it was of late, from which on what a box says counts in full
+_OF_LATE_S: Final = 2.0  # of late: the mean of about this time
+_BASELINE: Final = 0.015  # how far off it must have been once, by range, before the range is known
 
 
 class RangeEstimator(TargetEstimator):
@@ -53,8 +54,8 @@ class RangeEstimator(TargetEstimator):
         self._guesses: list[TargetEstimator] = []
         self._weights = np.ones(0)
         self._on_ground: TargetEstimator | None = None  # the guess that it stands there, until that is dropped
-        self._lowest = self._highest = self._left = self._right = 0.0  # of the vehicle, across the first line of sight
-        self._sight = np.zeros(3)
+        self._sight = self._about = np.zeros(3)  # the first line of sight; where the vehicle was of late
+        self._stirred_m = 0.0  # the farthest that the vehicle ever was from there, across that line
         self._size_known = self._known = self._learns = False
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
@@ -84,8 +85,7 @@ class RangeEstimator(TargetEstimator):
         self.seen_ns, self.refused = at_ns, 0
         azimuth = view.azimuth
         self._sight = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-        self._lowest = self._highest = float(camera.position[2])
-        self._left = self._right = self._aside(camera)
+        self._about, self._stirred_m = camera.position, 0.0
         self._judge(self.at(at_ns))
 
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
@@ -105,14 +105,12 @@ class RangeEstimator(TargetEstimator):
             self.refused += 1
             return False
         self.seen_ns, self.refused = max(at_ns, self.seen_ns), 0
-        if self._size_known or self._moved_m > _STIRRED_M:
-            costs = np.nan_to_num(costs, posinf=1e9)
-            worse = np.minimum(costs - costs.min(), _WORST)
-            self._weights = self._weights * np.exp(-0.5 * worse * within(since_s / _TOGETHER_S, 0.0, 1.0))
-            self._drop()
-        self._lowest = min(self._lowest, float(camera.position[2]))
-        self._highest = max(self._highest, float(camera.position[2]))
-        self._left, self._right = max(self._left, self._aside(camera)), min(self._right, self._aside(camera))
+        # Of a vehicle that stays boxes tell nothing: the guess that counts on the least motion would win slowly.
+        told = 1.0 if self._size_known else within((self._stir(camera, since_s) / _STIRRED_M) ** 2, 0.0, 1.0)
+        costs = np.minimum(costs, 1e9)
+        worse = np.minimum(costs - costs.min(), _WORST)
+        self._weights = self._weights * np.exp(-0.5 * worse * told * within(since_s / _TOGETHER_S, 0.0, 1.0))
+        self._drop()
         self._judge(self.at(self.seen_ns))
         return True
 
@@ -179,13 +177,13 @@ class RangeEstimator(TargetEstimator):
         if self._on_ground not in self._guesses:
             self._on_ground = None
 
-    def _aside(self, camera: Camera) -> float:
-        return float(self._sight[0] * camera.position[1] - self._sight[1] * camera.position[0])
-
-    @property
-    def _moved_m(self) -> float:
-        """How far the vehicle has moved across the line of sight."""
-        return max(self._highest - self._lowest, self._left - self._right)
+    def _stir(self, camera: Camera, since_s: float) -> float:
+        """Return how far the vehicle is from where it was of late, across the first line of sight [m]."""
+        self._about = self._about + (camera.position - self._about) * within(since_s / _OF_LATE_S, 0.0, 1.0)
+        x, y, z = (camera.position - self._about).tolist()
+        off_m = math.hypot(float(self._sight[0] * y - self._sight[1] * x), z)
+        self._stirred_m = max(self._stirred_m, off_m)
+        return off_m
 
     def _judge(self, state: TargetState) -> None:
         """Decide whether the range is known: by the size, or by what the vehicle's own motion has shown."""
@@ -194,7 +192,7 @@ class RangeEstimator(TargetEstimator):
             self._known = share < _UNKNOWN or len(self._guesses) == 1
         else:
             told = self._size_known or self.traits.on_ground
-            moved = self._moved_m > _BASELINE * state.range_m
+            moved = self._stirred_m > _BASELINE * state.range_m
             self._known = share < _UNKNOWN if told else moved and share < _KNOWN
 
 
