@@ -13,6 +13,7 @@ from skyloop.control.airframe import Motion, TiltVelocity
 from skyloop.control.chase_law import ChaseLaw, FollowMode, TargetPhase
 from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_estimate import TRAITS, TargetEstimator, TargetState, Traits
+from skyloop.control.target_range import estimator_of
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.messages import Attitude, Feedback, FlightState
 from skyloop.messages.geometry import wrap_angle
@@ -196,7 +197,8 @@ class ChaseWorld:
         if view is None:
             return
         if self.estimator is None:
-            self.estimator = TargetEstimator(self._traits, relative=self._relative)
+            known = self._traits.height_m is not None
+            self.estimator = estimator_of("thing" if known else None, self._traits, relative=self._relative)
             self.estimator.start(view, camera, now_ns, ground=self._altitude)
             self._seen_ns = now_ns
         elif self.estimator.update(view, camera, now_ns):

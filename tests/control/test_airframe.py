@@ -336,6 +336,22 @@ def test_a_landing_holds_where_attitude_and_velocity_never_come_together() -> No
     assert law.problem == ""
 
 
+def test_positions_that_were_stamped_ahead_do_not_tilt_it_until_then() -> None:
+    law = FlowLaw()
+    for at_s, x in ((9.0, 0.0), (9.05, 0.1), (9.1, 0.2)):
+        law.feedback(state(at_s))
+        law.see(np.array([x, 0.0]), nanoseconds(at_s))
+    assert step(law, 9.1) != Attitude()
+    for at_s in np.arange(1.0, 4.0, 0.05).tolist():
+        law.feedback(state(at_s))
+        setpoint = step(law, at_s)
+    assert (setpoint, law.phase) == (Attitude(), FlowPhase.LOST)
+    law.see(np.array([5.0, 0.0]), nanoseconds(at_s))
+    step(law, at_s)
+    assert law.phase is FlowPhase.HOLDING
+    assert law.off_m == pytest.approx(0.0, abs=0.01), "there, where it is now"
+
+
 def test_an_obstacle_whose_edge_the_lens_can_not_tell_counts_as_close() -> None:
     """It ended the flight by an error about a fuzzy variable."""
     law = AvoidLaw(9.0)

@@ -389,6 +389,16 @@ def test_the_behaviour_sends_attitudes_where_there_is_no_velocity() -> None:
 
 
 @pytest.mark.usefixtures("_no_age")
+def test_frames_that_end_after_one_that_was_stamped_ahead_are_missed() -> None:
+    pilot = FollowTarget(Recorder(), the_box(), mode="look")  # type: ignore[arg-type]
+    given(pilot, 0.5)
+    assert not pilot.blind
+    pilot.on_frame(picture(10.0))
+    pilot.on_feedback(state(2.2))
+    assert pilot.blind, "it would have flown on for eight seconds"
+
+
+@pytest.mark.usefixtures("_no_age")
 @pytest.mark.parametrize(("camera", "phase"), [("front", TargetPhase.FOLLOWING), ("bottom", TargetPhase.LOOKING)])
 def test_the_behaviour_takes_the_results_of_a_processor(camera: str, phase: TargetPhase) -> None:
     """Those of its own camera: a box of another one's frames is somewhere else."""
@@ -406,7 +416,7 @@ def test_the_behaviour_takes_the_results_of_a_processor(camera: str, phase: Targ
 
 
 def test_mode_and_settings_may_be_changed_in_flight() -> None:
-    follower = follower_of()
+    follower = follower_of(class_name="person")
     flown(follower, 0.5)
     follower.mode = FollowMode("orbit")
     follower.settings = ChaseSettings(distance_m=3.0)
@@ -478,6 +488,37 @@ def test_the_end_of_the_leash_is_a_problem() -> None:
         else:
             follower._seen_ns = nanoseconds(at_s)
     assert follower.status.problem == "at the end of the leash"
+
+
+def test_of_a_box_alone_it_says_that_the_range_is_not_known_and_only_turns() -> None:
+    follower = follower_of(settings=ChaseSettings(distance_m=3.0))
+    command, drawn = flown(follower, 1.0)
+    assert follower.phase is TargetPhase.RANGING
+    assert isinstance(command, Velocity)
+    assert command.yaw_rate < -0.05, "to the right"
+    assert (command.forward, command.left) == pytest.approx((0.0, 0.0), abs=0.02)
+    assert command.up > 0.1, "to see it from another height"
+    status = follower.status
+    assert status.phase == "range not yet known: turns only"
+    assert status.range_deviation_m is not None
+    assert status.range_deviation_m > 0.3 * (status.range_m or 0.0)
+    assert any(status.phase in one.text for one in drawn if isinstance(one, Text))
+
+
+def test_a_frame_that_was_stamped_ahead_is_not_flown_by() -> None:
+    """It counted as seen for eight seconds, and the vehicle flew on to where the target had been."""
+    follower = follower_of(class_name="person", settings=ChaseSettings(distance_m=2.5))
+    flown(follower, 1.0)
+    follower.look(picture(10.0))
+    flown(follower, 3.5, start=2.0, shown=False)
+    assert follower.phase is TargetPhase.HOVERING
+
+
+def test_what_was_seen_before_the_clock_was_put_right_is_not_flown_by() -> None:
+    follower = follower_of(class_name="person", settings=ChaseSettings(distance_m=2.5))
+    flown(follower, 1.0, start=10.0)
+    flown(follower, 2.5, start=2.0, shown=False)
+    assert follower.phase is TargetPhase.LOOKING
 
 
 def test_a_camera_without_intrinsics_can_not_be_used() -> None:

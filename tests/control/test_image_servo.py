@@ -40,6 +40,17 @@ def test_a_view_by_a_vehicle_that_is_tilted_too_far_is_as_good_as_none() -> None
     assert phase_at(law, 2.0) is ServoPhase.SERVOING
 
 
+def test_a_view_that_was_stamped_ahead_is_not_flown_by_until_then() -> None:
+    law = ImageServoLaw(FORWARD, WANTED, 1.5)
+    law.see(WANTED + 0.05, tilted(9.0, 0.0), nanoseconds(9.0))
+    law.feedback(tilted(1.0, 0.0))
+    for at_s in np.arange(1.0, 4.0, 0.1):
+        law.feedback(tilted(float(at_s), 0.0))
+        held = law.step(nanoseconds(float(at_s)))
+    assert law.phase is ServoPhase.SEARCHING
+    assert (held.forward, held.left, held.up) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+
+
 def test_a_camera_that_does_not_say_how_it_is_mounted_is_refused_before_the_flight() -> None:
     with pytest.raises(UsageError, match="mounted"):
         ImageServoLaw(CameraInfo("front", 320, 240, 15.0), WANTED, 1.5)

@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S, nanoseconds
-from skyloop.control.landing_law import LandingLaw, LandingPhase
+from skyloop.control.landing_law import LandingLaw, LandingPhase, SpiralSearch
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.control.response import ResponseSettings
-from skyloop.control.spiral import SpiralSearch
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, Velocity
 from skyloop.messages.geometry import rotation_from_euler

@@ -11,10 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import nanoseconds
-from skyloop.control.heading import AlongPath, FixedYaw, LookAt
 from skyloop.control.limiting import SetpointLimits
 from skyloop.control.path import Circle, Polyline
-from skyloop.control.path_law import PathLaw, PathSettings
+from skyloop.control.path_law import AlongPath, FixedYaw, LookAt, PathLaw, PathSettings
 from skyloop.control.pid import Gains
 from skyloop.control.position import Fix, fix_of
 from skyloop.errors import UsageError

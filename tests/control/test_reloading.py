@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.control import Controller
-from skyloop.control.loading import load_controller
-from skyloop.control.reloading import Reloader
+from skyloop.control.loading import Reloader, load_controller
 from skyloop.errors import FileFormatError
 from skyloop.transport.testing import wait_until
 

@@ -7,6 +7,7 @@ from collections import deque
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.control.response import ResponseSettings, VelocityResponse
@@ -121,6 +122,22 @@ def test_knows_nothing_before_it_has_heard() -> None:
     assert response.predict(0) is None
     response.add(Feedback(captured_ns=1, velocity_m_s=(1.0, 0.0, 0.0), yaw_rad=0.0))
     assert response.predict(NS_PER_S) is None, "without an attitude"
+
+
+def test_a_sample_that_was_stamped_ahead_freezes_nothing() -> None:
+    """For as long it believed the velocity of then, and asked for one the other way, whatever the vehicle did."""
+    vehicle, response = Vehicle(), VelocityResponse()
+    for _ in range(200):
+        vehicle.step(1.0, 5.0)
+        response.add(vehicle.feedback())
+    response.add(replace(vehicle.feedback(), captured_ns=vehicle.now_ns + 8 * NS_PER_S))
+    for _ in range(400):
+        vehicle.step(0.0, 5.0)
+        response.add(vehicle.feedback())
+    motion = response.predict(vehicle.now_ns)
+    assert motion is not None
+    assert motion.velocity == pytest.approx([vehicle.velocity, 0.0], abs=0.05)
+    assert response.setpoint(3.0 * -motion.velocity, motion) == pytest.approx([0.0, 0.0], abs=0.1)
 
 
 @pytest.mark.parametrize("setting", [{"gain_per_s": 0.0}, {"lag_s": math.nan}, {"delay_s": -0.1}, {"tilt_rad": 2.0}])

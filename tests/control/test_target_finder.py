@@ -12,6 +12,7 @@ from benchmarks.tracking_scenes import texture
 from skyloop.clock import nanoseconds
 from skyloop.control.target_estimate import Traits
 from skyloop.control.target_finder import Sighting, TargetFinder
+from skyloop.control.target_range import RangeEstimator
 from skyloop.control.target_view import Camera
 from skyloop.errors import UsageError
 from skyloop.vision.detection import Detection
@@ -20,6 +21,7 @@ from tests.control.target_world import PERIOD_S, SIZE, Path, box_of, camera_at, 
 
 WIDTH, HEIGHT = SIZE
 BLUE, RED = (180, 90, 40), (40, 60, 190)
+STANDS = Traits(radius_m=0.1, on_ground=True)
 
 
 class Walker:
@@ -100,12 +102,13 @@ def start_box(walker: Walker) -> Box:
     return walker.box(camera_at(), 0.0)
 
 
-def test_a_box_is_enough() -> None:
+@pytest.mark.parametrize("traits", [None, STANDS])
+def test_a_box_is_enough(traits: Traits | None) -> None:
     walker = Walker(walk(4.0, -1.0, 0.0, 0.8), BLUE, 1)
-    film = Film(TargetFinder(box=start_box(walker)), walker, detects=False)
+    film = Film(TargetFinder(box=start_box(walker), traits=traits), walker, detects=False)
     film.run(2.0)
     assert film.agreement(28) > 0.6
-    assert film.is_kept()
+    assert film.is_kept() or traits is None, "without traits its range is not known before the vehicle moves"
     assert film.finder.target is None
     assert film.finder.others(film.at_ns) == []
     assert film.finder.class_name is None
@@ -161,6 +164,21 @@ def test_traits_that_are_given_go_before_those_of_the_class(class_name: str | No
     film.run(0.7)
     assert film.finder.target is not None
     assert film.finder.target.estimator.traits is small, "also after it was recognised"
+
+
+@pytest.mark.parametrize("box", [None, (138.0, 82.0, 40.0, 40.0)])
+def test_a_target_of_a_class_that_nothing_is_known_of_may_hang_on_a_wall(box: Box | None) -> None:
+    finder = TargetFinder(box=box, class_name=None if box else "clock")
+    image, camera = texture(np.random.default_rng(7), WIDTH, HEIGHT), camera_at()
+    clock, other = (Detection((x, 85.0, 40.0, 40.0), 0.9, 0, "clock") for x in (140.0, 30.0))
+    for n in range(6):
+        finder.see(image, camera, nanoseconds(1.0 + n * PERIOD_S), ground=True, detections=[clock, other])
+    assert finder.target is not None
+    assert finder.estimator is finder.target.estimator
+    assert isinstance(finder.estimator, RangeEstimator)
+    assert not finder.estimator.at(nanoseconds(1.4)).range_known
+    (beside,) = finder.others(nanoseconds(1.4))
+    assert beside.range_known, "others are kept clear of as if they stood on the ground"
 
 
 def test_of_a_class_the_largest_is_taken_once_it_is_believed() -> None:
@@ -261,6 +279,20 @@ def test_the_tracker_recognises_what_may_have_gone_there() -> None:
     film.run(2.0)
     assert film.agreement(5) > 0.6
     assert film.is_kept()
+
+
+def test_without_a_height_nothing_is_recognised_as_if_the_camera_were_on_the_ground() -> None:
+    """It was thought to be 0.3 m away then, and backed off from."""
+    here, there = (start_box(Walker(walk(4.0, side), BLUE, 1)) for side in (-1.9, 1.9))
+    finder, drifting = TargetFinder(box=here, class_name="box", nominal_m=4.0), Drifting()
+    image, camera = texture(np.random.default_rng(7), WIDTH, HEIGHT), camera_at(z=0.1)
+    finder._tracker = drifting  # type: ignore[assignment]
+    for n in range(75):
+        drifting.box = here if n < 30 else None if n < 60 else there
+        found = finder.see(image, camera, nanoseconds(1.0 + n * PERIOD_S), ground=False, detections=None)
+    assert found.box == there, "that may be it"
+    assert finder.estimator is not None
+    assert finder.estimator.at(nanoseconds(6.0)).range_m > 2.0
 
 
 def test_what_comes_where_the_target_can_not_be_is_not_recognised() -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.client.channels import Listener
     from skyloop.control import Controller
-    from skyloop.control.reloading import Reloader
+    from skyloop.control.loading import Reloader
 
 Make = Callable[[type["Controller"]], "Controller"]
 _LOOK_S: Final = 0.1  #: how often a flight that waits for a mended file looks whether the drone is still there

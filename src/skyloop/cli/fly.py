@@ -22,7 +22,7 @@ from skyloop.extend import end_flight
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.control import Controller
-    from skyloop.control.reloading import Reloader
+    from skyloop.control.loading import Reloader
 
 ADVICE = (
     "wait in the queue with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
@@ -68,8 +68,7 @@ def fly(
     """
     from skyloop.cli.piloting import connect_pilot
     from skyloop.client import Authority
-    from skyloop.control.loading import load_controller
-    from skyloop.control.reloading import Reloader
+    from skyloop.control.loading import Reloader, load_controller
 
     join_network(network, keys)
     target = one_drone(name, drone or on, default="sim://")

@@ -9,13 +9,12 @@ from skyloop.control.flow_hover import FlowHover
 from skyloop.control.follow import FollowMarker
 from skyloop.control.follow_target import FollowTarget
 from skyloop.control.gates import FIVE_GATES, RACE_GATES, RACE_TRACK, Course, FlyThroughGates, GateKind, course_in
-from skyloop.control.heading import AlongPath, FixedYaw, LookAt, YawMode
 from skyloop.control.image_servo import ImageServo
 from skyloop.control.landing import LandOnMarker
 from skyloop.control.onnx_policy import OnnxPolicy, PolicyNetwork, PolicyPhase
 from skyloop.control.path import Circle, FunctionPath, Lemniscate, Path, Polyline, Spline
 from skyloop.control.path_following import FollowPath, TrackingError, Waypoints
-from skyloop.control.path_law import PathLaw, PathSettings
+from skyloop.control.path_law import AlongPath, FixedYaw, LookAt, PathLaw, PathSettings, YawMode
 from skyloop.control.position import DeadReckoning, Fix, PositionSource
 from skyloop.control.route import Look, Photo, Route, RouteWaypoint, Wait, load_route, save_route
 from skyloop.control.route_check import Finding, RouteCheck

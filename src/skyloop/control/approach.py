@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Literal
 from skyloop.clock import seconds
 from skyloop.control.follow import FollowMarker
 from skyloop.control.follow_law import FollowSettings, Mode
-from skyloop.control.heading import AlongPath, LookAt
 from skyloop.control.limiting import clamped
 from skyloop.control.path import Circle
 from skyloop.control.path_following import FollowPath
+from skyloop.control.path_law import AlongPath, LookAt
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:

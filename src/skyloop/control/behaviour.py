@@ -89,7 +89,8 @@ class Behaviour(Controller):
         self._law.feedback(feedback)
         if self._frame_ns is None or self.done:
             return
-        if feedback.captured_ns - self._frame_ns > nanoseconds(BLIND_S):
+        # A frame that was stamped ahead would else hide for as long that none come any more.
+        if abs(feedback.captured_ns - self._frame_ns) > nanoseconds(BLIND_S):
             if not self.blind:
                 self.blind = True
                 self.emit("no frames arrive: hovering", Severity.WARNING)

@@ -40,6 +40,7 @@ _UNCERTAIN_M = 1.0  # most by which it stays farther off from somebody whose pla
 _GIVING_WAY_S = 1.0  # who has begun to make way to one side goes on to that side
 _EITHER_SIDE = 0.2  # of the clearance: it may pass on either side of somebody who comes so near to its middle
 _SWEEP_BACK = 0.4  # of the sweep: to where the target was not going
+_THERE_M = 0.1  # from a height that it flies to for the parallax: on to the other
 _ALONG_M_S = 0.4  # a target that is slower has no direction to be behind or beside of
 
 
@@ -55,6 +56,7 @@ class TargetPhase(StrEnum):
     """What becomes of it."""
 
     LOOKING = "looking for the target"  #: it was not seen yet: turning on the spot
+    RANGING = "range not yet known: turns only"  #: seen, but perhaps far nearer than it seems
     FOLLOWING = "following"
     ORBITING = "orbiting"
     WATCHING = "looking at it"
@@ -101,6 +103,7 @@ class ChaseLaw:
         self._was_at: Array | None = None  # in odometry axes, at the last step
         self._begin: Array | None = None  # in world axes; None: its position was not known yet
         self._height: float | None = None
+        self._away = False  # while the range is not known: whether it is on its way to the other height
         self._since_ns: int | None = None  # when the search began
         self._direction = 1.0
         self._sweep_first = 0.0  # side to look to first, 1 is left; 0: not chosen yet
@@ -168,7 +171,11 @@ class ChaseLaw:
             return self._steer(still, turn, state, now)
         # As fast as before for half of the time, then ever slower.
         fade = clamped(2.0 * (1.0 - (unseen_s - s.seen_s) / s.predict_s), 1.0)
-        horizontal = self._horizontal(ahead, state) * max(0.0, fade)
+        if state.range_known:
+            horizontal = self._horizontal(ahead, state) * max(0.0, fade)
+        else:  # it may be far nearer than it seems
+            horizontal = still
+            self.phase = self.phase if self.phase in LOSSES else TargetPhase.RANGING
         if self.phase is TargetPhase.PREDICTING:
             horizontal = _not_towards(horizontal, state.foot[:2] - ahead.position[:2])
         for other in others:
@@ -281,7 +288,8 @@ class ChaseLaw:
         across = max(0.3, float(np.hypot(*offset)))
         sight = offset / across
         aside = np.array([-sight[1], sight[0]])
-        self.off_m = across - s.distance_m
+        near = max(0.3, across - state.margin_m)
+        self.off_m = near - s.distance_m
         # Towards it no faster than it can stop again; away from it as the gain says.
         approach = min(s.range_gain * self.off_m, _stoppable(self.off_m, s))
         moving = self._soon(state, own.at_ns)
@@ -294,7 +302,7 @@ class ChaseLaw:
         else:
             wanted = wanted + aside * self._round(state, sight, across)
         wanted = wanted + self._evading(own, state)
-        return self._kept_off(wanted, state, sight, across)
+        return self._kept_off(wanted, state, sight, near)
 
     def _soon(self, state: TargetState, at_ns: int) -> Array:
         """Return the target's velocity as it will be when the vehicle has taken it up, (2,) [m/s]."""
@@ -396,12 +404,26 @@ class ChaseLaw:
         if altitude_m is None:
             return 0.0
         height = s.height_m if s.height_m is not None else (self._height if self._height is not None else altitude_m)
-        if state is not None:
+        if self.phase is TargetPhase.RANGING:
+            height = self._for_parallax(height, altitude_m)
+        elif state is not None and (state.range_known or self.phase is TargetPhase.WATCHING):
             reach = math.tan(s.steep_rad) * state.range_m
             middle = float(state.middle[2])
             height = within(height, middle - reach, middle + reach)
         height = within(height, s.lowest_m, s.highest_m)
         return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
+
+    def _for_parallax(self, height: float, altitude_m: float) -> float:
+        """Return the next of the two heights that a range is learnt by: rather above, as somebody may stand below."""
+        s = self.settings
+        other = height = within(height, s.lowest_m, s.highest_m)
+        if s.parallax_m is not None:
+            above, below = height + s.parallax_m, height - s.parallax_m
+            other = above if above <= s.highest_m else max(below, s.lowest_m)
+        goal = other if self._away else height
+        if abs(goal - altitude_m) < _THERE_M:
+            self._away = not self._away
+        return other if self._away else height
 
     def _by_attitude(self, own: Motion, wanted: Array, up: float, turn: float) -> Attitude:
         """Return the attitude that accelerates to a velocity, (2,) in odometry axes [m/s]; against drag as well."""

@@ -27,6 +27,8 @@ class ChaseSettings:
         height_m: Above the ground; None: the height at the start.
         lowest_m: Above the ground.
         highest_m: Above the ground.
+        parallax_m: How far it rises, or sinks where it may not, and comes back, to learn the range of what may not
+            stand on the ground. None: it only waits, for what else moves it.
         steep_rad: Farthest elevation of the target's middle, up or down, at which the height is kept.
         lead_s: From a command's decision to its taking hold: delays of commands and feedback together.
         response_s: From a velocity's set-point to that velocity: the target's acceleration is fed forward by as much.
@@ -64,6 +66,7 @@ class ChaseSettings:
     height_m: float | None = None
     lowest_m: float = 0.8
     highest_m: float = 4.0
+    parallax_m: float | None = 0.4
     steep_rad: float = 0.25
     lead_s: float = 0.12
     response_s: float = 0.4
@@ -89,7 +92,7 @@ class ChaseSettings:
     sweep_rad: float = 0.6
 
     def __post_init__(self) -> None:
-        free = {"bearing_rad", "orbit_m_s", "leash_m", "height_m"}
+        free = {"bearing_rad", "orbit_m_s", "leash_m", "height_m", "parallax_m"}
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
             if value is None and name in free:

@@ -64,8 +64,8 @@ class FollowTarget(Behaviour):
             mode: ``follow``, ``orbit`` or ``look``.
             detector: Searches every frame; or the name of a processor whose results are detections, such as that of
                 ``skyloop detect``. None: the target is tracked by its looks alone.
-            height_m: How high the target is, if that is known, for its distance; else that of its class is taken, or
-                the ground that it stands on.
+            height_m: How high the target is, if that is known, for its distance; else that of its class is taken. With
+                neither, the drone only turns until its own motion has shown the range.
             traits: All that is known of the target, in place of ``height_m``.
             camera: Whose frames to use; None is the vehicle's first camera.
             settings: Of the law; None are the defaults. They are brought within the drone's ``limits.*``.

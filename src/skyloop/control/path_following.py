@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds
 from skyloop.control.controller import Controller
-from skyloop.control.heading import FixedYaw, YawMode
 from skyloop.control.path import Path, Polyline
-from skyloop.control.path_law import PathLaw, PathSettings
+from skyloop.control.path_law import FixedYaw, PathLaw, PathSettings, YawMode
 from skyloop.control.position import Fix, PositionSource, fix_of
 from skyloop.control.waypoint import Waypoint, lacking
 from skyloop.errors import UsageError
@@ -154,7 +153,7 @@ class FollowPath(_PathFlyer):
         Args:
             drone: The drone to fly.
             path: In world axes.
-            yaw: One of :mod:`skyloop.control.heading`; None keeps the present yaw.
+            yaw: A :class:`skyloop.control.YawMode`; None keeps the present yaw.
             settings: Of the law; None are the defaults.
             source: Of positions; None is the vehicle's own feedback.
             max_age_s: With an older position the vehicle hovers.
@@ -215,7 +214,7 @@ class Waypoints(_PathFlyer):
             speed_m_s: Greatest speed between waypoints.
             acceleration_m_s2: At the start and end of each leg.
             hold_s: How long to stay at each waypoint.
-            yaw: One of :mod:`skyloop.control.heading`, for waypoints without a yaw; None keeps the present yaw.
+            yaw: A :class:`skyloop.control.YawMode`, for waypoints without a yaw; None keeps the present yaw.
             settings: Of the law; None are the defaults.
             source: Of positions; None is the vehicle's own feedback.
             max_age_s: With an older position the vehicle hovers.

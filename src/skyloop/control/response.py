@@ -100,7 +100,10 @@ class VelocityResponse:
         self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # of velocity and push, in each axis
 
     def add(self, feedback: Feedback) -> None:
-        """Update with the next sample. Ignored without velocity or attitude, or if not newer than the last."""
+        """Update with the next sample. Ignored without velocity or attitude, or if not newer than the last.
+
+        One that is older by more than half a second begins anew: the one before was stamped ahead.
+        """
         if feedback.velocity_m_s is None or feedback.yaw_rad is None:
             return
         if feedback.roll_rad is None or feedback.pitch_rad is None:
@@ -108,7 +111,11 @@ class VelocityResponse:
         turn = rotation_from_euler(0.0, 0.0, feedback.yaw_rad)[:2, :2]
         velocity = turn @ np.asarray(feedback.velocity_m_s[:2])
         lean = turn @ (np.tan([feedback.pitch_rad, -feedback.roll_rad]) * GRAVITY_M_S2)
-        before_ns, self._at_ns = self._at_ns, max(feedback.captured_ns, self._at_ns or 0)
+        before_ns = self._at_ns
+        if before_ns is not None and seconds(before_ns - feedback.captured_ns) > _LONGEST_PREDICTION_S:
+            before_ns = None  # that one was stamped ahead: until then, nothing would be newer
+            self._setpoints.clear()
+        self._at_ns = max(feedback.captured_ns, before_ns or 0)
         if before_ns is None or seconds(feedback.captured_ns - before_ns) > _LONGEST_GAP_S:
             self._velocity, self._lean = velocity, lean
         elif feedback.captured_ns > before_ns:

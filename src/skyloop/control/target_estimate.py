@@ -41,8 +41,9 @@ _BEFORE_S: Final = 0.2  # before it was seen last: what hid it had not begun to 
 _GATE: Final = 4.0  # standard deviations, of the azimuth
 _EDGE_GATE: Final = 3.0  # of an edge: a farther one is hidden by something, or the image of something else
 _OUTGROWN: Final = 3.0  # standard deviations of both edges, outwards
-_LEAST_SLOPE: Final = 0.04  # of an edge, below which its height says nothing about the range
-_SURE_OF_SIZE: Final = 0.4  # deviation of the logarithm of the height, from which on it counts as unknown
+_PACE_PER_S: Final = 0.2  # deviation of a velocity, by a range that is only a guess
+LEAST_SLOPE: Final = 0.04  # of an edge, below which its height says nothing about the range
+SURE_OF_SIZE: Final = 0.4  # deviation of the logarithm of the height, from which on it counts as unknown
 
 
 def _is_number(value: object) -> bool:
@@ -58,7 +59,8 @@ class Traits:
         height_share: Standard deviation of that, as a share of it.
         radius_m: From its middle to where its lower edge is seen.
         intensity_m2_s3: Of the random acceleration: within a second the velocity wanders by the root of it.
-        on_ground: Whether it stands on the ground.
+        on_ground: Whether it stands on the ground. None: what has a class is taken to; of anything else that is one
+            guess among others (:mod:`.target_range`).
 
     Raises:
         UsageError: A number is out of its range.
@@ -68,7 +70,7 @@ class Traits:
     height_share: float = 0.1
     radius_m: float = 0.0
     intensity_m2_s3: float = 1.0
-    on_ground: bool = True
+    on_ground: bool | None = None
 
     def __post_init__(self) -> None:
         if self.height_m is not None and not (_is_number(self.height_m) and 0.01 <= self.height_m <= 100.0):
@@ -104,6 +106,8 @@ class TargetState:
         place_m: Standard deviation of its place: the root of the sum of its horizontal variances.
         range_m: Horizontal distance from the camera that saw it last.
         range_deviation_m: Standard deviation along the line of sight.
+        range_known: Whether the range is good enough to fly by; False while nothing but a guess tells it.
+        margin_m: How much nearer it may be, for which a vehicle stays farther off; 0 for a target on the ground.
     """
 
     at_ns: int
@@ -113,6 +117,8 @@ class TargetState:
     place_m: float
     range_m: float
     range_deviation_m: float
+    range_known: bool = True
+    margin_m: float = 0.0
 
     @property
     def middle(self) -> Array:
@@ -147,7 +153,7 @@ class TargetEstimator:
         self.traits = traits
         self.refused = 0
         self.seen_ns: int | None = None
-        self._nominal_m = nominal_m
+        self._nominal_m, self._relative = nominal_m, relative
         self._intensity = traits.intensity_m2_s3 + (_RECKONING_M2_S3 if relative else 0.0)
         self._at_ns = 0
         self._state = np.zeros(6)  # x, y, velocities, foot's height, log of the height
@@ -167,15 +173,15 @@ class TargetEstimator:
             ground: Whether the camera's height above the ground is known.
         """
         traits, height = self.traits, float(camera.position[2])
-        ground = ground and traits.on_ground
+        ground = ground and traits.on_ground is not False
         guesses = [(self._nominal_m, 0.5)]  # range, relative deviation
-        if ground and view.bottom is not None and view.bottom < -_LEAST_SLOPE:
+        if ground and view.bottom is not None and view.bottom < -LEAST_SLOPE:
             share = math.hypot(view.edge / -view.bottom, 0.05 / max(0.1, height)) + view.tilt / -view.bottom
             guesses.append((height / -view.bottom + traits.radius_m, share))
         if traits.height_m is not None and view.bottom is not None and view.top is not None:
             slopes = max(1e-3, view.top - view.bottom)
             guesses.append((traits.height_m / slopes, math.hypot(traits.height_share, 1.5 * view.edge / slopes)))
-        if ground and traits.height_m is not None and view.top is not None and abs(view.top) > _LEAST_SLOPE:
+        if ground and traits.height_m is not None and view.top is not None and abs(view.top) > LEAST_SLOPE:
             above = traits.height_m - height  # of the camera
             share = math.hypot(traits.height_share * traits.height_m / max(0.05, abs(above)), view.edge / abs(view.top))
             if above / view.top > 0.0:
@@ -183,7 +189,7 @@ class TargetEstimator:
         distance, share = min(guesses, key=lambda guess: guess[1])
         distance = max(_NEAREST_M, distance)
         share = min(0.5, 1.3 * share + 0.02)
-        known = traits.height_m is not None and traits.height_share < _SURE_OF_SIZE
+        known = traits.height_m is not None and traits.height_share < SURE_OF_SIZE
         foot = 0.0 if ground else height + distance * (view.bottom if view.bottom is not None else -0.2)
         if known and traits.height_m is not None:
             log_height, log_deviation = math.log(traits.height_m), traits.height_share
@@ -203,7 +209,47 @@ class TargetEstimator:
         if not known:  # what is farther than it was taken to be is larger, too
             covariance[:2, 5] = covariance[5, :2] = radial / distance * along
             covariance[5, 5] += share**2
-        self._covariance = covariance
+        self._begin(self._state, covariance, camera, at_ns)
+
+    def start_at(self, distance_m: float, share: float, view: BoxView, camera: Camera, at_ns: int) -> None:
+        """Start from the first box, at a range that is only a guess: wherever the thing is, its box is as it is.
+
+        Args:
+            distance_m: The range; foot and height go along with it.
+            share: Standard deviation of that, as a share of it.
+            view: What the box shows.
+            camera: That took the image.
+            at_ns: Its capture.
+        """
+        bottom = -0.2 if view.bottom is None else view.bottom
+        top = 0.2 if view.top is None else view.top
+        slopes, edge = max(1e-3, top - bottom), math.hypot(view.edge, view.tilt)
+        along = np.array([math.cos(view.azimuth), math.sin(view.azimuth)])
+        aside = np.array([-along[1], along[0]])
+        foot, log_height = camera.position[2] + distance_m * bottom, math.log(max(0.01, slopes * distance_m))
+        outwards = np.array([*along, 0.0, 0.0, bottom, 1.0 / distance_m])
+        covariance = (share * distance_m) ** 2 * np.outer(outwards, outwards)
+        covariance[:2, :2] += (view.azimuth_rad * distance_m + 0.05) ** 2 * np.outer(aside, aside)
+        covariance[4, 4] += ((edge if view.bottom is not None else 0.3) * distance_m) ** 2
+        covariance[5, 5] += (1.5 * edge / slopes) ** 2 if None not in (view.bottom, view.top) else 0.5**2
+        place = camera.position[:2] + distance_m * along
+        self._begin(np.array([*place, 0.0, 0.0, foot, log_height]), covariance, camera, at_ns)
+        self.loosen(distance_m)
+
+    def loosen(self, distance_m: float) -> None:
+        """Count on a faster target the farther it is, directly after the start.
+
+        Else the likelihood of boxes that hardly move would speak for the farthest of several guesses.
+
+        Args:
+            distance_m: The range that is guessed.
+        """
+        pace = _PACE_PER_S * distance_m
+        self._intensity += self.traits.intensity_m2_s3 * (pace**2 - 1.0)
+        self._covariance[2:4, 2:4] = np.eye(2) * pace**2
+
+    def _begin(self, state: Array, covariance: Array, camera: Camera, at_ns: int) -> None:
+        self._state, self._covariance = state, covariance
         self._at_ns = self.seen_ns = at_ns
         self._eye = camera.position
         self.refused, self._surprise = 0, 1.0
@@ -296,6 +342,10 @@ class TargetEstimator:
             range_m=distance,
             range_deviation_m=math.sqrt(max(0.0, float(sight @ place @ sight))),
         )
+
+    def again(self, at_ns: int) -> TargetEstimator:
+        """Return a filter, not started yet, for the same thing where it comes into view again."""
+        return TargetEstimator(self.traits, nominal_m=self.at(at_ns).range_m, relative=self._relative)
 
     def _predict(self, at_ns: int) -> tuple[Array, Array]:
         """Return state and covariance at a time.

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import seconds
-from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, TargetState, Traits
+from skyloop.control.target_estimate import TRAITS, TargetEstimator, TargetState, Traits
+from skyloop.control.target_range import RangeEstimator, estimator_of
 from skyloop.control.target_scene import Scene, SceneObject, unlikeness
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
@@ -102,7 +103,7 @@ class TargetFinder:
         self.class_name = class_name
         self.detections: tuple[Detection, ...] = ()
         self._first_box = box
-        self._given = traits
+        self._given, self._unnamed = traits, class_name is None
         self._nominal_m = nominal_m
         self._relative = relative
         self._tracker = LongTermTracker()
@@ -115,6 +116,7 @@ class TargetFinder:
         self._doubts = 0
         self._twin_ns: int | None = None  # when another thing that looks like the target was seen beside it
         self._newcomers: dict[int, tuple[int, float]] = {}  # images of them, and mean unlikeness to the target
+        self._ground = False  # whether the camera's height above the ground is known in the newest image
         self._agreed = 0  # images in a row in which tracker and a detection agree
 
     def see(
@@ -133,6 +135,7 @@ class TargetFinder:
             UsageError: The first box does not fit into the image.
         """
         self._frames.append(_Seen(image, camera, captured_ns))
+        self._ground = ground
         tracked = TrackResult(None, 0.0)
         if self._tracking:
             self._shift(camera, captured_ns)
@@ -168,6 +171,7 @@ class TargetFinder:
         frame = next((one for one in self._frames if one.captured_ns == captured_ns), None)
         if frame is None:
             return False
+        self._ground = ground
         self._use(detections, frame, TrackResult(frame.box, 0.0), ground=ground)
         target = self.target
         self._tracker_noise = _TRACKER_NOISE if target is None else _BESIDE_LATE
@@ -220,11 +224,12 @@ class TargetFinder:
     # The tracker ---------------------------------------------------------------------------------------------------
 
     def _begin(self, box: Box, camera: Camera, captured_ns: int, *, ground: bool) -> None:
-        traits = self._given or (TRAITS.get(self.class_name, UNKNOWN) if self.class_name else UNKNOWN)
+        traits = self._given or TRAITS.get(self.class_name or "")
         view = BoxView.of(box, camera, _TRACKER_NOISE)
         if view is None:
             raise UsageError("the box is straight above or below the vehicle, where it has no bearing: turn or move")
-        self.estimator = TargetEstimator(traits, nominal_m=self._nominal_m, relative=self._relative)
+        name, nominal_m = self.class_name, self._nominal_m
+        self.estimator = estimator_of(name, traits, nominal_m=nominal_m, relative=self._relative)
         self.estimator.start(view, camera, captured_ns, ground=ground)
 
     def _decide(self, image: Image, camera: Camera, captured_ns: int, tracked: TrackResult) -> Sighting:
@@ -272,8 +277,8 @@ class TargetFinder:
         if unseen_s < _DORMANT_S or self._number is not None:
             return False
         before = estimator.at(captured_ns)
-        again = TargetEstimator(estimator.traits, nominal_m=before.range_m, relative=self._relative)
-        again.start(view, camera, captured_ns, ground=estimator.traits.on_ground)
+        again = estimator.again(captured_ns)
+        again.start(view, camera, captured_ns, ground=self._ground)
         way = again.at(captured_ns).foot[:2] - before.foot[:2]
         if float((way @ way) ** 0.5) > _FAST_M_S * unseen_s + before.place_m:
             return False
@@ -328,6 +333,8 @@ class TargetFinder:
         looks = [colours(frame.image, one.box) for one in detections]
         scene.update(detections, looks, frame.camera, frame.captured_ns, ground=ground)
         if target is not None:
+            if target.seen and self._is_unsure(scene, target):
+                target.estimator = self._learning(target, frame, back=True)
             self.estimator = target.estimator  # two that had been taken for each other may have been exchanged
         if target is None:
             self._choose(scene, frame, tracked)
@@ -343,7 +350,7 @@ class TargetFinder:
         if not self._tracking:
             confirmed = [each for each in candidates if each.confirmed]
             if self.class_name is not None and confirmed:
-                self._adopt(scene, max(confirmed, key=lambda each: each.detection.box[3]))
+                self._adopt(scene, max(confirmed, key=lambda each: each.detection.box[3]), frame)
                 self._resume(frame.image, self.target.detection.box if self.target else (0, 0, 0, 0))
             return
         box = tracked.box
@@ -356,7 +363,7 @@ class TargetFinder:
             return
         self._agreed += 1
         if at_start or self._agreed >= 3:
-            self._adopt(scene, best)
+            self._adopt(scene, best, frame)
 
     def _recognise(self, scene: Scene, target: SceneObject, frame: _Seen) -> None:
         """Take a newcomer for the target if it can be it, looks like it, and is the only such one."""
@@ -390,7 +397,7 @@ class TargetFinder:
             return
         # Of what comes out of hiding the first boxes are of what it comes from behind of, too.
         found.looks, found.hits = target.looks, target.hits + found.hits
-        self._adopt(scene, found)
+        self._adopt(scene, found, frame, back=True)
         del scene.objects[target.number]
 
     def _note_twins(self, scene: Scene, target: SceneObject, at_ns: int) -> None:
@@ -421,11 +428,33 @@ class TargetFinder:
     def _may_be(self, each: SceneObject) -> bool:
         return self.class_name is None or each.class_name == self.class_name
 
-    def _adopt(self, scene: Scene, thing: SceneObject) -> None:
+    def _is_unsure(self, scene: Scene, thing: SceneObject) -> bool:
+        """Whether a thing is taken to stand on the ground, and may hang on a wall for all that is known of it."""
+        traits = scene.traits.get(thing.class_name)
+        unsure = traits is None or (traits is self._given and self._unnamed and traits.on_ground is None)
+        return unsure and not isinstance(thing.estimator, RangeEstimator)
+
+    def _learning(self, thing: SceneObject, frame: _Seen, *, back: bool) -> TargetEstimator:
+        """Return the filter that learns the range of a thing, which was seen in a frame and may be back again."""
+        before = self.estimator
+        if isinstance(before, RangeEstimator) and not back:
+            return before
+        view = BoxView.of(thing.detection.box, frame.camera)
+        if view is None:
+            return thing.estimator
+        new = estimator_of(None, self._given, nominal_m=self._nominal_m, relative=self._relative)
+        if isinstance(before, RangeEstimator):
+            new = before.again(frame.captured_ns)
+        new.start(view, frame.camera, frame.captured_ns, ground=self._ground)
+        return new
+
+    def _adopt(self, scene: Scene, thing: SceneObject, frame: _Seen, *, back: bool = False) -> None:
         if self._given is not None and self.class_name is None:  # what is known of it goes before its class
             scene.traits[thing.class_name] = self._given
             if self.estimator is not None:
                 thing.estimator = self.estimator
+        if self._is_unsure(scene, thing):
+            thing.estimator = self._learning(thing, frame, back=back)
         self._number = thing.number
         self.class_name = thing.class_name
         self.estimator = thing.estimator

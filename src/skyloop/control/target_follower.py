@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.airframe import AirframeLaw, Part
+from skyloop.control.airframe import STALE_S, AirframeLaw, Part
 from skyloop.control.chase_law import LOSSES, ChaseLaw, FollowMode, TargetPhase
 from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_estimate import TargetEstimator, Traits
@@ -182,7 +182,9 @@ class TargetFollower(AirframeLaw):
         Raises:
             UsageError: The first box does not fit into the image, or the camera's intrinsics are not known.
         """
-        state = frame.feedback
+        state, newest = frame.feedback, self.airframe.feedback
+        if newest is not None and seconds(frame.captured_ns - newest.captured_ns) > STALE_S:
+            state = None  # stamped ahead, or nothing is heard of the vehicle: where it looked from is not known
         # A vehicle whose velocity is not known any more hovers where it was last.
         motion = self.airframe.at(frame.captured_ns) or self.airframe.newest
         if state is None or motion is None:
@@ -238,6 +240,8 @@ class TargetFollower(AirframeLaw):
         if not self._ready(now_ns):
             return Attitude() if self._relative else Velocity()
         self._since_s(now_ns)
+        if self._seen_ns is not None and seconds(self._seen_ns - now_ns) > STALE_S:
+            self._seen_ns = None  # that frame was stamped ahead: it would count as seen until then
         finder = self._finder
         return self._law.step(
             now_ns,

@@ -9,6 +9,7 @@ drifts only as corners leave the image and new ones replace them.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -85,11 +86,9 @@ class GroundTracker:
         pixels, intrinsics = checked(image, intrinsics)
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels.copy()
         height = at_capture.altitude_m
-        if (
-            height is None
-            or height < _LOWEST_M
-            or None in (at_capture.roll_rad, at_capture.pitch_rad, at_capture.yaw_rad)
-        ):
+        known = (height, at_capture.roll_rad, at_capture.pitch_rad, at_capture.yaw_rad)
+        # What is not finite would stay in the position for good.
+        if height is None or height < _LOWEST_M or any(one is None or not math.isfinite(one) for one in known):
             self.forget()
             return None
         if self._grey is not None and self._grey.shape != grey.shape:

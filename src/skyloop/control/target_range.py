@@ -1,0 +1,212 @@
+"""The range of a target that may not stand on the ground: several hypotheses, until the bearings decide. Pure.
+
+A box that a person draws may hold a person on the ground, a picture on a wall or a lamp. Its lower edge gives the range
+only of a target on the ground: a picture whose lower edge is a little below the vehicle seems far away, and surely so.
+That is therefore one hypothesis among others, at ranges from near to far, with a filter each (T. R. Kronhamn,
+"Bearings-only target motion analysis based on a multihypothesis Kalman filter and adaptive ownship motion control", IEE
+Proceedings 145(4), 1998; N. Peach, IEE Proceedings 142(1), 1995). While the vehicle stays, all of them fit. Once it has
+moved, above all up or down, where hardly any target moves, those at a wrong range do not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from skyloop.clock import seconds
+from skyloop.control.limiting import within
+from skyloop.control.target_estimate import LEAST_SLOPE, SURE_OF_SIZE, UNKNOWN, TargetEstimator, TargetState, Traits
+from skyloop.control.target_view import BoxView, Camera
+
+_RANGES_M: Final = tuple(0.7 * 1.7**n for n in range(8))  # to 29 m, and beyond
+_SHARE: Final = 0.3  # standard deviation of each, as a share of it
+_ON_GROUND: Final = 0.5  # that it stands on the ground, before anything was seen
+_AS_BEFORE: Final = 0.5  # standard deviation of the logarithm of the range of a thing that was seen before
+_TOGETHER_S: Final = 0.3  # boxes within this time count as one: a tracker's errors last
+_WORST: Final = 50.0  # cost of a box, by which a guess may lose at most
+_LEAST: Final = 1e-3  # a guess that is less likely is dropped
+_KNOWN: Final = 0.2  # deviation of the range, as a share of it, from which on it is known
+_UNKNOWN: Final = 0.4  # and above which it is not any more
+_STIRRED_M: Final = 0.1  # off from where it was of late, from which on what a box says counts in full
+_OF_LATE_S: Final = 2.0  # of late: the mean of about this time
+_BASELINE: Final = 0.015  # how far off it must have been once, by range, before the range is known
+
+
+class RangeEstimator(TargetEstimator):
+    """The filters of one target that may stand on the ground or not."""
+
+    def __init__(
+        self, traits: Traits, *, nominal_m: float = 4.0, relative: bool = False, before: TargetState | None = None
+    ) -> None:
+        """Initialise the filters.
+
+        Args:
+            traits: Known traits of the target.
+            nominal_m: Its distance at the start where the vehicle does not know its own height.
+            relative: As of :class:`TargetEstimator`.
+            before: The state in which it was lost, if its range was known then.
+        """
+        super().__init__(traits, nominal_m=nominal_m, relative=relative)
+        self._seen_before = before
+        self._guesses: list[TargetEstimator] = []
+        self._weights = np.ones(0)
+        self._on_ground: TargetEstimator | None = None  # the guess that it stands there, until that is dropped
+        self._sight = self._about = np.zeros(3)  # the first line of sight; where the vehicle was of late
+        self._stirred_m = 0.0  # the farthest that the vehicle ever was from there, across that line
+        self._size_known = self._known = self._learns = False
+
+    def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
+        """Start from the first box, as :meth:`TargetEstimator.start`.
+
+        Without a known height nothing can tell the guesses apart: the range is the nominal one, and the law keeps the
+        apparent size.
+        """
+        self._size_known = self.traits.height_m is not None and self.traits.height_share < SURE_OF_SIZE
+        self._guesses, weights = [], []
+        self._on_ground, self._known, self._learns = None, not ground, ground
+        below = view.bottom is None or view.bottom < -LEAST_SLOPE
+        if ground and below and self.traits.on_ground is not False:
+            self._on_ground = self._member(view, camera, at_ns, on_ground=True)
+            weights.append(_ON_GROUND)
+        if self._on_ground is not None and self.traits.on_ground:
+            pass  # it was seen to stand there before
+        elif not ground or self._size_known:
+            self._member(view, camera, at_ns, on_ground=False)
+            weights.append(1.0 - _ON_GROUND)
+        else:
+            for distance_m in _RANGES_M:
+                self._guesses.append(guess := TargetEstimator(self.traits, relative=self._relative))
+                guess.start_at(distance_m, _SHARE, view, camera, at_ns)
+                weights.append((1.0 - _ON_GROUND) / len(_RANGES_M) * self._as_before(distance_m))
+        self._weights = np.array(weights) / sum(weights)
+        self.seen_ns, self.refused = at_ns, 0
+        azimuth = view.azimuth
+        self._sight = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+        self._about, self._stirred_m = camera.position, 0.0
+        self._judge(self.at(at_ns))
+
+    def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
+        """Return how badly a box fits, as :meth:`TargetEstimator.distance`: the best fit of all, and the mixture's."""
+        fits, costs = zip(*(guess.distance(view, camera, at_ns) for guess in self._guesses), strict=True)
+        likelihood = float(self._weights @ np.exp(-np.minimum(costs, 700.0) / 2.0))
+        return min(fits), -2.0 * math.log(likelihood) if math.isfinite(min(costs)) and likelihood > 0.0 else math.inf
+
+    def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
+        """Update with a box, as :meth:`TargetEstimator.update`, and drop the guesses that it does not fit."""
+        if self.seen_ns is None:
+            return super().update(view, camera, at_ns)  # which says so
+        since_s = seconds(at_ns - self.seen_ns)
+        costs = np.array([guess.distance(view, camera, at_ns)[1] for guess in self._guesses])
+        used = [guess.update(view, camera, at_ns) for guess in self._guesses]
+        if not any(used):
+            self.refused += 1
+            return False
+        self.seen_ns, self.refused = max(at_ns, self.seen_ns), 0
+        # Of a vehicle that stays boxes tell nothing: the guess that counts on the least motion would win slowly.
+        told = 1.0 if self._size_known else within((self._stir(camera, since_s) / _STIRRED_M) ** 2, 0.0, 1.0)
+        costs = np.minimum(costs, 1e9)
+        worse = np.minimum(costs - costs.min(), _WORST)
+        self._weights = self._weights * np.exp(-0.5 * worse * told * within(since_s / _TOGETHER_S, 0.0, 1.0))
+        self._drop()
+        self._judge(self.at(self.seen_ns))
+        return True
+
+    def at(self, at_ns: int) -> TargetState:
+        """Predict the target's state, as :meth:`TargetEstimator.at`: the mean of all guesses, with its deviation."""
+        if self.seen_ns is None:
+            return super().at(at_ns)  # which says so
+        states = [guess.at(at_ns) for guess in self._guesses]
+        weights = self._weights
+
+        def mean(values: list[float]) -> float:
+            return float(weights @ np.array(values))
+
+        foot = weights @ np.array([one.foot for one in states])
+        distance = mean([one.range_m for one in states])
+        apart = [float((one.foot[:2] - foot[:2]) @ (one.foot[:2] - foot[:2])) for one in states]
+        deviation_m = math.sqrt(mean([one.range_deviation_m**2 + (one.range_m - distance) ** 2 for one in states]))
+        return TargetState(
+            at_ns=at_ns,
+            foot=foot,
+            velocity=weights @ np.array([one.velocity for one in states]),
+            height_m=mean([one.height_m for one in states]),
+            place_m=math.sqrt(mean([one.place_m**2 + off for one, off in zip(states, apart, strict=True)])),
+            range_m=distance,
+            range_deviation_m=deviation_m,
+            range_known=self._known,
+            margin_m=deviation_m if self.on_ground is False and self._learns else 0.0,
+        )
+
+    @property
+    def on_ground(self) -> bool | None:
+        """Whether it stands on the ground: None while that is not known."""
+        if self._on_ground is None:
+            return False
+        likeliest = self._guesses[int(np.argmax(self._weights))]
+        return True if self._known and likeliest is self._on_ground else None
+
+    def again(self, at_ns: int) -> TargetEstimator:
+        """Return the filter, not started yet, for the same thing where it comes into view again."""
+        before, stands = self.at(at_ns), self.on_ground
+        traits = self.traits if stands is None else replace(self.traits, on_ground=stands)
+        return RangeEstimator(
+            traits, nominal_m=before.range_m, relative=self._relative, before=before if self._known else None
+        )
+
+    def _member(self, view: BoxView, camera: Camera, at_ns: int, *, on_ground: bool) -> TargetEstimator:
+        member = TargetEstimator(self.traits, nominal_m=self._nominal_m, relative=self._relative)
+        member.start(view, camera, at_ns, ground=on_ground)
+        if on_ground and not self._size_known:
+            member.loosen(member.at(at_ns).range_m)
+        self._guesses.append(member)
+        return member
+
+    def _as_before(self, distance_m: float) -> float:
+        if self._seen_before is None:
+            return 1.0
+        return math.exp(-0.5 * (math.log(distance_m / self._seen_before.range_m) / _AS_BEFORE) ** 2)
+
+    def _drop(self) -> None:
+        self._weights = self._weights / self._weights.sum()
+        kept = np.flatnonzero(self._weights >= min(_LEAST, float(self._weights.max())))
+        self._guesses = [self._guesses[n] for n in kept]
+        self._weights = self._weights[kept] / self._weights[kept].sum()
+        if self._on_ground not in self._guesses:
+            self._on_ground = None
+
+    def _stir(self, camera: Camera, since_s: float) -> float:
+        """Return how far the vehicle is from where it was of late, across the first line of sight [m]."""
+        self._about = self._about + (camera.position - self._about) * within(since_s / _OF_LATE_S, 0.0, 1.0)
+        x, y, z = (camera.position - self._about).tolist()
+        off_m = math.hypot(float(self._sight[0] * y - self._sight[1] * x), z)
+        self._stirred_m = max(self._stirred_m, off_m)
+        return off_m
+
+    def _judge(self, state: TargetState) -> None:
+        """Decide whether the range is known: by the size, or by what the vehicle's own motion has shown."""
+        share = state.range_deviation_m / state.range_m
+        if self._known:
+            self._known = share < _UNKNOWN or len(self._guesses) == 1
+        else:
+            told = self._size_known or self.traits.on_ground
+            moved = self._stirred_m > _BASELINE * state.range_m
+            self._known = share < _UNKNOWN if told else moved and share < _KNOWN
+
+
+def estimator_of(
+    class_name: str | None, traits: Traits | None, *, nominal_m: float = 4.0, relative: bool = False
+) -> TargetEstimator:
+    """Return the filter, not started yet, of a thing.
+
+    Args:
+        class_name: Of the target; None: a person drew a box, without a class.
+        traits: Known traits of the target; None: there are none.
+        nominal_m: Its distance at the start where nothing tells it.
+        relative: Whether the vehicle does not know its own velocity.
+    """
+    if traits is not None and (class_name is not None or traits.on_ground is not None):
+        return TargetEstimator(traits, nominal_m=nominal_m, relative=relative)
+    return RangeEstimator(traits or UNKNOWN, nominal_m=nominal_m, relative=relative)
