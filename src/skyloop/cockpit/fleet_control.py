@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
@@ -45,7 +46,11 @@ class FleetSession:
 
     async def run(self) -> None:
         """Serve the page until it is gone."""
-        await self._page.serve(lambda messages: [self._on_message(text) for text in messages])
+        await self._page.serve(self._on_messages)
+
+    def _on_messages(self, texts: Sequence[str | bytes]) -> None:
+        for text in texts:
+            self._on_message(text)
 
     def _on_message(self, text: str | bytes) -> None:
         now_s = seconds(self._clock())

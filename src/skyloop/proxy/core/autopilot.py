@@ -187,8 +187,8 @@ class Autopilot:
             arrived = there or (altitude is None and rising_s >= needed_s)
         if not arrived and rising_s < LONGEST_RISE * needed_s + LONGEST_RISE_S:
             return Velocity(up=settings.climb)
-        # A stuck altimeter reads the same all the time. One that moves, and has the vehicle down when the time is over, is
-        # right: motors turn, and it has not left the ground, as a real Betaflight on a slow computer.
+        # A stuck altimeter reads the same all the time. One that moves, and has the vehicle down when the time is over,
+        # is right: motors turn, and it has not left the ground, as a real Betaflight on a slow computer.
         if not arrived and len(self._altitudes) > 1 and max(self._altitudes) < settings.takeoff_altitude / 2:
             self.mode = Mode.LAND
             self.flight.steer(FlightState.LANDING, now_ns)
