@@ -39,8 +39,6 @@ export class Hold {
 /** What is done when it was held, and whose motors it is about, in words. */
 export interface Deadly {
   what: string;
-  /** The only drone that it is about; null: all. */
-  drone: string | null;
   act: () => void;
 }
 
@@ -53,6 +51,7 @@ export class Countdown {
   private readonly bar = h("i", {});
   private readonly hold = new Hold();
   private held: Deadly | null = null;
+  private button: Element | null = null;
   private hint: ReturnType<typeof setTimeout> | undefined;
 
   constructor() {
@@ -65,16 +64,16 @@ export class Countdown {
     return this.hold.isHeld;
   }
 
-  /** The only drone that what is held is about; null: nothing is held, or it is about all. */
-  get drone(): string | null {
-    return this.held?.drone ?? null;
+  /** Whether it is this that is held, and nothing that began elsewhere: only that is ended by who began it. */
+  holds(deadly: Deadly | null): boolean {
+    return deadly !== null && this.held === deadly;
   }
 
-  /** What is held already goes on. */
-  press(deadly: Deadly): void {
+  /** What is held already goes on. `button`: where it is held; once that is gone, nobody sees that it is let go. */
+  press(deadly: Deadly, button: Element | null = null): void {
     if (this.hold.isHeld) return;
     clearTimeout(this.hint);
-    this.held = deadly;
+    [this.held, this.button] = [deadly, button];
     this.hold.press(performance.now());
     this.tick();
     requestAnimationFrame(this.round);
@@ -98,6 +97,7 @@ export class Countdown {
   }
 
   private readonly round = (): void => {
+    if (this.button?.isConnected === false) this.release();
     if (!this.hold.isHeld) return;
     this.tick();
     requestAnimationFrame(this.round);
@@ -122,19 +122,21 @@ export class Countdown {
 /** A button that is held: by pointer, or by the space bar or Enter. `deadly` is asked when the press begins. */
 export function holdButton(countdown: Countdown, deadly: () => Deadly | null, attributes: Record<string, string>, ...children: (Node | string)[]): HTMLButtonElement {
   const button = h("button", { type: "button", ...attributes }, ...children);
-  let held: number | string | null = null; // by which finger or key: to let go of another one ends nothing
+  let pressed: { by: number | string; meant: Deadly } | null = null; // by which finger or key: to let go of another one ends nothing
   const press = (by: number | string): void => {
     const meant = deadly();
     if (meant === null || button.disabled) return;
-    if (!countdown.isHeld) held = by; // also where the release of the one before was not seen
+    countdown.press(meant, button);
+    if (!countdown.holds(meant)) return; // something else is held
+    pressed = { by, meant };
     setAttribute(button, "data-held", "true");
-    countdown.press(meant);
   };
-  const release = (by: number | string | null): void => {
-    if (held === null || (by !== null && by !== held)) return;
-    held = null;
+  const release = (by: number | string): void => {
+    if (by !== pressed?.by) return;
+    const { meant } = pressed;
+    pressed = null;
     setAttribute(button, "data-held", "false");
-    countdown.release();
+    if (countdown.holds(meant)) countdown.release(); // or it is done, and what is held now was begun elsewhere
   };
   button.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;
@@ -142,7 +144,8 @@ export function holdButton(countdown: Countdown, deadly: () => Deadly | null, at
     press(event.pointerId);
   });
   for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) button.addEventListener(end, (event) => release(event.pointerId));
-  button.addEventListener("blur", () => release(null));
+  // Keys are let go elsewhere then. A finger is captured: wherever the focus goes, it is seen here.
+  button.addEventListener("blur", () => typeof pressed?.by === "string" && release(pressed.by));
   button.addEventListener("contextmenu", (event) => event.preventDefault()); // a long press on a touch screen
   button.addEventListener("keydown", (event) => {
     if (event.code !== "Space" && event.code !== "Enter" && event.code !== "NumpadEnter") return;

@@ -129,7 +129,7 @@ export class Pane {
     this.stage = new Stage(name, this.controls, pilots ? this.marking() : null);
     this.strip = new Strip(name, (deed) => this.act(deed), (id, grant, reason) => this.pilot?.answer(id, grant, reason), {
       countdown: host.countdown,
-      deadly: () => (this.target === null ? null : { what: t.safety.motorsOff(name), drone: name, act: () => this.target?.stop() }),
+      deadly: () => (this.target === null ? null : { what: t.safety.motorsOff(name), act: () => this.target?.stop() }),
       understood: () => this.pilot?.understood(),
     });
     this.writes = new Writes((parameter, value) => this.pilot?.write(parameter, value));

@@ -53,6 +53,9 @@ export class Safety {
   private target: Target | null = null;
   private asked: { deed: Deed; drones: readonly string[]; each: Map<string, { state: string; why: string }>; since_ms: number } | null = null;
   private flying = 0;
+  /** What began last with the drone that was aimed at then; with keys or the gamepad. */
+  private aimed: Deadly | null = null;
+  private keyed: Deadly | null = null;
 
   constructor(
     connect: (handlers: Handlers) => CommandSocket,
@@ -77,8 +80,7 @@ export class Safety {
 
   /** Which drone is stopped by its own button, by keys and by the gamepad; null: none that flies is seen. */
   aim(target: Target | null): void {
-    const { drone } = this.countdown;
-    if (drone !== null && drone !== target?.name) this.countdown.release(); // that was meant for another one
+    if (target?.name !== this.target?.name && this.countdown.holds(this.aimed)) this.countdown.release(); // that was meant for another one
     this.target = target;
     this.show();
   }
@@ -92,23 +94,30 @@ export class Safety {
 
   /** Keys or the gamepad are held, or no longer. */
   hold(which: "one" | "all" | null): void {
-    if (which === null) this.countdown.release();
-    else {
-      const meant = which === "one" ? this.one() : this.every("stop_all");
-      if (meant) this.countdown.press(meant);
-      else this.notify(t.safety.aimless, true);
+    if (which === null) {
+      if (this.countdown.holds(this.keyed)) this.countdown.release();
+      return;
     }
+    const meant = which === "one" ? this.one() : this.every("stop_all");
+    if (meant === null) {
+      this.notify(t.safety.aimless, true);
+      return;
+    }
+    this.countdown.press(meant);
+    if (this.countdown.holds(meant)) this.keyed = meant;
   }
 
   private one(): Deadly | null {
     const { target } = this;
-    return target && { what: t.safety.motorsOff(target.name), drone: target.name, act: () => target.stop() };
+    const meant = target && { what: t.safety.motorsOff(target.name), act: () => target.stop() };
+    if (!this.countdown.isHeld) this.aimed = meant;
+    return meant;
   }
 
   private every(deed: Deed): Deadly {
     const count = this.flying;
     const which = count === 1 ? t.safety.theOnly : t.safety.allOf(count);
-    return { drone: null, what: deed === "land_all" ? t.safety.landThese(which) : t.safety.motorsOff(which), act: () => this.send(deed) };
+    return { what: deed === "land_all" ? t.safety.landThese(which) : t.safety.motorsOff(which), act: () => this.send(deed) };
   }
 
   private send(deed: Deed): void {

@@ -279,8 +279,14 @@ def test_a_stop_that_is_held_is_ended_by_no_other_key_or_finger(deck: Deck) -> N
         with page.holding(" "):
             page.page.keyboard.up("w")
             page.until(lambda: drone.feedback().state is FlightState.EMERGENCY, "all motors are off")
-        drone.reset_emergency()
-        drone.wait("landed", 10)
+
+        def stands() -> bool:
+            state = drone.feedback().state
+            if state is FlightState.EMERGENCY:
+                drone.reset_emergency()  # which counts for nothing while it falls
+            return state is FlightState.LANDED
+
+        page.until(stands, "it has fallen, and is reset")
         drone.takeoff()
         stop.hover()
         page.page.mouse.down()

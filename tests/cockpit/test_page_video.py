@@ -250,7 +250,7 @@ def test_drawings_that_come_late_are_shown_pale_or_the_page_says_why_not(deck: D
 
         def draw(frame: Frame) -> None:
             frames.append(frame)
-            while drone.now_ns - frames[0].captured_ns > late_s * 1e9:
+            while frames and drone.now_ns - frames[0].captured_ns > late_s * 1e9:
                 old = frames.pop(0)
                 drone.annotate(old, [Polyline(((40, 40), (200, 40), (200, 160)), closed=True)], source="detector")
 
