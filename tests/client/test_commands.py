@@ -264,6 +264,51 @@ def test_a_landing_asked_for_during_a_return_of_the_autopilots_own_is_the_caller
     assert not again.automatic
 
 
+@pytest.mark.parametrize("had", ["the lease", "no lease"])
+def test_a_pilot_who_takes_a_landing_by_hand_keeps_it_whoever_had_the_vehicle_before(
+    proxy: ScriptedProxy, drone: Drone, had: str
+) -> None:
+    """It was compared with what had it when land() was called: the same words, or whatever came before its lease."""
+    others = "the vehicle is flown by others"
+    proxy.state = FlightState.FLYING
+    if had == "the lease":
+        proxy.more["others"] = others
+        drone.wait(lambda feedback: feedback.others == others, WAIT_S)
+    else:
+        proxy.answers[RequestAuthority] = None
+        lost_lease(proxy, proxy.until_commanded(Idle()))
+        proxy.until(lambda: isinstance(proxy.requests[-1], RequestAuthority), "the loss is known")
+
+    def vehicle() -> None:
+        if had == "no lease":
+            drone._core.state.notifier.wait_for(lambda: drone._core.commands.newest == Land(), WAIT_S)
+            del proxy.answers[RequestAuthority]
+        first = proxy.until_commanded(Land())
+        assert proxy.owner is not None
+        proxy.more["others"] = None
+        proxy.more["outcome"] = Outcome(proxy.owner[0], first.intent)
+        drone._core.state.notifier.wait_for(lambda: _told(drone) == first.intent, WAIT_S)
+        del proxy.more["outcome"]
+        proxy.more["others"] = others
+        drone.wait(lambda feedback: feedback.others == others, WAIT_S)
+        lost_lease(proxy, first)
+        proxy.until(
+            lambda: any(c.action == Land() and c.lease > first.lease for c in proxy.commands), "it is sent anew"
+        )
+        proxy.more.clear()
+        proxy.state = FlightState.LANDED
+
+    landing = background(vehicle)
+    drone.land(timeout_s=2 * WAIT_S)
+    landing.join(WAIT_S)
+    assert [command for command in proxy.commands if command.action == Land()][-1].automatic
+
+
+def _told(drone: Drone) -> int:
+    told = drone._core.commands.told
+    return 0 if told is None else told.intent
+
+
 def test_a_landing_that_was_given_up_after_a_minute_is_not_asked_for_anew(proxy: ScriptedProxy, drone: Drone) -> None:
     """Whoever waited for it may have forgotten it, and what is heard by then may be another flight."""
 

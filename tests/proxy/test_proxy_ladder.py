@@ -177,6 +177,35 @@ def test_a_landing_asked_for_in_the_dark_is_given_up_after_a_minute(bench: Bench
     assert bench.driver.told[-1] == Land(), "asked for anew, it lands"
 
 
+@pytest.mark.parametrize("ends", ["stays", "leaves", "hovers"])
+def test_a_landing_that_is_given_up_is_not_broken_off(bench: Bench, ends: str) -> None:
+    """A hover followed: what lands from high up, and hears although it is not heard, hung in the air from then on."""
+    pilot = bench.airborne()
+    be_patient(pilot)
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    in_the_dark(bench, 2, pilot, Idle())
+    pilot.command(Land())
+    in_the_dark(bench, 60, pilot, Land())
+    assert len(messages(pilot, "landing_given_up")) == 1
+    bench.driver.told.clear()
+    in_the_dark(bench, 5, pilot, Land())
+    assert bench.driver.told == []
+    if ends == "leaves":
+        for name in ("failsafe.hover_after_s", "failsafe.land_after_s"):
+            pilot.ask(SetParameter(name, 5.0, pilot.lease))
+        pilot.ask(ReleaseAuthority())
+        for _ in range(8):
+            bench.clock.advance(1.0)
+            bench.tick()
+        assert set(bench.driver.told) == {Land()}, "with nobody there it is landed"
+    elif ends == "hovers":
+        pilot.command(Hover())
+        in_the_dark(bench, 1, pilot, Hover())
+        assert set(bench.driver.told) == {Hover()}
+
+
 @pytest.mark.parametrize("pilot_stays", [True, False])
 def test_a_landing_that_is_under_way_outlives_a_broken_link_for_a_minute(bench: Bench, pilot_stays: bool) -> None:
     pilot = bench.airborne()

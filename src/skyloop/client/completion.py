@@ -184,6 +184,8 @@ class ActionWait:
         told = self._commands.told
         if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
             self._note(told.text)  # nothing any more, once a repeat is carried out
+            if not told.over:  # carried out: whoever has the vehicle from now on took it since
+                self._others, self._may_be_sent = None, True
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
             return None

@@ -19,7 +19,7 @@ from skyloop.vehicles.msp.motion import Motion
 from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
 from skyloop.vehicles.msp.wire.messages import FailsafeConfig, Function, ModeRange, OnLoss, channels
-from tests.drivers.msp.bench import Bench, options
+from tests.drivers.msp.bench import TICK_S, Bench, options
 
 
 def test_it_learns_the_throttle_and_holds_its_height() -> None:
@@ -579,6 +579,52 @@ def test_a_stop_waits_for_no_settings() -> None:
     bench.session.command(EmergencyStop(), bench.clock.now_ns)
     bench.run(0.03)
     assert not bench.board.armed
+
+
+#: Its arm switch is on while it is low, where every guess puts it.
+INVERTED = BoardSettings(ranges=(ModeRange(0, 0, 900, 1300), ModeRange(1, 1, 900, 2100)))
+
+
+@pytest.mark.parametrize("silent", [Function.STATUS, Function.MODE_RANGES, Function.RX_MAP, None])
+@pytest.mark.parametrize("text", ["msp://tcp:127.0.0.1:5761", "msp://tcp:127.0.0.1:5761?override=1"])
+def test_no_stop_arms_what_stands(silent: Function | None, text: str) -> None:
+    """Before its settings are read its arm switch can only be guessed, and a low one may be on."""
+    bench = Bench(INVERTED)
+    bench.ready()
+    bench.reconnect(text)
+    if silent is not None:
+        bench.unanswered = {silent}
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    for tick in range(round(1.2 / TICK_S)):
+        bench.tick()
+        assert not bench.board.armed, f"armed by a stop {tick * TICK_S:.2f} s after it"
+
+
+@pytest.mark.parametrize("silent", [Function.RX_MAP, Function.BOXNAMES])
+def test_a_stop_keeps_to_the_switches_that_an_earlier_round_of_questions_found(silent: Function) -> None:
+    """While they were asked for again, it fell back to guesses for some frames."""
+    bench = Bench(INVERTED)
+    bench.ready()
+    bench.reconnect()
+    bench.refused = {silent}
+    bench.run(3.0)
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.sent.clear()
+    for _ in range(round(2.0 / TICK_S)):
+        bench.tick()
+        assert not bench.board.armed
+    assert bool(sticks(bench)) is (silent is Function.RX_MAP), "without names it only tells that it stands"
+    assert all(widths[4] > 1300 for widths in sticks(bench))
+
+
+def test_a_stop_reaches_what_can_not_be_heard_by_a_new_proxy() -> None:
+    """What flies may hear it, and what stands had no sticks for so long that it wants its arm switch off first."""
+    bench = Bench()
+    bench.take_off()
+    bench.reconnect()
+    bench.deaf = True
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.until(lambda: not bench.board.armed, 0.6)
 
 
 def test_a_stop_of_what_is_just_being_found_in_flight_is_not_undone_by_taking_it_over() -> None:

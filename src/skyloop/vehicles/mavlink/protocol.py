@@ -358,7 +358,9 @@ class MavlinkSession(VehicleSession):
         messages = (
             self.setpoints.messages(vehicle, now_ns) if self.setpoints is not None and vehicle is not None else []
         )
-        if not self._heard_by_it or now_ns - (self._received_ns or 0) >= QUIET_NS:
+        quiet = now_ns - (self._received_ns or 0) >= QUIET_NS
+        holds = self.setpoints is not None and self.setpoints.holds  # harmless late, and needed now
+        if not self._heard_by_it or (quiet and not holds):
             messages = []  # they would wait somewhere, and be followed when somebody reads again
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 

@@ -342,6 +342,11 @@ class SetpointController:
             self._step_land(vehicle, now_ns)
         return []
 
+    @property
+    def holds(self) -> bool:
+        """Whether it is to stay in the air where it is."""
+        return self.goal is Goal.HOLD or (self.goal is Goal.FOLLOW and isinstance(self._setpoint, PositionHold))
+
     def step_stop(self, vehicle: VehicleState | None, now_ns: int) -> bool:
         """Send an emergency stop that is due, whether or not the vehicle is heard; return whether one is in force."""
         if not self.stop.active:

@@ -24,7 +24,7 @@ from skyloop.vehicles.msp.setpoints import PASSING, Phase, Report, SetpointContr
 from skyloop.vehicles.msp.telemetry import Reported, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
-from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, Sensor
 from skyloop.vehicles.msp.wire.names import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
 
 DEGRADED_NS: Final = nanoseconds(0.4)
@@ -35,8 +35,10 @@ MOST_STICKS: Final = 4  #: frames of sticks that may be without an acknowledgeme
 STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older one is taken for lost once something newer was heard
 LAST_STICKS: Final = 3  #: frames of sticks, level or disarming, that end what is sent to one that is not heard any more
 COUNT_NS: Final = nanoseconds(1.0)  #: over which acknowledged sticks are counted
+UNTOLD_NS: Final = nanoseconds(0.5)  #: a receiver without sticks for so long wants its arm switch off before it arms
 LEAST_STICKS_HZ: Final = 25.0  #: fewer are warned of
 BUNDLING_API: Final = (1, 42)  #: of Betaflight: it knows MULTIPLE
+_MODES_AT: Final = 6  # of STATUS
 WAKING_NS: Final = nanoseconds(8.0)  #: what passes by itself after its start keeps it from being armed for no longer
 AGAIN_NS: Final = nanoseconds(1.0)  #: between two tries to find out who it is
 
@@ -76,6 +78,9 @@ class MspSession(VehicleSession):
         self._known = False  # who it is was asked since it was found
         self._refused_variant = ""
         self._unread = ""  # what it did not tell of its settings
+        self._part = Setup()  # what was read of them, for a stop
+        self._armed: bool | None = None  # as it told before them; None: it did not
+        self._stop_waits = False  # for a word whether it is armed
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns
         self._sticks: deque[int] = deque()  # when those without an acknowledgement were sent
@@ -309,10 +314,14 @@ class MspSession(VehicleSession):
         return made
 
     def _due_sticks(self, now_ns: int) -> bytes:
-        self.urgent = urgent = self._step_stop(now_ns)
-        if urgent and self.setup is None:
+        urgent = self._step_stop(now_ns)
+        known = self.setup is not None
+        if not known:
+            urgent |= self._stop_waits and self.setpoints.stop.active
             self._keep_part()
-        known = self.setup is not None or (urgent and not self._refused_variant)  # a stop waits for no settings
+            known = urgent and self._may_stop_unread(now_ns)
+            self._stop_waits = urgent and not known
+        self.urgent = urgent and known
         if not known or not (urgent or (self._may_steer and now_ns >= self._sticks_due_ns)):
             return b""
         period = nanoseconds(1 / self.options.rate_hz)
@@ -324,6 +333,17 @@ class MspSession(VehicleSession):
             return b""
         self._sticks.append(now_ns)
         return made
+
+    def _may_stop_unread(self, now_ns: int) -> bool:
+        """Return whether a stop can be sent before all settings were read, and can't arm what stands.
+
+        Where the arm switch was not read its channel is low, by which some are armed.
+        """
+        if self._refused_variant or self._part.ranges_of(ARM):
+            return not self._refused_variant
+        if self._armed is not None or self.options.override:  # a pilot's receiver goes on by itself
+            return bool(self._armed)
+        return now_ns - self._opened_ns >= UNTOLD_NS
 
     def _holds_back(self, now_ns: int) -> bool:
         """Return whether sticks that are sent now might wait in a buffer and be obeyed late, or are somebody else's.
@@ -371,10 +391,16 @@ class MspSession(VehicleSession):
         if not self._questions.idle or (self._asked_ns is not None and now_ns - self._asked_ns < AGAIN_NS):
             return
         self._asked_ns = now_ns
+        self._questions.ask(Function.STATUS, self._on_armed)
         self._identification = Identification(self._questions, self._on_setup)
         self._questions.ask(Function.STATUS, self._on_identity)
 
-    def _on_identity(self, _status: bytes | None) -> None:
+    def _on_armed(self, status: bytes | None) -> None:
+        if status is not None and len(status) > _MODES_AT:
+            self._armed = bool(status[_MODES_AT] & 1)  # ARM is the first mode of both firmwares
+
+    def _on_identity(self, status: bytes | None) -> None:
+        self._on_armed(status)
         assert self._identification is not None
         identity = self._identification.setup.identity
         if identity.variant in SUPPORTED:
@@ -422,10 +448,13 @@ class MspSession(VehicleSession):
         self._telemetry = Telemetry(streams, bundle)
 
     def _keep_part(self) -> None:
-        """Keep what was read of its settings: by that at least a stop is sent."""
-        identification = self._identification
-        if self.setup is None and identification and identification.setup.identity.variant in SUPPORTED:
-            self.setpoints.set_up(identification.setup, "its settings were not read")
+        """Keep what was read of its settings, or in an earlier round: by that at least a stop is sent."""
+        if self.setup is not None or self._identification is None:
+            return
+        found, before = self._identification.setup, self._part
+        if found.identity.variant in SUPPORTED and _told(found) >= _told(before):
+            self._part = found
+            self.setpoints.set_up(found, "its settings were not read")
 
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events()
@@ -440,7 +469,7 @@ class MspSession(VehicleSession):
         del now_ns
         self._keep_part()
         self._received_ns = self._asked_ns = self._identification = None
-        self._known, self._refused_variant, self._wakes_until_ns = False, "", None
+        self._known, self._refused_variant, self._wakes_until_ns, self._armed = False, "", None, None
         self._questions.clear()
         if self._telemetry is not None:
             self._telemetry.forget()
@@ -467,6 +496,10 @@ class MspSession(VehicleSession):
         if self.options.serial:
             return serial_trouble(error, self.options.place, self._advice())
         return super()._trouble(error)
+
+
+def _told(setup: Setup) -> tuple[bool, bool]:
+    return bool(setup.ranges_of(ARM)), setup.sticks != USUAL_MAP
 
 
 def _has_height(status: msp.Status) -> bool:
