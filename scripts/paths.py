@@ -73,7 +73,7 @@ THREADS: Final = {
 #: Where paths begin and end: the first letters of the file, the last ones of the function.
 ANYWHERE: Final = ("", "")
 SIMULATOR: Final = ("sim/", "")
-CAMERA: Final = ("drivers/", ".show")
+CAMERA: Final = ("vehicles/", ".show")
 HANG_UP: Final = ("transport/", "._end")
 CALLBACK: Final = ("application", "on_frame")
 _PARTS: Final = ("<listcomp>", "<setcomp>", "<dictcomp>", "<genexpr>", "<module>")
