@@ -5,7 +5,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 copy=build/core
 rm -rf "$copy/src" "$copy/tests" "$copy/docs"
-mkdir -p "$copy/src/skyloop" "$copy/tests"
+mkdir -p "$copy/src/skyloop" "$copy/tests" "$copy/scripts"
 cp src/skyloop/*.py src/skyloop/*.pyi src/skyloop/py.typed "$copy/src/skyloop"
 rm "$copy/src/skyloop/"{bench,ray}.py
 cp -r src/skyloop/{messages,transport,proxy,client,aio,drivers} "$copy/src/skyloop"
@@ -13,6 +13,7 @@ cp pyproject.toml README.md LICENSE "$copy"
 cp tests/{__init__,conftest}.py "$copy/tests"
 cp -r tests/{messages,transport,proxy,client,data} "$copy/tests"
 cp -r docs "$copy"
+cp scripts/aio_stub.py "$copy/scripts"
 # Tests of what plugs into the core, and those that need SciPy, PyAV or what stands beside the package.
 rm "$copy"/tests/transport/test_{fabric*,overload}.py "$copy"/tests/messages/test_{geometry,wire_format_fabric}.py
 rm "$copy"/tests/client/test_{connect,end_of_flight,preflight,worker}.py

@@ -305,7 +305,8 @@ def test_other_firmware_is_not_flown() -> None:
     bench.cut = True
     bench.tick()
     now_ns = bench.clock.now_ns
-    for function, payload in ((1, b"\0\1\x2a"), (2, b"CLFL"), (3, b"\2\6\0"), (4, b"ABCD"), (101, bytes(20))):
+    identity = ((1, b"\0\1\x2a"), (2, b"CLFL"), (3, b"\2\6\0"), (4, b"ABCD"))
+    for function, payload in ((101, bytes(20)), *identity, (101, bytes(20))):
         bench.session.poll(now_ns)
         bench.session.receive(encode(Frame(function, payload, Direction.REPLY)), now_ns)
     for publish in bench.session.drain():

@@ -504,7 +504,7 @@ def test_a_hover_that_nobody_decided_leaves_a_drone_alone_whose_stop_was_given_u
     rig.run(11.0)
     rig.deaf = False
     rig.take_said()
-    for _ in range(10):
+    for _ in range(8):  # then it lands by itself, and on the ground it is kept awake
         rig.session.command(Hover(), rig.now_ns, new=False)
         rig.run(0.5)
     assert not [text for text in rig.said if text.startswith(("rc", "wifi?"))]
