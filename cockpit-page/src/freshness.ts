@@ -48,7 +48,8 @@ export class Freshness {
     const isOld = age_ms > STALE_MS;
     if (isOld) {
       setText(this.age, `${(age_ms / 1000).toFixed(1)} s`);
-      setText(this.what, old_ms >= silent_ms ? t.pane.nothingNew(this.name) : t.pane.cockpitSilent);
+      // A cockpit that stands still ends both, and either may have come last.
+      setText(this.what, silent_ms > STALE_MS ? t.pane.cockpitSilent : t.pane.nothingNew(this.name));
     }
     if (isOld === this.isOld) return false;
     this.isOld = isOld;
