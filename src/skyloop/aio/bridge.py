@@ -16,7 +16,6 @@ from typing import Any, Generic, TypeVar, Unpack
 from skyloop import client
 from skyloop.client.channels import VideoChannel, VideoOptions
 from skyloop.client.commands import cancelled
-from skyloop.client.drone import LOOK_S
 from skyloop.client.frame import Arrival
 from skyloop.client.mailbox import Mailbox, Notifier
 from skyloop.client.results import ResultMailbox, checked_age, silence
@@ -300,21 +299,16 @@ class Drone:
         self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> AsyncIterator[client.Frame]:
         core, notifier, clock = self.sync._core, LoopNotifier(), asyncio.get_running_loop().time
-        channel, deadline = core.channel(camera, **how), clock() + timeout_s
-        while not self.sync.closed:
-            mailbox = Mailbox[Arrival](notifier=notifier)
-            with core.closing(mailbox), channel.into(mailbox):
-                while not self.sync.closed:
-                    if await notifier.within(min(LOOK_S, deadline - clock())):
-                        frame = await _decoded(channel, mailbox.take(), how.get("max_age_s"))
-                        if frame is not None:
-                            yield frame
-                            deadline = clock() + timeout_s
-                    elif clock() >= deadline:
-                        raise core.no_frame(channel.camera.name, timeout_s)
-                    elif (now := core.channel(camera, **how)) is not channel:
-                        channel = now  # the proxy was started again with another camera
-                        break
+        channel, mailbox = core.follow(lambda: core.channel(camera, **how)), Mailbox[Arrival](notifier=notifier)
+        with core.closing(mailbox), channel.into(mailbox):
+            deadline = clock() + timeout_s
+            while not self.sync.closed:
+                if not await notifier.within(deadline - clock()):
+                    raise core.no_frame(channel.current.camera.name, timeout_s)
+                frame = await _decoded(channel.current, mailbox.take(), how.get("max_age_s"))
+                if frame is not None:
+                    yield frame
+                    deadline = clock() + timeout_s
 
     @like(client.Drone.results)
     async def results(

@@ -97,7 +97,7 @@ from skyloop.transport.base import Dialer
 T = TypeVar("T")
 EVENT_DEPTH: Final = 256  #: how many events, log entries and the like wait for a slow callback
 WHOLE_S: Final = 1.0  #: for every field of feedback to come, where less had been asked for
-LOOK_S: Final = 0.5  #: how often who waits for a frame looks whether its camera is still there
+_LOOK_S: Final = 0.5  #: how often who waits for a frame looks whether its camera is still there
 _log = logging.getLogger("skyloop")
 
 
@@ -670,7 +670,7 @@ class Drone:
             channel = self._core.channel(camera)  # anew: the proxy may have been started again with another camera
             channel.keep()
             self._core.check_may_wait()
-            left_s = min(LOOK_S, deadline - time.monotonic())
+            left_s = min(_LOOK_S, deadline - time.monotonic())
             while channel.notifier.wait_for(lambda: channel.unread or self._core.closed, left_s):  # noqa: B023
                 self._core.check_open()
                 frame = channel.read()

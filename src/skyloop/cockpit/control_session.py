@@ -189,9 +189,8 @@ class ControlSession:
                 commands.append(decode_command(text))
             except DecodeError as error:
                 self._refuse("", str(error))
-        while commands:
-            command = commands.pop(0)
-            if not (isinstance(command, Fly) and commands and isinstance(commands[0], Fly)):
+        for command, after in itertools.zip_longest(commands, commands[1:]):
+            if not (isinstance(command, Fly) and isinstance(after, Fly)):
                 self._on_command(command)
 
     def _on_command(self, command: AnyCommand) -> None:

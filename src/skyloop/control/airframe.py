@@ -41,6 +41,11 @@ _TILTING_S: Final = 0.3
 _STEEPEST: Final = 0.5  # cosine of the tilt, beyond which the vehicle does not keep its height
 
 
+def not_ahead(seen_ns: int | None, now_ns: int) -> int | None:
+    """Return when something was seen; None if that was stamped ahead, and would count as new until then."""
+    return None if seen_ns is not None and seconds(seen_ns - now_ns) > STALE_S else seen_ns
+
+
 class Part(StrEnum):
     """What a law may need to know of the vehicle."""
 

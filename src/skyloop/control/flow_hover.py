@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.airframe import STALE_S, AirframeLaw, Part
+from skyloop.control.airframe import AirframeLaw, Part, not_ahead
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import GRAVITY_M_S2, clamped, shortened
@@ -118,9 +118,8 @@ class FlowLaw(AirframeLaw):
     def step(self, now_ns: int) -> Attitude:
         """Compute the set-point for now: level while the position is not known."""
         s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
-        if self._seen_ns is not None and seconds(self._seen_ns - now_ns) > STALE_S:
-            self._seen_ns = None  # that frame was stamped ahead: it would tilt the vehicle until then
-            self.phase, self.off_m = FlowPhase.LOST, None
+        if self._seen_ns is not None and not_ahead(self._seen_ns, now_ns) is None:
+            self._seen_ns, self.phase, self.off_m = None, FlowPhase.LOST, None
         if self._seen_ns is None or self._kept is None:
             return Attitude()
         altitude, yaw = self._altitude, None if newest is None else newest.yaw_rad

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.airframe import STALE_S, Part, VelocityLaw
+from skyloop.control.airframe import Part, VelocityLaw, not_ahead
 from skyloop.control.behaviour import Behaviour, camera_info
 from skyloop.control.interaction import levelled, servo
 from skyloop.control.limiting import SetpointLimits
@@ -132,8 +132,7 @@ class ImageServoLaw(VelocityLaw):
 
     def _setpoint(self, now_ns: int) -> Array:
         s, feedback = self.settings, self.airframe.feedback
-        if self._seen_ns is not None and seconds(self._seen_ns - now_ns) > STALE_S:
-            self._seen_ns = None  # that frame was stamped ahead: it would be flown by until then
+        self._seen_ns = not_ahead(self._seen_ns, now_ns)
         unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
         wanted = np.zeros(4)
         if unseen_s <= s.fresh_s:

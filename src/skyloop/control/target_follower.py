@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.airframe import STALE_S, AirframeLaw, Part
+from skyloop.control.airframe import AirframeLaw, Part, not_ahead
 from skyloop.control.chase_law import LOSSES, ChaseLaw, FollowMode, TargetPhase
 from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_estimate import TargetEstimator, Traits
@@ -183,7 +183,7 @@ class TargetFollower(AirframeLaw):
             UsageError: The first box does not fit into the image, or the camera's intrinsics are not known.
         """
         state, newest = frame.feedback, self.airframe.feedback
-        if newest is not None and seconds(frame.captured_ns - newest.captured_ns) > STALE_S:
+        if newest is not None and not_ahead(frame.captured_ns, newest.captured_ns) is None:
             state = None  # stamped ahead, or nothing is heard of the vehicle: where it looked from is not known
         # A vehicle whose velocity is not known any more hovers where it was last.
         motion = self.airframe.at(frame.captured_ns) or self.airframe.newest
@@ -240,8 +240,7 @@ class TargetFollower(AirframeLaw):
         if not self._ready(now_ns):
             return Attitude() if self._relative else Velocity()
         self._since_s(now_ns)
-        if self._seen_ns is not None and seconds(self._seen_ns - now_ns) > STALE_S:
-            self._seen_ns = None  # that frame was stamped ahead: it would count as seen until then
+        self._seen_ns = not_ahead(self._seen_ns, now_ns)
         finder = self._finder
         return self._law.step(
             now_ns,

@@ -71,12 +71,11 @@ class RangeEstimator(TargetEstimator):
         if ground and below and self.traits.on_ground is not False:
             self._on_ground = self._member(view, camera, at_ns, on_ground=True)
             weights.append(_ON_GROUND)
-        if self._on_ground is not None and self.traits.on_ground:
-            pass  # it was seen to stand there before
-        elif not ground or self._size_known:
+        stood = self._on_ground is not None and self.traits.on_ground  # as was seen before
+        if not stood and (self._size_known or not ground):
             self._member(view, camera, at_ns, on_ground=False)
             weights.append(1.0 - _ON_GROUND)
-        else:
+        elif not stood:
             for distance_m in _RANGES_M:
                 self._guesses.append(guess := TargetEstimator(self.traits, relative=self._relative))
                 guess.start_at(distance_m, _SHARE, view, camera, at_ns)
@@ -99,7 +98,7 @@ class RangeEstimator(TargetEstimator):
         if self.seen_ns is None:
             return super().update(view, camera, at_ns)  # which says so
         since_s = seconds(at_ns - self.seen_ns)
-        costs = np.array([guess.distance(view, camera, at_ns)[1] for guess in self._guesses])
+        costs = np.minimum([guess.distance(view, camera, at_ns)[1] for guess in self._guesses], 1e9)
         used = [guess.update(view, camera, at_ns) for guess in self._guesses]
         if not any(used):
             self.refused += 1
@@ -107,7 +106,6 @@ class RangeEstimator(TargetEstimator):
         self.seen_ns, self.refused = max(at_ns, self.seen_ns), 0
         # Of a vehicle that stays boxes tell nothing: the guess that counts on the least motion would win slowly.
         told = 1.0 if self._size_known else within((self._stir(camera, since_s) / _STIRRED_M) ** 2, 0.0, 1.0)
-        costs = np.minimum(costs, 1e9)
         worse = np.minimum(costs - costs.min(), _WORST)
         self._weights = self._weights * np.exp(-0.5 * worse * told * within(since_s / _TOGETHER_S, 0.0, 1.0))
         self._drop()
