@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: help demo test test-all test-core explore check chaos docs fuzz format stubs coverage package page pictures lock clean
 help:
 	@echo "make demo [ARGS='--seconds 30 --headless']   a simulated drone that flies by its camera"
-	@echo "make test [ARGS='-k authority']              the tests of every day, 5 minutes; with ARGS, those that they select of all"
+	@echo "make test [ARGS='-k authority']              the tests of every day, some 10 minutes; with ARGS, those that they select of all"
 	@echo "make test-all                                all tests"
 	@echo "make test-core                               the core's tests, without all that plugs into it, in 1 minute"
 	@echo "make explore [SECONDS=3600]                  new examples for the tests of properties, for a minute"
