@@ -30,8 +30,8 @@ from skyloop.client import connect
 from skyloop.cockpit import Access, serve_cockpit, target_tracker, with_certificate
 from skyloop.cockpit.__main__ import main
 from skyloop.cockpit.addresses import bind
+from skyloop.cockpit.camera_feed import _ENCODER, NICENESS
 from skyloop.cockpit.child import CockpitProcess
-from skyloop.cockpit.server import NICENESS
 from skyloop.cockpit.testing import HeadlessPage, Pages
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import FlightState
@@ -130,7 +130,7 @@ def test_child_tells_why_it_did_not_start() -> None:
 
 @contextmanager
 def served(**options: Any) -> Iterator[str]:
-    """A cockpit on a thread, which alone becomes nicer; its address."""
+    """A cockpit on a thread; its address."""
     ready, stop, told = threading.Event(), threading.Event(), []
 
     def tell(address: str) -> None:
@@ -214,13 +214,11 @@ def test_a_session_is_valid_after_a_restart(tokens: Path) -> None:
 
 
 def test_programs_of_this_user_are_let_in_without_a_word() -> None:
-    before = os.nice(0)
     with served() as address:
         assert ask(address, "/api/session") == {"role": "pilot", "name": "", "login": False, "hint": ""}
         request = urllib.request.Request(f"{address}/api/session", headers={"X-Forwarded-For": "192.0.2.1"})
         with urllib.request.urlopen(request, timeout=5) as answer:
             assert json.load(answer)["role"] == "pilot", "who is there is asked of the kernel, not of a header"
-    assert os.nice(0) == before
 
 
 def test_its_metrics(capfd: pytest.CaptureFixture[str]) -> None:
@@ -380,10 +378,17 @@ def test_page_of_a_real_drone(tmp_path: Path) -> None:
 
 
 @pytest.mark.process
-def test_the_process_makes_room_for_who_flies(tmp_path: Path) -> None:
+def test_the_process_keeps_the_priority_of_those_who_fly(tmp_path: Path) -> None:
+    """A person's sticks pass through it."""
     with CockpitProcess(recordings=tmp_path / "here") as page:
         page.address()
         pid = page.pid
-        assert os.getpriority(os.PRIO_PROCESS, pid) == os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
+        assert os.getpriority(os.PRIO_PROCESS, pid) == os.getpriority(os.PRIO_PROCESS, 0)
         assert ask(page.address().rstrip("/"), "/api/recordings")["folder"] == str(tmp_path / "here")
     assert not Path(f"/proc/{pid}").exists()
+
+
+def test_what_encodes_pictures_makes_room_for_those_who_fly() -> None:
+    usual = os.getpriority(os.PRIO_PROCESS, 0)
+    assert _ENCODER.submit(os.getpriority, os.PRIO_PROCESS, 0).result(5) == usual + NICENESS
+    assert os.getpriority(os.PRIO_PROCESS, 0) == usual

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import struct
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -22,8 +23,10 @@ JPEG_QUALITY = 80
 
 _LENGTH: Final = struct.Struct(">I")
 _encode = msgspec.json.Encoder().encode
-#: One thread for all cameras: encoding for many pages must not take the cores that fly.
-_ENCODER: Final = ThreadPoolExecutor(1, thread_name_prefix="jpeg")
+NICENESS: Final = 10  #: of the thread that encodes
+#: One thread for all cameras: encoding for many pages must not take the cores that fly. The event loop keeps the
+#: priority it was started with: a person's sticks and stop pass through it, and must not starve beside a browser.
+_ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=os.nice, initargs=(NICENESS,))
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,7 @@ REPORT: Final = "report"
 TIMELINE: Final = "timeline"
 REPORT_S: Final = 120.0  #: for one report, before the next one has its turn
 MAX_WAITING: Final = 4  #: who comes later would wait for minutes
-NICENESS: Final = 5  #: of the child, besides the cockpit's own: pages come before reports
+NICENESS: Final = 10  #: of the child: pages and flights come before reports
 _TAKEN: Final = 4096  # bytes of what a child complains about
 
 #: What is run for a report of FILE, to be written to TARGET, of DRONE if one is named.

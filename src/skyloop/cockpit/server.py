@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 import socket
 import ssl
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     from skyloop.network import FabricSettings
 
 
-NICENESS = 10  #: of the serving thread and of those that it starts: programs that fly come first
 RECORDINGS = Path("recordings")  #: where recordings go by default
 _LARGEST_MESSAGE = 4096  # bytes from a page
 _LOOK_S = 0.05  # how often it is asked whether to end
@@ -105,8 +103,6 @@ def serve_cockpit(
     metrics: str | None = None,
 ) -> None:
     """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) comes.
-
-    The calling thread becomes nicer by :data:`NICENESS`, for good.
 
     Args:
         names: The drones to show; none: all that there are, as they come and go.
@@ -301,7 +297,6 @@ def _serve(
     server = quiet_server(app)
     seen_at = reachable(address)[0]
     page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"
-    os.nice(NICENESS)
     listener = Listener(listening, admission, http_protocol(server, admission), tls)
     with ExitStack() as beside:
         if metrics is not None:
