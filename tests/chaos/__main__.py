@@ -42,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.chaos", description=__doc__, epilog=EPILOG)
     parser.add_argument("--seconds", type=float, default=180.0, help="how long to make trouble [180]")
     parser.add_argument("--seed", type=int, default=1, help="of the order and length of the faults [1]")
+    parser.add_argument("--lanes", nargs="+", choices=CONTROLS, default=list(CONTROLS), help="fly only these [all]")
     parser.add_argument("--quiet", action="store_true", help="only the result")
     chosen = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="chaos-") as folder, _small_disk(Path(folder)) as mounted:
@@ -51,7 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for fault in impossible:
             print(f"left out, as it takes root: {fault.__doc__}")
         faults = {"local": LOCAL, "network": NETWORK, "mavlink": MAVLINK, "page": HANDS}
-        if missing := PageLane.missing():
+        faults = {name: each for name, each in faults.items() if name in chosen.lanes}
+        if "page" in faults and (missing := PageLane.missing()):
             print(f"left out, as it takes {missing}: {', '.join(str(fault.__doc__) for fault in faults.pop('page'))}")
         possible = {name: [fault for fault in each if fault not in impossible] for name, each in faults.items()}
         return _run(Path(folder), chosen.seconds, chosen.seed, chosen.quiet, possible)
