@@ -18,7 +18,7 @@ from tests.cockpit import firefox
 from tests.processes.conftest import Process
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page, Playwright
+    from playwright.sync_api import Browser, ConsoleMessage, Page, Playwright
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -105,7 +105,11 @@ class DronePage:
         self.problems: list[str] = []  #: what went wrong in it, as the browser says
         self.pane = page.locator(f'.pane[data-drone="{drone}"]')
         page.on("pageerror", lambda error: self.problems.append(str(error)))
-        page.on("console", lambda said: self.problems.append(said.text) if said.type == "error" else None)
+        page.on("console", self._hear)
+
+    def _hear(self, said: ConsoleMessage) -> None:
+        if said.type == "error":
+            self.problems.append(f"{said.text} {said.location['url']}")
 
     def press(self, *keys: str) -> None:
         for key in keys:
