@@ -20,6 +20,8 @@ MAX_AGE_S: Final = 0.25  #: … and command.max_age_s
 STALL_S: Final = 1.0  #: how long the library repeats a set-point without a call
 #: Between the moment that counts and the line in the journal lie the scheduler and, on a loaded machine, its queue.
 SLACK_S: Final = 0.05
+#: A call reaches the proxy within this. A failsafe that comes earlier knows of the silence before it alone.
+ARRIVES_S: Final = 0.1
 #: A failsafe that is later than this was missed.
 LATE_S: Final = 1.0
 #: Every take-off request is over by then.
@@ -178,14 +180,16 @@ def _judge_needless(
             verdict.needless.append(f"landed at {entry.at_ns / 1e9:.3f} s, which no pilot and no failsafe wanted")
         if not entry.what.startswith("failsafe:"):
             continue
-        last = bisect_right(calls.begins, entry.at_ns)
+        last = bisect_right(calls.begins, entry.at_ns - _ns(ARRIVES_S))
         silent_s = (entry.at_ns - calls.begins[last - 1]) / 1e9 if last else float("inf")
         if silent_s >= HOVER_AFTER_S - SLACK_S or any(begin <= entry.at_ns <= end for begin, end in windows):
             verdict.justified += 1
         else:
             before = [fault for fault in faults if fault.begin_ns <= entry.at_ns]
             when = f"{(entry.at_ns - before[-1].begin_ns) / 1e9:.3f} s after {before[-1].kind} began" if before else ""
-            verdict.needless.append(f"{entry.what} {silent_s:.3f} s after a call, {when or 'before any fault'}")
+            verdict.needless.append(
+                f"{entry.what} {silent_s:.3f} s after a call that had arrived, {when or 'before any fault'}"
+            )
 
 
 def _judge_missed(verdict: Verdict, vehicle: Sequence[Entry], disruptions: Sequence[Fault]) -> None:

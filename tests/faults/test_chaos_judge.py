@@ -99,6 +99,13 @@ def test_a_failsafe_after_the_pilot_was_silent_is_due() -> None:
     assert (verdict.needless, verdict.justified) == ([], 1)
 
 
+def test_a_call_that_ends_a_silence_and_is_still_under_way_makes_no_failsafe_needless() -> None:
+    flight = Flight(away=(5.0, 5.6))
+    flight.vehicle.append(entry(5.604, "failsafe:hover"))
+    verdict = flight.judge()
+    assert (verdict.needless, verdict.justified) == ([], 1)
+
+
 @pytest.mark.parametrize(
     ("hover_s", "land_s", "missed"), [(5.52, 10.0, 0), (None, 10.0, 1), (5.52, None, 1), (7.0, 13.0, 2)]
 )
