@@ -224,11 +224,10 @@ def test_sticks_that_a_pilot_moves_during_a_take_off_keep_the_vehicle_and_its_ow
 
 def _hold_sticks(scene: Scene, let_go: threading.Event) -> None:
     """Centred ones, of which one is moved when the vehicle is 2 m up, and centred again."""
-    moved_s: float | None = None
+    to_move = 15  # messages, 0.3 s of them where nothing holds this thread up
     while not let_go.wait(0.02):
-        if moved_s is None and scene.height > 2.0:
-            moved_s = time.monotonic()
-        moving = moved_s is not None and time.monotonic() - moved_s < 0.3
+        moving = to_move > 0 and scene.height > 2.0
+        to_move -= moving
         scene.station_says(m.MAVLink_manual_control_message(1, 0, 700 if moving else 0, 500, 0, 0))
 
 
