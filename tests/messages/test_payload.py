@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
 from skyloop.errors import DecodeError, UsageError
-from skyloop.messages.payload import ARRAY, DTYPES, pack, unpack
+from skyloop.messages.relayed import ARRAY, DTYPES, pack, unpack
 from skyloop.messages.result import MAX_PAYLOAD
 
 PLAIN = st.recursive(

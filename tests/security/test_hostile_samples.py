@@ -43,8 +43,8 @@ from skyloop.messages import (
 )
 from skyloop.messages.codec import HEADER, HEADER_SIZE, KINDS, SIGNATURE, VERSION
 from skyloop.messages.numbers import LATEST_NS
-from skyloop.messages.payload import ARRAY, MAX_DEPTH, pack, unpack
-from skyloop.messages.video import FrameFilter
+from skyloop.messages.relayed import ARRAY, MAX_DEPTH, pack, unpack
+from skyloop.messages.subscription import FrameFilter
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import ClockPair
 from skyloop.recording.translation import Translator

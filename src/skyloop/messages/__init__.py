@@ -57,9 +57,7 @@ from skyloop.messages.encoded import EncodedFrame, StreamReport
 from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback, Value, Vector
 from skyloop.messages.feedback_request import FeedbackRequest
-from skyloop.messages.frame import CameraInfo, FrameHeader, Intrinsics
-from skyloop.messages.intent import Fate, Outcome
-from skyloop.messages.kinds import (
+from skyloop.messages.fields import (
     Encoding,
     EventKind,
     Failsafe,
@@ -71,12 +69,14 @@ from skyloop.messages.kinds import (
     Severity,
     Takeover,
 )
+from skyloop.messages.frame import CameraInfo, FrameHeader, Intrinsics
+from skyloop.messages.intent import Fate, Outcome
 from skyloop.messages.log import LogEntry
 from skyloop.messages.overview import Overview, VehicleOverview
 from skyloop.messages.parameter import Parameter, ParameterType
 from skyloop.messages.pose import VehiclePose
 from skyloop.messages.result import ProcessorResult, ProcessorShare
-from skyloop.messages.video import VideoRequest
+from skyloop.messages.subscription import VideoRequest
 
 __all__ = [
     "ACTION_NAMES",

@@ -7,8 +7,8 @@ from typing import Annotated
 import msgspec
 
 from skyloop.messages.feedback import Value
+from skyloop.messages.fields import Refusal, Role, Takeover
 from skyloop.messages.frame import CameraInfo, Name
-from skyloop.messages.kinds import Refusal, Role, Takeover
 from skyloop.messages.numbers import Count, TimeNs
 from skyloop.messages.parameter import Parameter, ParameterName
 from skyloop.messages.result import MAX_CODE, ProcessorName

@@ -7,8 +7,8 @@ from typing import Annotated, Final
 
 import msgspec
 
+from skyloop.messages.fields import Encoding
 from skyloop.messages.frame import FrameHeader, Intrinsics, Name, Pixels
-from skyloop.messages.kinds import Encoding
 from skyloop.messages.numbers import Count, TimeNs
 
 H264: Final = "h264"  #: the one codec that is recorded as it comes

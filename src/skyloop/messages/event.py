@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from skyloop.messages.feedback import Value
-from skyloop.messages.kinds import EventKind, Severity
+from skyloop.messages.fields import EventKind, Severity
 from skyloop.messages.numbers import Count, TimeNs
 
 

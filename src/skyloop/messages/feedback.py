@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 
 from skyloop.messages.earth import EarthOrigin
+from skyloop.messages.fields import Failsafe, FlightState, LinkState, ReturnPhase
 from skyloop.messages.intent import Outcome
-from skyloop.messages.kinds import Failsafe, FlightState, LinkState, ReturnPhase
 from skyloop.messages.numbers import Count, Finite, TimeNs
 
 if TYPE_CHECKING:

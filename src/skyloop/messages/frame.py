@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from skyloop.messages.kinds import Encoding
+from skyloop.messages.fields import Encoding
 from skyloop.messages.numbers import Count, Finite, TimeNs
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import msgspec
 
-from skyloop.messages.kinds import Refusal
+from skyloop.messages.fields import Refusal
 from skyloop.messages.numbers import Count
 
 MAX_OUTCOME_TEXT: Final = 300  #: characters

@@ -9,8 +9,8 @@ from typing import Annotated, Final
 
 import msgspec
 
+from skyloop.messages.fields import Severity
 from skyloop.messages.frame import Name
-from skyloop.messages.kinds import Severity
 from skyloop.messages.numbers import Count, Finite, TimeNs, shape_fits
 
 MAX_TEXT: Final = 4096  #: characters

@@ -8,7 +8,7 @@ import msgspec
 
 from skyloop.messages.event import Event
 from skyloop.messages.feedback import LinkText, Vector
-from skyloop.messages.kinds import Failsafe, FlightState, LinkState, ReturnPhase
+from skyloop.messages.fields import Failsafe, FlightState, LinkState, ReturnPhase
 from skyloop.messages.numbers import Count, Finite, TimeNs
 
 MAX_ADDRESS: Final = 200  #: characters of a vehicle's address

@@ -29,7 +29,7 @@ class ProcessorResult(msgspec.Struct, frozen=True, array_like=True):
     made_ns: TimeNs  #: when the result was there, on the proxy's clock
     took_ns: Count  #: how long the worker's ``process`` ran
     number: Count  #: grows by one with each result of a worker
-    payload: Annotated[bytes, msgspec.Meta(max_length=MAX_PAYLOAD)]  #: see ``skyloop.messages.payload``
+    payload: Annotated[bytes, msgspec.Meta(max_length=MAX_PAYLOAD)]  #: see ``skyloop.messages.relayed``
     worker: Count = 0  #: number of the application that sent it; written by the proxy, whatever was there
 
 

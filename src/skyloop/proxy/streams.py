@@ -24,7 +24,7 @@ from skyloop.messages import CameraInfo, EncodedFrame, Encoding, FrameHeader, St
 from skyloop.messages.encoded import H264, MAX_ENCODED, split
 from skyloop.messages.image_header import why_not_decoded
 from skyloop.messages.rate import RateLimiter
-from skyloop.messages.video import MAX_KBIT_S
+from skyloop.messages.subscription import MAX_KBIT_S
 from skyloop.proxy.core.stream_rate import StreamRate, picture_form
 from skyloop.proxy.events import Counters
 from skyloop.proxy.forms import Forms

@@ -23,7 +23,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.encoded import H264
 from skyloop.messages.log import MOCAP
-from skyloop.messages.payload import unpack
+from skyloop.messages.relayed import unpack
 from skyloop.recording import foxglove, layout
 from skyloop.recording.backlog import Item
 from skyloop.recording.layout import Channel, ClockPair, Drops, FrameRecord, ResultRecord, Topic
