@@ -42,7 +42,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.codec import HEADER, HEADER_SIZE, KINDS, SIGNATURE, VERSION
-from skyloop.messages.numbers import LATEST_NS
+from skyloop.messages.fields import LATEST_NS
 from skyloop.messages.relayed import ARRAY, MAX_DEPTH, pack, unpack
 from skyloop.messages.subscription import FrameFilter
 from skyloop.recording.backlog import Item, Rank

@@ -20,7 +20,7 @@ from skyloop.drivers.h264 import Inspector, Unit
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.live_video import Decoded
 from skyloop.errors import MissingExtraError, UnsupportedError
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.pyav import limit_memory, new_decoder
 
 try:

@@ -8,7 +8,7 @@ from typing import Final
 from skyloop.drivers.base import Sink
 from skyloop.drivers.h264 import Unit
 from skyloop.messages import EventKind, Intrinsics, Severity
-from skyloop.messages.encoded import Chain
+from skyloop.messages.frame import Chain
 
 KEYLESS: Final = 600  #: pictures without a key after which it is reported that nothing can be handed on
 

@@ -22,7 +22,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.ardrone.configuration import own_ids
 from skyloop.vehicles.ardrone.diagnostics import diagnose
 from skyloop.vehicles.ardrone.link import ArdroneLink

@@ -10,7 +10,7 @@ from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.uri import VehicleUri
 from skyloop.messages import CameraInfo
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.vehicles.mavlink.options import FACINGS, CameraOptions
 
 

@@ -13,8 +13,8 @@ from skyloop.drivers.link_reasons import LinkTrouble, serial_trouble
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
-from skyloop.messages.checkup import Diagnostic
 from skyloop.messages.feedback import WAKING_UP
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.msp.firmware import SUPPORTED, Setup, hindrances
 from skyloop.vehicles.msp.identification import Identification
 from skyloop.vehicles.msp.motion import MotionEstimate

@@ -14,7 +14,7 @@ from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Hover, Intrinsics, Land, Parameter, Refusal, Value
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.link import TelloLink
 from skyloop.vehicles.tello.options import options_of
 from skyloop.vehicles.tello.parameters import DroneSettings

@@ -14,7 +14,7 @@ from skyloop.drivers.live_video import VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError
 from skyloop.messages import CameraInfo, Capabilities, EventKind, Feedback, Hover, Intrinsics, Land, LinkState, Severity
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.vehicles.video.devices import cameras, described
 from skyloop.vehicles.video.options import options_of
 from skyloop.vehicles.video.player import FEEDBACK_NS, CameraPublisher, FilePlayer

@@ -15,7 +15,7 @@ from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.files import expand
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.vehicles.video.devices import cameras, described
 from skyloop.vehicles.video.sources import DEFAULT_FPS, is_device
 from skyloop.vehicles.video.v4l2 import FORMATS, V4l2Device, opened
