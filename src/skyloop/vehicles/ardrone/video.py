@@ -23,8 +23,8 @@ from skyloop.drivers.base import Sink
 from skyloop.drivers.h264 import Unit
 from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.live_frames import StreamRelay
 from skyloop.drivers.live_video import Decoded, Decoder, LiveVideo, Picture, Stream, VideoEvent
-from skyloop.drivers.stream_relay import StreamRelay
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, Intrinsics
