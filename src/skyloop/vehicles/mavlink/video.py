@@ -5,8 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from skyloop.drivers.base import Sink
-from skyloop.drivers.camera_options import CameraSource, source_of
-from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.camera_options import CameraSource, intrinsics_of, source_of
 from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.uri import VehicleUri
 from skyloop.messages import CameraInfo

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 
 from skyloop.clock import Clock, nanoseconds
-from skyloop.drivers.backlog import Coded
-from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.camera_options import intrinsics_of
+from skyloop.drivers.live_frames import Coded
 from skyloop.drivers.live_video import Decoded
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_link import MAX_DATAGRAM

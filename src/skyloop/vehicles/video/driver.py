@@ -7,8 +7,7 @@ from functools import partial
 
 from skyloop.clock import monotonic_ns, seconds
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.camera_options import CameraSource
-from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.camera_options import CameraSource, intrinsics_of
 from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.live_video import VideoEvent
 from skyloop.drivers.uri import VehicleUri

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.drivers.base import reject_unknown_options
-from skyloop.drivers.camera_options import CameraSource, is_address, source_of
-from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
+from skyloop.drivers.camera_options import INTRINSICS_OPTIONS, CameraSource, check_intrinsics, is_address, source_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.files import expand
