@@ -23,9 +23,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.drivers.backlog import Coded
 from skyloop.drivers.h264 import Inspector
 from skyloop.drivers.live_container import LiveDecoder, Piece
+from skyloop.drivers.live_frames import Coded
 from skyloop.vehicles.ardrone.pave_decoder import av
 from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser

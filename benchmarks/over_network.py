@@ -20,7 +20,7 @@ from skyloop.client.channels import VideoOptions
 from skyloop.client.core import Access
 from skyloop.errors import LinkError, SkyloopError, UnknownNameError
 from skyloop.messages import Encoding, FrameHeader
-from skyloop.messages.video import VideoRequest
+from skyloop.messages.subscription import VideoRequest
 from skyloop.network import FabricServer, FabricSettings
 from skyloop.network.settings import LEASE_S
 from skyloop.transport.base import TransportServer

@@ -29,7 +29,7 @@ from skyloop.messages import (
     LinkState,
     Velocity,
 )
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import VERSION, Channel, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.recording.output import RecordingFile

@@ -37,7 +37,7 @@ from skyloop.control import (
 )
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.messages import Event, EventKind, Feedback, FlightState
-from skyloop.messages.world import WORLD, decode_world
+from skyloop.messages.parameter import WORLD, decode_world
 from skyloop.sim.render import use_one_core
 from skyloop.sim.world import Gate
 from skyloop.sim.world_file import load_world

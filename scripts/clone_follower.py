@@ -37,7 +37,7 @@ from skyloop.clock import nanoseconds
 from skyloop.control import FollowMarker, OnnxPolicy, PolicyNetwork
 from skyloop.control.rehearsal import Radio, rehearse
 from skyloop.messages import Attitude, Velocity
-from skyloop.messages.annotation import Shape
+from skyloop.messages.relayed import Shape
 from skyloop.messages.rows import ACTIONS, state_row
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.lerobot import export_lerobot

@@ -22,7 +22,6 @@ NO_CORE = {"emulation", "emulator", "firmware", "wire"}  #: folders of vehicles 
 EXCEPTIONS: dict[str, str] = {
     "vehicles/ros2/node.py": "needs ROS 2, whose tests run in an environment of their own",
     "drivers/recording_sink.py": "part of the public suite: the rest reports mistakes that no driver here makes",
-    "drivers/suite_parameters.py": "part of the public suite: likewise",
 }
 
 

@@ -22,7 +22,7 @@ from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError
 from skyloop.files import MAX_RESULTS, read_json
 from skyloop.messages import Applied, Event, EventKind, Feedback, Idle, LogEntry
-from skyloop.messages.log import MOCAP
+from skyloop.messages.relayed import MOCAP
 from skyloop.recording.layout import Channel, FrameRecord
 from skyloop.recording.reader import Item, Progress, Recording
 

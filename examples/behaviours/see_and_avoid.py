@@ -33,8 +33,8 @@ from skyloop.control.behaviour import Behaviour
 from skyloop.control.limiting import SetpointLimits, clamped
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Polyline, Text
-from skyloop.messages.annotation import Colour, Shape
 from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.relayed import Colour, Shape
 from skyloop.vision import BlobDetector, BlobSighting
 
 if TYPE_CHECKING:

@@ -47,7 +47,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.messages.typical import typical_feedback
+from skyloop.messages.feedback import typical_feedback
 from skyloop.proxy import Proxy
 from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import MissingExtraError
-from skyloop.messages.image_header import MAX_PIXELS
+from skyloop.messages.frame import MAX_PIXELS
 
 if TYPE_CHECKING:
     from av.codec.context import CodecContext

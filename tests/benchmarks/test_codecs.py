@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from benchmarks import codecs, tables
 from benchmarks.command import build
-from skyloop.drivers.backlog import Coded
+from skyloop.drivers.live_frames import Coded
 from skyloop.vehicles.ardrone.video import PaveVideo
 from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.options import LAYOUTS

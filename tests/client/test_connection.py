@@ -38,7 +38,7 @@ from skyloop.messages import (
     VideoRequest,
     encode,
 )
-from skyloop.messages.encoded import EncodedFrame
+from skyloop.messages.frame import EncodedFrame
 from skyloop.transport.base import EVENTS, FEEDBACK, ClientHandler, TransportClient, video
 from skyloop.transport.memory import Faults
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted

@@ -13,7 +13,7 @@ from skyloop.client import Drone
 from skyloop.errors import UsageError
 from skyloop.messages import LogEntry, Severity, encode
 from skyloop.messages.codec import MAX_BODY
-from skyloop.messages.log import MAX_TEXT, MAX_VALUES
+from skyloop.messages.relayed import MAX_LOG_TEXT, MAX_VALUES
 from skyloop.transport.base import LOGS
 from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
 
@@ -60,7 +60,7 @@ def test_what_is_logged_is_sent(proxy: ScriptedProxy, drone: Drone) -> None:
     ("call", "match"),
     [
         (lambda log: log.text(7), "text of at most 4096"),
-        (lambda log: log.text("x" * (MAX_TEXT + 1)), "text of at most 4096"),
+        (lambda log: log.text("x" * (MAX_LOG_TEXT + 1)), "text of at most 4096"),
         (lambda log: log.text("x", severity="fatal"), "info, warning, error"),
         (lambda log: log.text("x", name="n" * 65), "1 to 64"),
         (lambda log: log.text("x", name=None), "1 to 64"),
@@ -87,7 +87,7 @@ def test_what_can_not_be_logged(proxy: ScriptedProxy, drone: Drone, call: Any, m
 
 def test_the_largest_entries_fit_into_a_packet(proxy: ScriptedProxy, drone: Drone) -> None:
     assert drone.log.array("n" * 64, [-1.2345e300] * MAX_VALUES)
-    assert drone.log.text("\U0001f681" * MAX_TEXT, name="n" * 64)
+    assert drone.log.text("\U0001f681" * MAX_LOG_TEXT, name="n" * 64)
     for entry in sent(proxy, 2):
         assert len(encode(entry)) < MAX_BODY
 

@@ -16,7 +16,7 @@ from skyloop.client.inspection import inspect
 from skyloop.client.preflight import PreflightState, check_before_flight
 from skyloop.errors import ClosedError, NoAnswerError
 from skyloop.messages import CameraInfo, Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
-from skyloop.messages.checkup import MAX_TEXT, Diagnostic, decode_checkup, encode_checkup
+from skyloop.messages.parameter import MAX_CHECKUP_TEXT, Diagnostic, decode_checkup, encode_checkup
 from skyloop.vehicles.ardrone.diagnostics import diagnose
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.mavlink.autopilots import ArduCopterProfile, AutopilotProfile, Px4Profile
@@ -193,7 +193,7 @@ def test_a_hot_tello_says_why_it_may_come_down() -> None:
 def test_a_check_up_that_is_too_long_keeps_what_is_wrong() -> None:
     many = [Diagnostic(f"check {number}", number % 2 == 0, "x" * 200) for number in range(60)]
     text = encode_checkup(many)
-    assert len(text) <= MAX_TEXT
+    assert len(text) <= MAX_CHECKUP_TEXT
     assert [one.good for one in decode_checkup(text)].count(False) == 30
 
 

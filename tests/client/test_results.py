@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from skyloop.client import Drone, Result
 from skyloop.errors import ClosedError, DecodeError, NoAnswerError, UsageError
 from skyloop.messages import Feedback, ProcessorResult, encode
-from skyloop.messages.payload import pack
+from skyloop.messages.relayed import pack
 from skyloop.transport.base import RESULTS, results
 from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
 

@@ -12,7 +12,7 @@ from skyloop.control.chase_law import FollowMode
 from skyloop.control.target_follower import FollowStatus
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Feedback, Polyline, Velocity
-from skyloop.messages.annotation import Shape
+from skyloop.messages.relayed import Shape
 from skyloop.vision import Detection
 from skyloop.vision.tracking import Box, outline
 

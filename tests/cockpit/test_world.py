@@ -11,7 +11,7 @@ import pytest
 
 from skyloop.cockpit.world import view_values, way_values, world_values
 from skyloop.messages import CameraInfo, Capabilities, Feedback, Intrinsics, Parameter, ParameterType, Value
-from skyloop.messages.world import MAX_TEXT, WORLD, Solid, WorldGeometry, decode_world, encode_world
+from skyloop.messages.parameter import MAX_WORLD_TEXT, WORLD, Solid, WorldGeometry, decode_world, encode_world
 from skyloop.sim.geometry import geometry_of
 from skyloop.sim.world_file import load_world, shipped_worlds
 from tests.cockpit.fake import FakeDrone, cockpit, fake_fleet
@@ -37,7 +37,7 @@ def drone_with(**values: Value) -> Any:
 def test_a_world_survives_its_text(name: str) -> None:
     world = geometry_of(load_world(name))
     text = encode_world(world)
-    assert len(text) <= MAX_TEXT
+    assert len(text) <= MAX_WORLD_TEXT
     assert decode_world(text) == world
 
 

@@ -19,7 +19,7 @@ from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, Ta
 from skyloop.control.target_range import RangeEstimator, estimator_of
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
-from skyloop.messages.annotation import Shape
+from skyloop.messages.relayed import Shape
 from skyloop.stepping.rehearsal import rehearse
 from skyloop.vision import simulated_detector
 from skyloop.vision.tracking import Box

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from skyloop.drivers.link_reasons import serial_trouble, trouble_of
 from skyloop.drivers.vehicle_link import NameLookup
+from skyloop.drivers.vehicle_session import serial_trouble, trouble_of
 
 DENIED = OSError(errno.EACCES, "Permission denied")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skyloop.drivers.camera_source import source_of
+from skyloop.drivers.camera_options import source_of
 from skyloop.drivers.h264 import PPS, SPS, START, unit_type, units
 from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.recording_sink import RecordingSink, SeenPicture
@@ -308,7 +308,7 @@ def test_a_stream_without_keys_is_left_to_ffmpeg_after_a_while_and_that_is_told(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("skyloop.drivers.live_container.STRICT_S", 0.5)
-    monkeypatch.setattr("skyloop.drivers.stream_relay.KEYLESS", 10)
+    monkeypatch.setattr("skyloop.drivers.live_frames.KEYLESS", 10)
     sink = RecordingSink(record=True)
     with RtspServer(Refreshed(without_key=False).next().payload) as server, camera(server.address, sink):
         with Projector(server.send, Refreshed(without_key=True)):

@@ -5,8 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.clock import NS_PER_S
-from skyloop.drivers.live_clock import LiveClock
+from skyloop.clock import NS_PER_S, LiveClock
 from skyloop.vehicles.video.player import FilePacer
 
 MS = 1_000_000

@@ -17,7 +17,7 @@ from skyloop.client import Drone, streams
 from skyloop.client.streams import MOST_WAITING, StreamChannel, StreamDecoder
 from skyloop.errors import UsageError
 from skyloop.messages import EncodedFrame
-from skyloop.messages.encoded import Chain
+from skyloop.messages.frame import Chain
 from skyloop.proxy.streams import IDLE_S, MAX_FORMS
 from skyloop.pyav import H264Encoder
 from skyloop.transport.base import Pixels

@@ -70,7 +70,7 @@ from skyloop.messages import (
     Velocity,
     Welcome,
 )
-from skyloop.messages.payload import pack
+from skyloop.messages.relayed import pack
 
 INTRINSICS = Intrinsics(fx=280.5, fy=281.5, cx=160.0, cy=120.0, distortion=(-0.1, 0.01, 0.0, 0.0, 0.001))
 CAMERA = CameraInfo(

@@ -38,8 +38,8 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.codec import HEADER, HEADER_SIZE, KINDS, MAX_BODY, SIGNATURE, VERSION
-from skyloop.messages.encoded import MAX_PIECE
-from skyloop.messages.numbers import LATEST_NS
+from skyloop.messages.fields import LATEST_NS
+from skyloop.messages.frame import MAX_PIECE
 from tests.messages.samples import CAMERA, SAMPLES
 
 PACKETS = Path(__file__).parents[1] / "data" / "packets"

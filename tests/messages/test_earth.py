@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.messages import Feedback
-from skyloop.messages.earth import EarthOrigin, is_on_earth
+from skyloop.messages.feedback import EarthOrigin, is_on_earth
 
 ZURICH = EarthOrigin(47.397742, 8.545594, 488.0, 6_371_000.0)
 NEAR = st.floats(-5_000.0, 5_000.0)

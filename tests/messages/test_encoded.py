@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.messages import EncodedFrame, decode, encode
-from skyloop.messages.encoded import MAX_PIECE, Chain, Pieces, split
+from skyloop.messages.frame import MAX_PIECE, Chain, Pieces, split
 
 
 def test_a_chain_begins_at_a_key_and_breaks_at_a_gap() -> None:

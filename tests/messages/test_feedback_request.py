@@ -11,9 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
 from skyloop.messages import FeedbackRequest, VideoRequest
-from skyloop.messages.feedback_request import PLAIN
-from skyloop.messages.rate import RateLimiter
-from skyloop.messages.video import FrameFilter
+from skyloop.messages.subscription import PLAIN, FrameFilter, RateLimiter
 from skyloop.transport.base import FEEDBACK, MAX_TOPIC
 
 requests = st.builds(FeedbackRequest, st.none() | st.floats(0.001, 1000.0))

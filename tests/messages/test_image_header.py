@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from skyloop.messages.image_header import image_size, why_not_decoded
+from skyloop.messages.frame import image_size, why_not_decoded
 
 SCAN_HEAD = b"\xff\xc0" + struct.pack(">HBHH", 11, 8, 240, 320) + bytes(4)
 

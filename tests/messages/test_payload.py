@@ -16,8 +16,7 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
 from skyloop.errors import DecodeError, UsageError
-from skyloop.messages.payload import ARRAY, DTYPES, pack, unpack
-from skyloop.messages.result import MAX_PAYLOAD
+from skyloop.messages.relayed import ARRAY, DTYPES, MAX_PAYLOAD, pack, unpack
 
 PLAIN = st.recursive(
     st.none()

@@ -12,7 +12,9 @@ import msgspec
 import pytest
 
 from skyloop import messages
-from skyloop.messages import annotation, codec, command, config, encoded
+from skyloop.messages import codec, command, config
+from skyloop.messages.frame import MAX_PIECE
+from skyloop.messages.relayed import Shape
 from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS, MAX_TOPIC
 from skyloop.transport.local import packets
 from skyloop.transport.local.frame_exchange import MAX_LEASES
@@ -20,7 +22,7 @@ from skyloop.transport.local.frame_exchange import MAX_LEASES
 PAGE = (Path(__file__).parents[2] / "docs" / "wire-format.md").read_text()
 SECTIONS = re.compile(r"^### (\w+)(?: — (kind|tag) (\d+))?\n(.*?)(?=^##|\Z)", re.MULTILINE | re.DOTALL)
 FOUND = {name: (word, number, body) for name, word, number, body in SECTIONS.findall(PAGE)}
-BODIES = (*typing.get_args(config.AnyRequest), *typing.get_args(config.AnyReply), *typing.get_args(annotation.Shape))
+BODIES = (*typing.get_args(config.AnyRequest), *typing.get_args(config.AnyReply), *typing.get_args(Shape))
 PARTS = (
     messages.Intrinsics,
     messages.CameraInfo,
@@ -61,7 +63,7 @@ def test_sizes_on_the_page() -> None:
     assert f"at most {codec.MAX_BODY:,}".replace(",", " ") in PAGE
     assert codec.SIGNATURE.hex(" ").upper() in PAGE
     assert codec.HEADER_SIZE == 12
-    assert f"| `data` | bin, ≤ {encoded.MAX_PIECE:_} |".replace("_", " ") in PAGE
+    assert f"| `data` | bin, ≤ {MAX_PIECE:_} |".replace("_", " ") in PAGE
 
 
 LOCAL, _, FABRIC = PAGE.partition("\n## The local transport\n")[2].partition("\n## The fabric transport\n")

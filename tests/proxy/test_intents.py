@@ -30,7 +30,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.messages.intent import ENDINGS
+from skyloop.messages.command import ENDINGS
 from skyloop.proxy.core.intents import SETTLED_NS, TAKEOFF_NS, Intent, Intents
 from tests.proxy.fake import ALL, App, Bench
 

@@ -19,7 +19,7 @@ from skyloop.messages import (
     VehicleOverview,
     decode,
 )
-from skyloop.messages.overview import OverviewPages
+from skyloop.messages.feedback import OverviewPages
 from skyloop.proxy.overview import OverviewRegistry
 from skyloop.transport.base import OVERVIEW
 from skyloop.transport.composite import CompositeServer

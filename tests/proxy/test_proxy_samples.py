@@ -32,7 +32,7 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from skyloop.messages.encoded import MAX_ENCODED
+from skyloop.messages.frame import MAX_ENCODED
 from skyloop.proxy import Proxy
 from skyloop.transport.memory import MemoryServer
 from tests.proxy.fake import WAIT_S, App, Bench, FakeDriver

@@ -11,7 +11,7 @@ import numpy as np
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import CameraInfo, Capabilities, Encoding, FrameHeader
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import VERSION, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.recording.output import RecordingFile

@@ -19,7 +19,7 @@ from skyloop.messages import (
     ProcessorResult,
 )
 from skyloop.messages import ParameterType as Type
-from skyloop.messages.payload import pack
+from skyloop.messages.relayed import pack
 from skyloop.recording import layout
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import Channel, ClockPair, FrameRecord, ResultRecord

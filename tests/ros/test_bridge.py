@@ -99,7 +99,7 @@ def test_state_and_what_is_not_known(rig: Rig) -> None:
 
 def test_a_vehicle_that_knows_its_place(rig: Rig) -> None:
     from skyloop.messages import Feedback, LinkState
-    from skyloop.messages.earth import EarthOrigin
+    from skyloop.messages.feedback import EarthOrigin
     from skyloop.ros.telemetry import Telemetry
     from skyloop.ros.time import RosTime
 

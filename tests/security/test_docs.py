@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skyloop.messages import Refusal
-from skyloop.messages.intent import ENDINGS
+from skyloop.messages.command import ENDINGS
 from tests.docs.pages import rows, section
 from tests.security import test_doors, test_replays
 from tests.security.deeds import DEEDS

@@ -27,7 +27,7 @@ from skyloop import pyav
 from skyloop.cli import main
 from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import FileFormatError, SkyloopError
-from skyloop.messages.image_header import MAX_PIXELS, MAX_SCANS, image_size, why_not_decoded
+from skyloop.messages.frame import MAX_PIXELS, MAX_SCANS, image_size, why_not_decoded
 from skyloop.recording import scan
 from skyloop.recording.layout import Channel
 from skyloop.recording.listing import describe

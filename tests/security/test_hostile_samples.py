@@ -42,9 +42,9 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.codec import HEADER, HEADER_SIZE, KINDS, SIGNATURE, VERSION
-from skyloop.messages.numbers import LATEST_NS
-from skyloop.messages.payload import ARRAY, MAX_DEPTH, pack, unpack
-from skyloop.messages.video import FrameFilter
+from skyloop.messages.fields import LATEST_NS
+from skyloop.messages.relayed import ARRAY, MAX_DEPTH, pack, unpack
+from skyloop.messages.subscription import FrameFilter
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import ClockPair
 from skyloop.recording.translation import Translator

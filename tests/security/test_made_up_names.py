@@ -22,7 +22,7 @@ from skyloop.messages import (
     Role,
     encode,
 )
-from skyloop.messages.payload import pack
+from skyloop.messages.relayed import pack
 from skyloop.network.frames import MAX_FORMS, MAX_FORMS_EACH, FramePublisher
 from skyloop.proxy.publisher import PLAIN, topic_problem
 from skyloop.proxy.sessions import MAX_MALFORMED

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns
-from skyloop.messages.rate import RateLimiter
+from skyloop.messages.subscription import RateLimiter
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.camera_pipeline import Camera, CameraPipeline, Exposure, Shutter, expose
 from skyloop.sim.render import SceneState

@@ -30,7 +30,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.config import AnyRequest
-from skyloop.messages.video import FrameFilter, VideoRequest
+from skyloop.messages.subscription import FrameFilter, VideoRequest
 from skyloop.network import (
     FabricServer,
     FabricSettings,

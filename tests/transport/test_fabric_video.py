@@ -10,7 +10,7 @@ import pytest
 
 from skyloop.clock import ManualClock
 from skyloop.messages import Encoding, FrameHeader, Intrinsics
-from skyloop.messages.video import VideoRequest
+from skyloop.messages.subscription import VideoRequest
 from skyloop.network.frames import LOST_NS, WINDOW, FramePublisher, Variant
 from skyloop.transport import frame_encoding
 from skyloop.transport.testing import header, picture, wait_until

@@ -30,7 +30,7 @@ from skyloop.messages import (
     Value,
     Vector,
 )
-from skyloop.messages.annotation import Shape
+from skyloop.messages.relayed import Shape
 from types import TracebackType
 from typing import Any, Unpack
 

@@ -14,7 +14,7 @@ import typer
 from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, join_network, one_drone
 from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
 from skyloop.files import read_bytes
-from skyloop.messages.image_header import image_size, why_not_decoded
+from skyloop.messages.frame import image_size, why_not_decoded
 
 if TYPE_CHECKING:
     import numpy as np

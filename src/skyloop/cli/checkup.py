@@ -15,7 +15,7 @@ from skyloop.messages import EventKind, LinkState, Severity
 if TYPE_CHECKING:
     from skyloop.drivers.base import Driver
     from skyloop.drivers.recording_sink import RecordingSink
-    from skyloop.messages.checkup import Diagnostic
+    from skyloop.messages.parameter import Diagnostic
 
 ANSWER_S: Final = 3.5  #: for a vehicle to answer; the user gets a result within 5 s
 PATIENCE_S: Final = 40.0  #: for one that answers to be read

@@ -19,7 +19,7 @@ from skyloop.client.mailbox import Holder, Mailbox
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.errors import ClosedError, DecodeError, SkyloopError
 from skyloop.messages import CameraInfo, EventKind, FrameHeader, Severity, VideoRequest
-from skyloop.messages.video import FrameFilter, VideoEncoding
+from skyloop.messages.subscription import FrameFilter, VideoEncoding
 from skyloop.transport.base import Pixels, video
 
 T = TypeVar("T")

@@ -30,8 +30,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.messages.command import SET_POINTS
-from skyloop.messages.intent import ENDINGS
+from skyloop.messages.command import ENDINGS, SET_POINTS
 
 _IDLE: Final = Idle()
 _HOVER: Final = Hover()

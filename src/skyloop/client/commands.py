@@ -55,10 +55,9 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from skyloop.messages.command import SET_POINTS
+from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.config import MAX_REASON
-from skyloop.messages.earth import is_on_earth
-from skyloop.messages.intent import ENDINGS
+from skyloop.messages.feedback import is_on_earth
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -55,8 +55,8 @@ from skyloop.messages import (
     Severity,
     Takeoff,
 )
-from skyloop.messages.result import MAX_CODE
-from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
+from skyloop.messages.relayed import MAX_CODE
+from skyloop.messages.subscription import DEFAULT_QUALITY, VideoEncoding, VideoRequest
 from skyloop.pyav import require_pyav
 from skyloop.transport.base import EVENTS, Dialer
 

@@ -88,10 +88,10 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from skyloop.messages.annotation import Shape
-from skyloop.messages.encoded import Chain
-from skyloop.messages.feedback_request import PLAIN
-from skyloop.messages.pose import check_pose
+from skyloop.messages.command import check_pose
+from skyloop.messages.frame import Chain
+from skyloop.messages.relayed import Shape
+from skyloop.messages.subscription import PLAIN
 from skyloop.transport.base import Dialer
 
 T = TypeVar("T")

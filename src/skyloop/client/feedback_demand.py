@@ -10,8 +10,7 @@ from functools import reduce
 from skyloop.client.channels import Channel
 from skyloop.client.connection import ProxyConnection
 from skyloop.messages import Feedback, FeedbackRequest
-from skyloop.messages.feedback_request import PLAIN
-from skyloop.messages.rate import RateLimiter
+from skyloop.messages.subscription import PLAIN, RateLimiter
 
 
 class FeedbackDemand:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Encoding, Feedback, FrameHeader, Intrinsics
-from skyloop.messages.image_header import image_size, why_not_decoded
-from skyloop.messages.video import VideoRequest
+from skyloop.messages.frame import image_size, why_not_decoded
+from skyloop.messages.subscription import VideoRequest
 from skyloop.transport.frame_encoding import encode_frame, resized, scaled_header
 
 if TYPE_CHECKING:

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from skyloop.client.connection import ProxyConnection
 from skyloop.errors import UsageError
 from skyloop.messages import LogEntry, Severity, encode
-from skyloop.messages.log import MAX_TEXT, MAX_VALUES
-from skyloop.messages.numbers import LATEST_NS
+from skyloop.messages.fields import LATEST_NS
+from skyloop.messages.relayed import MAX_LOG_TEXT as MAX_TEXT
+from skyloop.messages.relayed import MAX_VALUES
 
 MAX_DIMENSIONS = 8
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from skyloop.client.telemetry import LinkStatus
 from skyloop.messages import Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
-from skyloop.messages.checkup import CHECKUP, Diagnostic, decode_checkup
+from skyloop.messages.parameter import CHECKUP, Diagnostic, decode_checkup
 
 STALE_S: Final = 1.0  #: feedback that is older is not now
 STALE_VIDEO_S: Final = 1.0

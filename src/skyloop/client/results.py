@@ -19,8 +19,7 @@ from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import Feedback, ProcessorResult
-from skyloop.messages.payload import unpack
-from skyloop.messages.result import PROCESSOR_NAME
+from skyloop.messages.relayed import PROCESSOR_NAME, unpack
 from skyloop.transport.base import RESULTS, results
 
 T = TypeVar("T")

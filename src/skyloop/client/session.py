@@ -36,7 +36,7 @@ from skyloop.messages import (
     decode,
     encode,
 )
-from skyloop.messages.feedback_request import PLAIN
+from skyloop.messages.subscription import PLAIN
 from skyloop.transport.base import FEEDBACK, Dialer, Pixels, TransportClient, stream, video
 
 RETRY_S = 0.3  #: time after which an unanswered request is repeated; all requests are idempotent

@@ -12,7 +12,7 @@ import numpy as np
 from skyloop.client.channels import Channel
 from skyloop.clock import Clock
 from skyloop.messages import EncodedFrame, FrameHeader, StreamReport, encode
-from skyloop.messages.encoded import H264, Chain, Pieces
+from skyloop.messages.frame import H264, Chain, Pieces
 from skyloop.pyav import new_decoder
 from skyloop.transport.base import Pixels
 

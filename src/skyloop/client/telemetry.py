@@ -43,8 +43,8 @@ from skyloop.messages import (
     VideoRequest,
     Welcome,
 )
-from skyloop.messages.feedback_request import PLAIN
-from skyloop.messages.overview import OverviewPages
+from skyloop.messages.feedback import OverviewPages
+from skyloop.messages.subscription import PLAIN
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW, Pixels, stream
 
 RECENT_EVENTS: Final = 256

@@ -35,7 +35,7 @@ from skyloop.messages import (
     decode,
     encode,
 )
-from skyloop.messages.typical import typical_feedback
+from skyloop.messages.feedback import typical_feedback
 from skyloop.transport.base import ClientHandler, TransportClient
 from skyloop.warmth import SHORTEST_S, Pieces, Warmer
 

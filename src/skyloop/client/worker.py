@@ -18,7 +18,7 @@ from skyloop.messages import (
     Welcome,
     encode,
 )
-from skyloop.messages.payload import pack
+from skyloop.messages.relayed import pack
 
 if TYPE_CHECKING:
     from skyloop.client.connection import ProxyConnection
@@ -105,7 +105,7 @@ class Membership:
 
         Args:
             frame: The frame.
-            value: What was found; see :func:`skyloop.messages.payload.pack` for what can be sent.
+            value: What was found; see :func:`skyloop.messages.relayed.pack` for what can be sent.
             took_s: How long it took [s].
 
         Returns:

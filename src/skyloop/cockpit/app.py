@@ -56,7 +56,7 @@ from skyloop.cockpit.stream import UNKNOWN, BroadcastSender, PageCounts, Telemet
 from skyloop.cockpit.world import WorldApi
 from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Role
-from skyloop.messages.world import WorldGeometry
+from skyloop.messages.parameter import WorldGeometry
 
 SMALLEST_PACKED: Final = 1000  #: bytes; to compress less saves nothing
 _PACKED: Final = re.compile(r"text/.*|application/(javascript|json)|image/svg\+xml")

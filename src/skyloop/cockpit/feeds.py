@@ -15,7 +15,7 @@ import msgspec
 from skyloop.clock import Clock, monotonic_ns, seconds
 from skyloop.cockpit.broadcast import Cancellable, Wake, call_soon
 from skyloop.messages import Annotation, Applied, Event, LogEntry, Points, Polyline, Text
-from skyloop.messages.log import MOCAP as SERIES
+from skyloop.messages.relayed import MOCAP as SERIES
 
 if TYPE_CHECKING:
     from skyloop.client import Drone

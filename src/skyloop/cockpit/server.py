@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.sessions import SessionFile
     from skyloop.cockpit.station import Station
-    from skyloop.messages.world import WorldGeometry
+    from skyloop.messages.parameter import WorldGeometry
     from skyloop.metrics.endpoint import Source
     from skyloop.network import FabricSettings
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from skyloop.cockpit.frame_keeper import FrameKeeper
     from skyloop.control.target_follower import FollowStatus
     from skyloop.messages import AnyAction, Feedback
-    from skyloop.messages.annotation import Shape
+    from skyloop.messages.relayed import Shape
     from skyloop.vision import Detection
 
 PERIOD_S: Final = 0.05  #: between two set-points without a new frame

@@ -22,7 +22,7 @@ from skyloop.cockpit.broadcast import ROW_HZ
 from skyloop.cockpit.values import Json, number, vector
 from skyloop.errors import NoAnswerError, ParameterError, UnknownNameError
 from skyloop.messages import Position
-from skyloop.messages.world import WORLD, WorldGeometry, decode_world
+from skyloop.messages.parameter import WORLD, WorldGeometry, decode_world
 from skyloop.proxy.core.airspace import Airspace, AirspaceSettings
 from skyloop.proxy.core.limits import Limits
 from skyloop.zones import FAR_M, Box, Space, Zone, space_of
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.recordings import Recordings
     from skyloop.messages import CameraInfo, Feedback, Value
-    from skyloop.messages.world import WorldGeometry
+    from skyloop.messages.parameter import WorldGeometry
 
 LIMITS: Final = ("speed", "climb", "altitude")
 RECORDED: Final = "recorded."  #: before the names of recorded parameters: docs/replay.md

@@ -12,7 +12,7 @@ from skyloop.control.controller import Controller
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.extend import let_go
 from skyloop.messages import Attitude, CameraInfo, EventKind, Feedback, Severity, Velocity
-from skyloop.messages.annotation import Shape
+from skyloop.messages.relayed import Shape
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame

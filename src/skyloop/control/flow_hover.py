@@ -18,8 +18,8 @@ from skyloop.control.limiting import GRAVITY_M_S2, clamped, shortened
 from skyloop.control.pid import Gains, VectorPi
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, Points, Text
-from skyloop.messages.annotation import Colour, Shape
 from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.relayed import Colour, Shape
 from skyloop.vision.flow import GroundTracker
 
 if TYPE_CHECKING:

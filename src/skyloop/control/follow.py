@@ -10,7 +10,7 @@ from skyloop.clock import nanoseconds
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.follow_law import FollowLaw, FollowSettings, Mode
 from skyloop.messages import Points, Polyline, Text
-from skyloop.messages.annotation import Colour, Shape
+from skyloop.messages.relayed import Colour, Shape
 from skyloop.vision import MarkerDetector, MarkerSighting
 
 if TYPE_CHECKING:

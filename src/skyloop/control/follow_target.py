@@ -13,7 +13,7 @@ from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_estimate import Traits
 from skyloop.control.target_follower import FollowStatus, TargetFollower
 from skyloop.errors import UsageError
-from skyloop.messages.annotation import Shape
+from skyloop.messages.relayed import Shape
 from skyloop.vision.detection import Detection, ObjectDetector
 from skyloop.vision.tracking import Box
 

@@ -12,8 +12,8 @@ from skyloop.control.course_law import CourseLaw, CourseSettings, GatePlace, Pol
 from skyloop.control.gate_law import GateLaw, GatePhase, GateSettings
 from skyloop.errors import UsageError
 from skyloop.messages import Polyline, Severity, Text
-from skyloop.messages.annotation import Colour, Shape
-from skyloop.messages.world import WorldGeometry
+from skyloop.messages.parameter import WorldGeometry
+from skyloop.messages.relayed import Colour, Shape
 from skyloop.vision import GateDetector, GateSighting, PoleDetector
 
 if TYPE_CHECKING:

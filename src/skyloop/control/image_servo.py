@@ -18,7 +18,7 @@ from skyloop.control.limiting import SetpointLimits
 from skyloop.control.search import TurningSearch
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Feedback, Polyline, Text
-from skyloop.messages.annotation import Colour, Shape
+from skyloop.messages.relayed import Colour, Shape
 from skyloop.poses import mounting_rotation
 from skyloop.vision import MarkerDetector
 from skyloop.vision.lens import normalised, project

@@ -10,7 +10,7 @@ from skyloop.control.landing_settings import LandingSettings
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
 from skyloop.messages import FlightState, Polyline, Severity, Text
-from skyloop.messages.annotation import Colour, Shape
+from skyloop.messages.relayed import Colour, Shape
 from skyloop.vision import MarkerDetector
 
 if TYPE_CHECKING:

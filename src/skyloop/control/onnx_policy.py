@@ -18,7 +18,7 @@ from skyloop.control.behaviour import BLIND_S, Behaviour
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.extend import let_go
 from skyloop.messages import Attitude, Feedback, Text, Velocity
-from skyloop.messages.annotation import Shape
+from skyloop.messages.relayed import Shape
 from skyloop.messages.rows import ACTIONS, STATE, set_point, state_row
 from skyloop.vision.onnx import load_network, reason
 from skyloop.vision.opencv import opencv

@@ -24,7 +24,7 @@ from skyloop.control.target_finder import Sighting, TargetFinder
 from skyloop.control.target_view import Camera, predicted_box
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
-from skyloop.messages.annotation import Colour, Shape
+from skyloop.messages.relayed import Colour, Shape
 from skyloop.poses import mounting_rotation
 from skyloop.vision.detection import Detection, ObjectDetector
 from skyloop.vision.tracking import Box, outline

@@ -35,8 +35,8 @@ from skyloop.messages import (
     Value,
     Vector,
 )
-from skyloop.messages.checkup import Diagnostic
-from skyloop.messages.pose import check_pose
+from skyloop.messages.command import check_pose
+from skyloop.messages.parameter import Diagnostic
 
 
 class Sink(Protocol):

@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from skyloop.clock import monotonic_ns
-from skyloop.drivers.backlog import Coded
 from skyloop.drivers.base import Sink
-from skyloop.drivers.camera_source import DEVICE_FORMAT, CameraSource
+from skyloop.drivers.camera_options import DEVICE_FORMAT, CameraSource
+from skyloop.drivers.live_frames import CheckedRelay, Coded, StreamRelay
 from skyloop.drivers.live_video import Decoder, LiveVideo, Picture, VideoEvent
-from skyloop.drivers.stream_relay import CheckedRelay, StreamRelay
 from skyloop.errors import MissingExtraError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
 

@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from skyloop.clock import Clock, nanoseconds
-from skyloop.drivers.backlog import Coded
+from skyloop.clock import Clock, LiveClock, nanoseconds
 from skyloop.drivers.h264 import Inspector, Unit
-from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.live_frames import Coded
 from skyloop.drivers.live_video import Decoded
 from skyloop.errors import MissingExtraError, UnsupportedError
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.pyav import limit_memory, new_decoder
 
 try:

@@ -2,7 +2,7 @@
 
 Two threads: one reads frames from the socket at once, so that no picture grows old in a buffer of the kernel, and
 reconnects for ever; the other decodes what is wanted. Between them stands the
-:class:`~skyloop.drivers.backlog.Backlog`, which decides what is left out when decoding is late.
+:class:`~skyloop.drivers.live_frames.FrameBacklog`, which decides what is left out when decoding is late.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import Clock, monotonic_ns
-from skyloop.drivers.backlog import Backlog, Coded
 from skyloop.drivers.base import Sink
+from skyloop.drivers.live_frames import Coded, FrameBacklog
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
 
@@ -205,7 +205,7 @@ class LiveVideo:
         self._name = name
         self._stop = threading.Event()
         self._came = threading.Condition()  # guards the backlog and the counts of the reading thread
-        self._backlog = Backlog()
+        self._backlog = FrameBacklog()
         self._wanted = False  # when the last frame came
         self._shows = False  # pictures are wanted, not only checked frames
         self._received = self._connections = self._broken = self._lost_bytes = 0

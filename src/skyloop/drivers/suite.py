@@ -29,10 +29,9 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 from skyloop.drivers.base import Driver
-from skyloop.drivers.recording_sink import RecordingSink, implausible
+from skyloop.drivers.recording_sink import RecordingSink, another_value, implausible, mismatch, same
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.suite_flight import Flight
-from skyloop.drivers.suite_parameters import another_value, mismatch, same
 from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.errors import ParameterError, UnknownNameError, UsageError
 from skyloop.messages import (

@@ -4,7 +4,6 @@ SI units and radians; body axes x forward, y left, z up; world axes x east, y no
 integer nanoseconds on the proxy's monotonic clock.
 """
 
-from skyloop.messages.annotation import Annotation, Points, Polyline, Text
 from skyloop.messages.codec import Kind, Sample, decode, encode
 from skyloop.messages.command import (
     ACTION_NAMES,
@@ -14,13 +13,16 @@ from skyloop.messages.command import (
     Attitude,
     Command,
     EmergencyStop,
+    Fate,
     Hover,
     Idle,
     Land,
+    Outcome,
     Position,
     ResetEmergency,
     ReturnToStart,
     Takeoff,
+    VehiclePose,
     Velocity,
 )
 from skyloop.messages.config import (
@@ -53,13 +55,8 @@ from skyloop.messages.config import (
     Statistics,
     Welcome,
 )
-from skyloop.messages.encoded import EncodedFrame, StreamReport
-from skyloop.messages.event import Event
-from skyloop.messages.feedback import Feedback, Value, Vector
-from skyloop.messages.feedback_request import FeedbackRequest
-from skyloop.messages.frame import CameraInfo, FrameHeader, Intrinsics
-from skyloop.messages.intent import Fate, Outcome
-from skyloop.messages.kinds import (
+from skyloop.messages.feedback import Event, Feedback, Overview, VehicleOverview
+from skyloop.messages.fields import (
     Encoding,
     EventKind,
     Failsafe,
@@ -70,13 +67,13 @@ from skyloop.messages.kinds import (
     Role,
     Severity,
     Takeover,
+    Value,
+    Vector,
 )
-from skyloop.messages.log import LogEntry
-from skyloop.messages.overview import Overview, VehicleOverview
+from skyloop.messages.frame import CameraInfo, EncodedFrame, FrameHeader, Intrinsics, StreamReport
 from skyloop.messages.parameter import Parameter, ParameterType
-from skyloop.messages.pose import VehiclePose
-from skyloop.messages.result import ProcessorResult, ProcessorShare
-from skyloop.messages.video import VideoRequest
+from skyloop.messages.relayed import Annotation, LogEntry, Points, Polyline, ProcessorResult, ProcessorShare, Text
+from skyloop.messages.subscription import FeedbackRequest, VideoRequest
 
 __all__ = [
     "ACTION_NAMES",

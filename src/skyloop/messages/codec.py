@@ -14,17 +14,11 @@ from typing import Final
 import msgspec
 
 from skyloop.errors import DecodeError
-from skyloop.messages.annotation import Annotation
-from skyloop.messages.command import Applied, Command
+from skyloop.messages.command import Applied, Command, VehiclePose
 from skyloop.messages.config import Reply, Request
-from skyloop.messages.encoded import EncodedFrame, StreamReport
-from skyloop.messages.event import Event
-from skyloop.messages.feedback import Feedback
-from skyloop.messages.frame import FrameHeader
-from skyloop.messages.log import LogEntry
-from skyloop.messages.overview import Overview
-from skyloop.messages.pose import VehiclePose
-from skyloop.messages.result import ProcessorResult, ProcessorShare
+from skyloop.messages.feedback import Event, Feedback, Overview
+from skyloop.messages.frame import EncodedFrame, FrameHeader, StreamReport
+from skyloop.messages.relayed import Annotation, LogEntry, ProcessorResult, ProcessorShare
 
 SIGNATURE: Final = b"SKYL"
 VERSION: Final = 1

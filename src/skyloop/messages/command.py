@@ -1,16 +1,20 @@
-"""Commands: the full desired state each time; the newest wins.
+"""What an application tells the vehicle, and what became of it: commands, their outcome, and poses from outside.
 
-Axes are the body's (ROS REP 103): x forward, y left, z up; yaw is counter-clockwise seen from above.
+A command is the full desired state each time; the newest wins. Axes are the body's (ROS REP 103): x forward, y left, z
+up; yaw is counter-clockwise seen from above.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Annotated, Final
 
 import msgspec
 
-from skyloop.messages.numbers import Count, TimeNs
+from skyloop.errors import UsageError
+from skyloop.messages.fields import Count, Refusal, TimeNs
 
 FARTHEST_M: Final = 100_000.0  #: a place farther from the origin, along any axis, is taken for a mistake
 MOST_TURNS_RAD: Final = 1000.0  #: so is a larger yaw
@@ -203,3 +207,103 @@ class Applied(msgspec.Struct, frozen=True, array_like=True):
     applied_ns: TimeNs
     asked: AnyAction
     applied: AnyAction  #: after limits, and as the driver really applied it
+
+
+MAX_OUTCOME_TEXT: Final = 300  #: characters
+
+
+class Fate(StrEnum):
+    """How far an intent is, or what ended it. Nothing that is over is ever done again by a repeat."""
+
+    UNDER_WAY = "under_way"
+    COMPLETED = "completed"
+    REFUSED = "refused"
+    REPLACED = "replaced"
+    WITHDRAWN = "withdrawn"
+    TIMED_OUT = "timed_out"
+    LANDED = "landed"
+    EMERGENCY = "emergency"
+    AUTHORITY = "authority"
+    LINK = "link"
+    FAILSAFE = "failsafe"
+    OTHERS = "others"
+    SLEPT = "slept"
+    JUMPED = "jumped"
+
+
+#: The one list of what ends an intent, in words for people; ``docs/proxy.md`` has it, too.
+ENDINGS: Final[dict[Fate, str]] = {
+    Fate.COMPLETED: "it was done",
+    Fate.REFUSED: "it was refused",
+    Fate.REPLACED: "a newer command took its place",
+    Fate.WITHDRAWN: "its application wants it no more: the call was cancelled, failed, or ran out of time",
+    Fate.TIMED_OUT: "the vehicle did not leave the ground within 20 s, or one that was to land was not heard for 60 s",
+    Fate.LANDED: "the vehicle landed or disarmed, whoever made it",
+    Fate.EMERGENCY: "there was an emergency, or somebody stopped the motors",
+    Fate.AUTHORITY: "the authority was granted anew, lost or given back",
+    Fate.LINK: "the link to the vehicle broke or came back, which ends no landing, or the application's own was lost",
+    Fate.FAILSAFE: "a failsafe took over",
+    Fate.OTHERS: "somebody else took the vehicle",
+    Fate.SLEPT: "the proxy's computer slept",
+    Fate.JUMPED: "the vehicle's position jumped",
+}
+
+
+class Outcome(msgspec.Struct, frozen=True, array_like=True):
+    """What became of the newest intent of the application that commands, or commanded last."""
+
+    app_id: Count = 0  #: number of the application in this run of the proxy; 0: nobody has commanded yet
+    intent: Count = 0  #: the number of the intent, as in its commands
+    fate: Fate = Fate.UNDER_WAY
+    reason: Refusal | None = None  #: why it, or a repeat of it, is refused
+    text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: the same for a person
+
+    @property
+    def over(self) -> bool:
+        """Whether it ended."""
+        return self.fate is not Fate.UNDER_WAY
+
+    @property
+    def failed(self) -> bool:
+        """Whether it ended otherwise than by being done."""
+        return self.over and self.fate is not Fate.COMPLETED
+
+
+class VehiclePose(msgspec.Struct, frozen=True, array_like=True):
+    """A pose for the vehicle itself, from a pilot's application. World axes x east, y north, z up."""
+
+    captured_ns: TimeNs  #: when it was so, on the proxy's clock
+    position_m: tuple[float, float, float]  #: of the body's origin [m]
+    quaternion: tuple[float, float, float, float]  #: x, y, z, w, from body axes (forward, left, up) to world axes
+    position_std_m: float | None = None  #: standard deviation, if it is known
+    attitude_std_rad: float | None = None  #: standard deviation, if it is known
+
+
+def check_pose(
+    position: Sequence[float],
+    quaternion: Sequence[float],
+    position_std_m: float | None = None,
+    attitude_std_rad: float | None = None,
+) -> None:
+    """Check the numbers of a pose.
+
+    Args:
+        position: x, y, z [m].
+        quaternion: x, y, z, w.
+        position_std_m: Standard deviation of the position [m], 0 or more; None if it is not known.
+        attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if it is not known.
+
+    Raises:
+        UsageError: If a number is missing or not finite, a standard deviation is negative, or the quaternion's length
+            differs from 1 by more than 0.001.
+    """
+    for name, axes, values in (("position", "x, y, z", position), ("quaternion", "x, y, z, w", quaternion)):
+        count = len(axes.split(", "))
+        if len(values) != count or not all(map(math.isfinite, values)):
+            raise UsageError(f"{name} must have {count} finite numbers ({axes}), got {tuple(values)!r}")
+    length = math.hypot(*quaternion)
+    if abs(length - 1.0) > 1e-3:
+        raise UsageError(f"quaternion (x, y, z, w) of a rotation must have length 1, got {length:.4g}")
+    for name, value in (("position_std_m", position_std_m), ("attitude_std_rad", attitude_std_rad)):
+        if value is not None and not 0.0 <= value < math.inf:
+            raise UsageError(f"{name} is {value!r} and must be 0 or more, or None where it is not known")

@@ -6,12 +6,10 @@ from typing import Annotated
 
 import msgspec
 
-from skyloop.messages.feedback import Value
-from skyloop.messages.frame import CameraInfo, Name
-from skyloop.messages.kinds import Refusal, Role, Takeover
-from skyloop.messages.numbers import Count, TimeNs
+from skyloop.messages.fields import Count, Name, Refusal, Role, Takeover, TimeNs, Value
+from skyloop.messages.frame import CameraInfo
 from skyloop.messages.parameter import Parameter, ParameterName
-from skyloop.messages.result import MAX_CODE, ProcessorName
+from skyloop.messages.relayed import MAX_CODE, ProcessorName
 
 Priority = Annotated[int, msgspec.Meta(ge=0, le=31)]
 LONGEST_TERM_S = 86_400.0

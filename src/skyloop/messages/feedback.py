@@ -1,22 +1,34 @@
-"""Feedback: the vehicle's state, time-stamped. What is not known is ``None``, never zero."""
+"""What a proxy reports: the vehicle's state, time-stamped, events, and an overview of many vehicles.
+
+What is not known is ``None``, never zero.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import msgspec
 
-from skyloop.messages.earth import EarthOrigin
-from skyloop.messages.intent import Outcome
-from skyloop.messages.kinds import Failsafe, FlightState, LinkState, ReturnPhase
-from skyloop.messages.numbers import Count, Finite, TimeNs
+from skyloop.messages.command import Outcome
+from skyloop.messages.fields import (
+    Count,
+    EventKind,
+    Failsafe,
+    Finite,
+    FlightState,
+    LinkState,
+    ReturnPhase,
+    Severity,
+    TimeNs,
+    Value,
+    Vector,
+)
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-#: Three finite numbers, along x, y and z.
-Vector = tuple[Finite, Finite, Finite]
 
 MAX_LINK_TEXT = 300  #: characters of a text about the link to the vehicle
 LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
@@ -30,9 +42,6 @@ POSITION_SOURCES = (
     "let it know its position: a simulated drone reports it unless started with position=none, a MAVLink vehicle with "
     "GPS, optical flow or motion capture (docs/motion-capture.md)"
 )
-
-#: A value of a vehicle's native telemetry, of a parameter or of an event's particulars.
-Value = bool | int | float | str | tuple[float, ...]
 
 
 class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
@@ -94,3 +103,164 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
         if self.roll_rad is None or self.pitch_rad is None or self.yaw_rad is None:
             raise ValueError("the vehicle has not reported its attitude yet")
         return rotation_from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad)
+
+
+_KEYS: Final = (
+    "origin.latitude_deg",
+    "origin.longitude_deg",
+    "origin.altitude_amsl_m",
+    "origin.radius_m",
+)
+
+
+class EarthOrigin(NamedTuple):
+    """The place on the earth where the world axes of ``Feedback.position_m`` begin, x to the east and y to the north.
+
+    Autopilots project the earth onto their axes with a sphere. With theirs, a place that is converted here is the place
+    that they mean by it; with another one it would be off by up to 0.6 % of its distance.
+    """
+
+    latitude_deg: float  #: [°], north positive
+    longitude_deg: float  #: [°], east positive
+    altitude_m: float  #: above mean sea level [m]
+    radius_m: float  #: of the sphere that the vehicle takes the earth for [m]
+
+    @classmethod
+    def of(cls, native: Mapping[str, object] | None) -> EarthOrigin | None:
+        """Return the origin that a driver has put into ``Feedback.native``; None if there is none that makes sense."""
+        found = [native.get(key) if native else None for key in _KEYS]
+        numbers = [float(one) for one in found if isinstance(one, int | float) and math.isfinite(one)]
+        if len(numbers) < len(_KEYS) or not (is_on_earth(*numbers[:2]) and numbers[3] > 0.0):
+            return None
+        return cls(*numbers)
+
+    def native(self) -> dict[str, float]:
+        """Return what a driver puts into ``Feedback.native``."""
+        return dict(zip(_KEYS, self, strict=True))
+
+    def position_of(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[float, float, float]:
+        """Return a place in world axes: x east, y north, z up [m].
+
+        Args:
+            latitude_deg: [°], north positive.
+            longitude_deg: [°], east positive; the shorter way round is taken.
+            altitude_m: Above mean sea level [m].
+        """
+        east_rad = math.radians(math.remainder(longitude_deg - self.longitude_deg, 360.0))
+        middle_rad = math.radians((latitude_deg + self.latitude_deg) / 2.0)
+        north_m = math.radians(latitude_deg - self.latitude_deg) * self.radius_m
+        return east_rad * math.cos(middle_rad) * self.radius_m, north_m, altitude_m - self.altitude_m
+
+    def place_of(self, position: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Return latitude [°], longitude [°] and altitude above mean sea level [m] of a place in world axes [m]."""
+        x, y, z = position
+        latitude_deg = self.latitude_deg + math.degrees(y / self.radius_m)
+        middle_rad = math.radians((latitude_deg + self.latitude_deg) / 2.0)
+        longitude_deg = self.longitude_deg + math.degrees(x / (self.radius_m * math.cos(middle_rad)))
+        return latitude_deg, math.remainder(longitude_deg, 360.0), self.altitude_m + z
+
+
+def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
+    """Return whether there is such a place, and east and north are known there; False for NaN."""
+    return abs(latitude_deg) < 89.9 and abs(longitude_deg) <= 180.0
+
+
+class Event(msgspec.Struct, frozen=True, array_like=True):
+    """One thing that happened. ``text`` is for people, ``kind`` and ``data`` for programs."""
+
+    kind: EventKind
+    text: str
+    at_ns: TimeNs  #: on the proxy's clock
+    severity: Severity = Severity.INFO
+    seq: Count = 0  #: grows by one per proxy's run; 0 for events made by the client itself
+    app: str | None = None  #: the application it concerns
+    data: dict[str, Value] = msgspec.field(default_factory=dict)
+
+
+MAX_ADDRESS: Final = 200  #: characters of a vehicle's address
+MAX_EVENT_TEXT: Final = 200  #: characters of the last event's text
+
+
+class VehicleOverview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
+    """What is to be known of one vehicle at a glance. What is not known is ``None``, as in :class:`Feedback`."""
+
+    name: Annotated[str, msgspec.Meta(max_length=64)]  #: of its proxy
+    uri: Annotated[str, msgspec.Meta(max_length=MAX_ADDRESS)] = ""  #: its address; cut if it is longer
+    vehicle: Annotated[str, msgspec.Meta(max_length=64)] = ""  #: its family
+    can_fly: bool = False  #: whether it takes commands at all
+    captured_ns: TimeNs = 0  #: of its newest feedback, on the proxy's clock; 0: none has come
+    state: FlightState = FlightState.UNKNOWN
+    battery: Finite | None = None  #: charge left, 0 to 1
+    position_m: Vector | None = None  #: in world axes [m]
+    altitude_m: Finite | None = None  #: height above the ground below [m]
+    yaw_rad: Finite | None = None  #: counter-clockwise from x [rad]
+    vehicle_link: LinkState = LinkState.CONNECTING  #: the hop proxy–vehicle
+    link_reason: LinkText = ""  #: why it is as it is; while it is up, what a vehicle waits for that still wakes up
+    link_remedy: LinkText = ""  #: what a person can do about it
+    owner: str | None = None  #: name of the application that holds the authority
+    owner_priority: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None  #: 0 is the highest
+    failsafe: Failsafe = Failsafe.NONE
+    others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
+    return_phase: ReturnPhase = ReturnPhase.NONE
+    applications: Count = 0  #: how many are connected
+    event: Event | None = None  #: the last one, without its data; those of applications that come and go are left out
+
+
+class Overview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
+    """All vehicles of one process, or of one proxy, by name; a page of them where one packet can't hold all.
+
+    The pages of one overview have the same ``seq``.
+    """
+
+    at_ns: TimeNs  #: when it was made, on the proxy's clock
+    seq: Count  #: grows by one with each overview
+    first: Count = 0  #: index of the first row on this page
+    total: Count = 0  #: rows on all pages
+    vehicles: tuple[VehicleOverview, ...] = ()
+
+
+class OverviewPages:
+    """Puts the pages of overviews together, in the order of their arrival."""
+
+    def __init__(self) -> None:
+        self._seq: int | None = None
+        self._rows: list[VehicleOverview] = []
+
+    def add(self, page: Overview) -> Overview | None:
+        """Add a page; return the whole overview if this was its last page, else None.
+
+        One of which a page is missing is left out: the next one follows within a second.
+        """
+        if page.first == 0:
+            self._seq, self._rows = page.seq, []
+        elif page.seq != self._seq or page.first != len(self._rows):
+            self._seq = None
+            return None
+        self._rows.extend(page.vehicles)
+        if len(self._rows) < page.total:
+            return None
+        self._seq = None
+        return msgspec.structs.replace(page, first=0, vehicles=tuple(self._rows))
+
+
+def typical_feedback(captured_ns: int, state: FlightState = FlightState.FLYING) -> Feedback:
+    """Return feedback with as many values as a real vehicle's, for what measures the code or keeps it warm.
+
+    Args:
+        captured_ns: When it was captured [ns].
+        state: Its flight state.
+    """
+    return Feedback(
+        captured_ns=captured_ns,
+        state=state,
+        battery=0.8,
+        battery_v=11.4,
+        roll_rad=0.01,
+        pitch_rad=-0.02,
+        yaw_rad=0.5,
+        altitude_m=1.2,
+        velocity_m_s=(0.1, 0.0, 0.0),
+        angular_velocity_rad_s=(0.0, 0.01, 0.0),
+        acceleration_m_s2=(0.0, 0.1, 9.8),
+        position_m=(0.5, 0.25, 1.2),
+    )

@@ -1,20 +1,28 @@
-"""What travels with a frame of video."""
+"""Frames of video: what travels with their pixels, encoded pictures of a stream, and the headers of picture files.
+
+The pictures of a stream are as the vehicle sent them, or encoded by the proxy; only while somebody subscribes.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+import struct
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 
-from skyloop.messages.kinds import Encoding
-from skyloop.messages.numbers import Count, Finite, TimeNs
+from skyloop.messages.fields import Count, Encoding, Finite, Name, Pixels, TimeNs
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
-Pixels = Annotated[int, msgspec.Meta(ge=1, le=16384)]
+H264: Final = "h264"  #: the one codec that is recorded as it comes
+#: Bytes of a picture that fit a packet, with all that is sent beside it.
+MAX_PIECE: Final = 57_000
+MAX_PIECES: Final = 64
+MAX_ENCODED: Final = MAX_PIECE * MAX_PIECES  #: bytes of a whole picture
+Topic = Annotated[str, msgspec.Meta(max_length=200)]
 
 
 class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
@@ -63,3 +71,174 @@ class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
     rotation: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite] | None = None
     position_m: tuple[Finite, Finite, Finite] | None = None  #: of the optical centre in body axes [m]
     stream: str = ""  #: codec in which its pictures can be had as they come, ``h264``; empty: as frames only
+
+
+class EncodedFrame(msgspec.Struct, frozen=True, array_like=True):
+    """One picture: of H.264 an access unit in Annex B form, with its parameter sets if it is a key picture.
+
+    One that is larger than a packet travels in pieces, each of them one of these. A picture that is no key builds on
+    the one before, so after a gap in ``seq`` nothing can be decoded up to the next key. There are no pictures that
+    build on later ones. A frame decoded from it has the same ``captured_ns``, and a number of its own.
+    """
+
+    camera: Name
+    seq: Count  #: grows by one with each picture of the stream, those too large for a packet included
+    captured_ns: TimeNs  #: as of the decoded frame
+    published_ns: TimeNs  #: when the proxy had it
+    width: Pixels  #: of the picture when decoded
+    height: Pixels
+    codec: Annotated[str, msgspec.Meta(max_length=16)]  #: ``h264``
+    key: bool  #: it can be decoded without those before it
+    data: Annotated[bytes, msgspec.Meta(max_length=MAX_ENCODED)]  #: at most :data:`MAX_PIECE` of them in a packet
+    intrinsics: Intrinsics | None = None
+    topic: Topic = ""  #: that it was published on; empty: ``stream/CAMERA``, as the vehicle encoded it
+    piece: Annotated[int, msgspec.Meta(ge=0, lt=MAX_PIECES)] = 0
+    pieces: Annotated[int, msgspec.Meta(ge=1, le=MAX_PIECES)] = 1
+
+    def decoded(self, width: int, height: int) -> FrameHeader:
+        """Return the header of the frame that was decoded from it, in BGR and of this size [px]."""
+        same = (width, height) == (self.width, self.height)
+        times = (self.captured_ns, self.published_ns)
+        lens = self.intrinsics if same else None  # it is for the announced size
+        return FrameHeader(self.camera, self.seq, *times, width, height, Encoding.BGR8, width * height * 3, lens)
+
+
+class StreamReport(msgspec.Struct, frozen=True, array_like=True):
+    """What a subscriber tells the proxy of a stream that the proxy encodes. It may be lost: the next one tells more."""
+
+    topic: Topic
+    seq: Count  #: the newest picture that came whole; 0: none so far
+    wants_key: bool = False  #: it can decode nothing before the next key picture
+
+
+def split(picture: EncodedFrame) -> Iterator[EncodedFrame]:
+    """Yield the pieces of a picture in order; the picture itself if it fits a packet.
+
+    Args:
+        picture: Whole, of at most :data:`MAX_ENCODED` bytes.
+    """
+    pieces = -(-len(picture.data) // MAX_PIECE)
+    if pieces <= 1:
+        yield picture
+        return
+    for piece in range(pieces):
+        data = picture.data[piece * MAX_PIECE : (piece + 1) * MAX_PIECE]
+        yield msgspec.structs.replace(picture, data=data, piece=piece, pieces=pieces)
+
+
+class Pieces:
+    """Puts the pictures of one stream together again. Pieces come in order, or the picture is not whole."""
+
+    def __init__(self) -> None:
+        self._parts: list[EncodedFrame] = []
+
+    def add(self, part: EncodedFrame) -> EncodedFrame | None:
+        """Take what came; return a picture that is whole now."""
+        if part.pieces == 1:
+            self._parts.clear()
+            return part
+        last = self._parts[-1] if self._parts else None
+        if part.piece == 0:
+            self._parts = [part]
+        elif last is not None and (part.seq, part.pieces, part.piece) == (last.seq, last.pieces, last.piece + 1):
+            self._parts.append(part)
+        else:
+            self._parts.clear()
+            return None
+        if len(self._parts) < part.pieces:
+            return None
+        parts, self._parts = self._parts, []
+        return msgspec.structs.replace(part, data=b"".join(each.data for each in parts), piece=0, pieces=1)
+
+
+class Chain:
+    """Tells which pictures of a stream can be decoded: a key, and each that follows it without a gap in the numbers."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None  # None: wait for a key
+
+    def follows(self, number: int, *, key: bool) -> bool:
+        """Return whether a picture, the next that came, can be decoded; False for one that came a second time.
+
+        Args:
+            number: The picture's ``seq``.
+            key: Whether it is a key picture.
+        """
+        if number == self._last and not key:
+            return False
+        whole = key or (self._last is not None and number == self._last + 1)
+        self._last = number if whole else None
+        return whole
+
+    def restart(self) -> None:
+        """Restart: the next picture does not continue what came before."""
+        self._last = None
+
+
+# The size of a picture, read from the header of its JPEG or PNG file: a decoder reserves memory for what the header
+# announces, and a file of a few kilobytes may ask for gigabytes. ITU-T T.81 (JPEG), annex B; W3C PNG, section 5.
+
+#: The largest picture that is decoded, 8K UHD: no camera of a small drone comes near, and it takes 100 MB as BGR.
+MAX_PIXELS: Final = 7680 * 4320
+#: Of a progressive JPEG, each of which goes over the whole picture; encoders make about ten.
+MAX_SCANS: Final = 100
+
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_JPEG: Final = b"\xff\xd8"
+_SCAN: Final = b"\xff\xda"
+_START_OF_FRAME: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_WITHOUT_LENGTH: Final = frozenset({0x01, *range(0xD0, 0xD8)})
+_ENDS: Final = frozenset({0xD8, 0xD9, 0xDA})  #: no head goes on behind a second start, the end, or the first scan
+
+
+def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
+    """Return width and height [px] that the header of a JPEG or PNG announces.
+
+    Returns:
+        None for anything else, or a damaged header.
+    """
+    if data[:8] == _PNG:
+        if data[12:16] != b"IHDR" or len(data) < 24:
+            return None
+        width, height = struct.unpack_from(">II", data, 16)
+        return (width, height) if width and height else None
+    if data[:2] == _JPEG:
+        return _jpeg_size(data)
+    return None
+
+
+def why_not_decoded(data: bytes | memoryview) -> str:
+    """Return why a picture must not be given to a decoder; empty if it may be."""
+    size = image_size(data)
+    if size is None:
+        return "it is neither JPEG nor PNG, or it is damaged"
+    width, height = size
+    if width * height > MAX_PIXELS:
+        return f"it announces {width} × {height} pixels, and at most {MAX_PIXELS} are decoded"
+    if data[:2] == _JPEG and (scans := bytes(data).count(_SCAN)) > MAX_SCANS:
+        return f"it is a JPEG of {scans} scans, and at most {MAX_SCANS} are decoded"
+    return ""
+
+
+def _jpeg_size(data: bytes | memoryview) -> tuple[int, int] | None:
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF or data[at + 1] in (0x00, 0xFF):  # fill bytes, and what a decoder skips
+            at += 1
+            continue
+        marker = data[at + 1]
+        at += 2
+        if marker in _WITHOUT_LENGTH:
+            continue
+        if marker in _ENDS or at + 2 > len(data):
+            return None
+        (length,) = struct.unpack_from(">H", data, at)
+        if marker in _START_OF_FRAME:
+            if length < 8 or at + 7 > len(data):
+                return None
+            height, width = struct.unpack_from(">HH", data, at + 3)
+            return (width, height) if width and height else None
+        if length < 2:
+            return None
+        at += length
+    return None

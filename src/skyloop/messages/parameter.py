@@ -1,13 +1,18 @@
-"""Parameters: typed, with unit, range and default, so that a page or a person can edit them."""
+"""Parameters, and two read-only ones whose text has a structure: a vehicle's checkup, and its world.
+
+A parameter is typed, with unit, range and default, so that a page or a person can edit it.
+"""
 
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 
-from skyloop.messages.feedback import Value
+from skyloop.messages.fields import Finite, Value
+
+_encode_json = msgspec.json.Encoder().encode
 
 ParameterName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 
@@ -36,3 +41,135 @@ class Parameter(msgspec.Struct, frozen=True, array_like=True):
     read_only: bool = False
     description: str = ""
     momentary: bool = False  #: writing it does something once, such as a flip: no value to be restored or repeated
+
+
+# What a driver finds about its vehicle before a flight.
+
+CHECKUP: Final = "vehicle.checkup"  #: the parameter's name
+MAX_CHECKUP_TEXT: Final = 7000  #: characters of the parameter's text: its packet has to hold it
+
+_Text = Annotated[str, msgspec.Meta(max_length=600)]
+
+
+class Diagnostic(msgspec.Struct, frozen=True, array_like=True):
+    """Something about a vehicle or its settings that a person may want to know before flying.
+
+    Attributes:
+        what: What was examined.
+        good: Whether it is as it should be.
+        detail: What was found.
+        advice: What to do about it, empty if nothing.
+        severe: Not good, and dangerous or sure to fail: not only a safety net that is off.
+    """
+
+    what: _Text
+    good: bool
+    detail: _Text
+    advice: _Text = ""
+    severe: bool = False
+
+
+_checkup_decoder = msgspec.json.Decoder(list[Diagnostic])
+
+
+def encode_checkup(diagnostics: list[Diagnostic]) -> str:
+    """Return diagnostics as a parameter's text; those that are good are left out first if it is too long."""
+    kept = list(diagnostics)
+    while len(text := _encode_json(kept).decode()) > MAX_CHECKUP_TEXT:
+        kept.remove(next((one for one in reversed(kept) if one.good), kept[-1]))
+    return text
+
+
+def decode_checkup(text: str) -> list[Diagnostic]:
+    """Return the diagnostics of a parameter's text.
+
+    Raises:
+        ValueError: It has none.
+    """
+    return _checkup_decoder.decode(text.encode())
+
+
+# What stands in a vehicle's world, for maps: walls, solids, gates, markers, starts. A driver that knows its
+# surroundings lists it. World axes are those of `Feedback.position_m`: x east, y north, z up [m]; yaw 0 faces east,
+# counter-clockwise [rad]. It is for people's eyes: nothing is steered by it.
+
+WORLD: Final = "world.geometry"  #: the parameter's name
+MAX_WORLD_TEXT: Final = 8000  #: characters of the text: a parameter's packet has to hold it
+MAX_THINGS: Final = 256  #: of one kind
+
+_Name = Annotated[str, msgspec.Meta(max_length=64)]
+_Vec = tuple[Finite, Finite, Finite]
+
+
+class Solid(msgspec.Struct, frozen=True, array_like=True):
+    """An upright box: its centre, its extents along its own x, y, z, and its yaw."""
+
+    name: _Name
+    position: _Vec
+    size: _Vec
+    yaw: Finite = 0.0
+
+
+class Opening(msgspec.Struct, frozen=True, array_like=True):
+    """A gate: the centre, width and height of its opening, the heading of the way through, thickness of its bars."""
+
+    name: _Name
+    position: _Vec
+    size: tuple[Finite, Finite]
+    yaw: Finite = 0.0
+    frame: Finite = 0.08
+
+
+class Card(msgspec.Struct, frozen=True, array_like=True):
+    """A marker: its centre, its edge, and its outward normal's heading and angle above the horizon."""
+
+    name: _Name
+    position: _Vec
+    size: Finite
+    yaw: Finite = 0.0
+    elevation: Finite = 0.0
+
+
+class Start(msgspec.Struct, frozen=True, array_like=True):
+    """Where a vehicle stands at the start."""
+
+    name: _Name
+    position: _Vec
+    yaw: Finite = 0.0
+
+
+class WorldGeometry(msgspec.Struct, frozen=True):
+    """The whole of it. ``low`` and ``high`` are corners of the room; ``enclosed``: it has walls to see."""
+
+    name: _Name = ""
+    low: _Vec | None = None
+    high: _Vec | None = None
+    enclosed: bool = True
+    solids: Annotated[tuple[Solid, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
+    gates: Annotated[tuple[Opening, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
+    markers: Annotated[tuple[Card, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
+    starts: Annotated[tuple[Start, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
+    left_out: int = 0  #: things that the text has no room for
+
+
+_world_decoder = msgspec.json.Decoder(WorldGeometry)
+
+
+def encode_world(world: WorldGeometry) -> str:
+    """Return a world as a parameter's text; of a world that is too large the last solids and markers are left out."""
+    while len(text := _encode_json(world).decode()) > MAX_WORLD_TEXT:
+        kind = max(("solids", "markers", "gates", "starts"), key=lambda one: len(getattr(world, one)))
+        things = getattr(world, kind)
+        kept = things[: len(things) * 3 // 4]
+        left_out = world.left_out + len(things) - len(kept)
+        world = msgspec.structs.replace(world, **{kind: kept}, left_out=left_out)
+    return text
+
+
+def decode_world(text: str) -> WorldGeometry:
+    """Return the world of a parameter's text.
+
+    Raises:
+        ValueError: It is none.
+    """
+    return _world_decoder.decode(text.encode())

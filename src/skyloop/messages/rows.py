@@ -7,7 +7,8 @@ from typing import Final
 
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.command import Attitude, Velocity
-from skyloop.messages.feedback import Feedback, Vector
+from skyloop.messages.feedback import Feedback
+from skyloop.messages.fields import Vector
 
 _Number = Callable[[Feedback], float | None]
 

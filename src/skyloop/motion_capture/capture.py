@@ -15,7 +15,7 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.control.position import Fix
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import Severity
-from skyloop.messages.log import MOCAP
+from skyloop.messages.relayed import MOCAP
 from skyloop.motion_capture.address import System
 from skyloop.motion_capture.calibration import REST_S, Calibration, calibrate
 from skyloop.motion_capture.pose import BodyPose, plausible, z_up

@@ -19,7 +19,7 @@ from typing import Final
 from skyloop.clock import Clock, nanoseconds
 from skyloop.errors import LinkError, MissingExtraError, UsageError
 from skyloop.messages import FrameHeader
-from skyloop.messages.video import FrameFilter, VideoRequest
+from skyloop.messages.subscription import FrameFilter, VideoRequest
 from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 

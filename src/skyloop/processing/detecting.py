@@ -6,7 +6,7 @@ from collections.abc import Collection
 from typing import Any, Final
 
 from skyloop.client import Frame
-from skyloop.messages.annotation import Polyline, Shape, Text
+from skyloop.messages.relayed import Polyline, Shape, Text
 from skyloop.processing.output import Output
 from skyloop.vision.detection import Detection, ObjectDetector
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from skyloop.messages.annotation import Shape
+from skyloop.messages.relayed import Shape
 
 
 class Output:

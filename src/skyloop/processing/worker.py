@@ -16,7 +16,7 @@ from skyloop.client.results import checked_age, checked_name
 from skyloop.errors import UsageError
 from skyloop.extend import join_processor
 from skyloop.messages import Severity
-from skyloop.messages.log import MAX_TEXT
+from skyloop.messages.relayed import MAX_LOG_TEXT
 from skyloop.processing.frames import Frames
 from skyloop.processing.output import Output
 from skyloop.processing.status import Status, Tally
@@ -184,4 +184,4 @@ class Worker:
 
     def _emit(self, text: str) -> None:
         self._report(text)
-        self._drone.log.text(text[-MAX_TEXT:], name=self.settings.name, severity=Severity.ERROR)
+        self._drone.log.text(text[-MAX_LOG_TEXT:], name=self.settings.name, severity=Severity.ERROR)

@@ -9,8 +9,7 @@ import msgspec
 from skyloop.clock import Clock
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, FeedbackRequest, encode
-from skyloop.messages.feedback_request import TOPIC
-from skyloop.messages.rate import RateLimiter
+from skyloop.messages.subscription import TOPIC, RateLimiter
 from skyloop.proxy.events import Counters
 from skyloop.proxy.forms import Forms
 from skyloop.transport.base import TransportServer

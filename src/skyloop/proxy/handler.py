@@ -48,7 +48,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.command import SET_POINTS
-from skyloop.messages.numbers import LATEST_NS
+from skyloop.messages.fields import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.command_checks import CommandChecks

@@ -17,8 +17,8 @@ import msgspec
 from skyloop.clock import nanoseconds
 from skyloop.errors import DriverError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterPage, ParameterType, Refusal, Value
-from skyloop.messages.checkup import CHECKUP, encode_checkup
 from skyloop.messages.codec import MAX_BODY
+from skyloop.messages.parameter import CHECKUP, encode_checkup
 from skyloop.proxy.core.airspace import AirspaceSettings
 from skyloop.proxy.core.autopilot import AutopilotSettings
 from skyloop.proxy.core.failsafe import FailsafeSettings

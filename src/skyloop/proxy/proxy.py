@@ -55,7 +55,7 @@ from skyloop.messages import (
     Welcome,
     decode,
 )
-from skyloop.messages.overview import MAX_ADDRESS, MAX_EVENT_TEXT
+from skyloop.messages.feedback import MAX_ADDRESS, MAX_EVENT_TEXT
 from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
 from skyloop.proxy.core.events import EventDraft

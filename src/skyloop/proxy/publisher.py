@@ -36,9 +36,9 @@ from skyloop.messages import (
     VideoRequest,
     encode,
 )
-from skyloop.messages.encoded import H264, MAX_ENCODED
 from skyloop.messages.feedback import MAX_LINK_TEXT
-from skyloop.messages.result import PROCESSOR_NAME
+from skyloop.messages.frame import H264, MAX_ENCODED
+from skyloop.messages.relayed import PROCESSOR_NAME
 from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.intents import NO_INTENT, Intent
 from skyloop.proxy.events import Counters, EventPublisher

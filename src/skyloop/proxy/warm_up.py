@@ -34,7 +34,7 @@ from skyloop.messages import (
     decode,
     encode,
 )
-from skyloop.messages.typical import typical_feedback
+from skyloop.messages.feedback import typical_feedback
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer
 from skyloop.warmth import Pieces, Warmer

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import MissingExtraError
 from skyloop.messages import Annotation, CameraInfo, Feedback, Intrinsics, Points, Polyline, Severity
-from skyloop.messages.annotation import Colour, Point, Shape, Text
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.messages.relayed import Colour, Point, Shape, Text
 from skyloop.recording.layout import WORLD, optical_frame
 
 try:

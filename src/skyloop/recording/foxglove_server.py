@@ -20,7 +20,7 @@ from skyloop.client import Drone
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UsageError
 from skyloop.extend import Known
 from skyloop.messages import CameraInfo, Capabilities, Value
-from skyloop.messages.encoded import H264, Chain
+from skyloop.messages.frame import H264, Chain
 from skyloop.recording import foxglove, layout
 from skyloop.recording.backlog import Item
 from skyloop.recording.foxglove import CompressedVideo

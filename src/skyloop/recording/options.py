@@ -13,7 +13,7 @@ import msgspec
 
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import CameraInfo, Severity
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.recording.layout import Channel
 
 VideoEncoding = Literal["auto", "jpeg", "png"]

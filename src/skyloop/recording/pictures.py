@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, MissingExtraError
 from skyloop.messages import Encoding, FrameHeader
-from skyloop.messages.encoded import H264, Chain
-from skyloop.messages.image_header import why_not_decoded
+from skyloop.messages.frame import H264, Chain, why_not_decoded
 from skyloop.pyav import new_decoder
 from skyloop.recording.layout import FrameRecord
 

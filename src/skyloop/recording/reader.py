@@ -14,7 +14,7 @@ from typing import IO, Any, TypeGuard
 
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, UnknownNameError
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.recording.layout import (
     META_CLOCK,
     META_END,

@@ -37,10 +37,10 @@ from skyloop.messages import (
     Polyline,
     Severity,
 )
-from skyloop.messages.annotation import Text
 from skyloop.messages.command import SET_POINTS
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.messages.relayed import Text
 from skyloop.recording.layout import FrameRecord
 from skyloop.recording.translation import Path as Trail
 

@@ -18,7 +18,7 @@ from typing import Final
 from skyloop.client import Drone
 from skyloop.clock import nanoseconds
 from skyloop.errors import FileFormatError, LinkError, NoAnswerError, SkyloopError
-from skyloop.messages.encoded import H264, Chain
+from skyloop.messages.frame import H264, Chain
 from skyloop.recording.backlog import Item
 from skyloop.recording.layout import Channel, ClockPair, DroneRecord, FrameRecord
 from skyloop.recording.options import MB, VIDEO

@@ -32,7 +32,7 @@ from skyloop.messages import (
     Parameter,
     Severity,
 )
-from skyloop.messages.encoded import H264, Chain
+from skyloop.messages.frame import H264, Chain
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import VIDEO, Options

@@ -21,9 +21,8 @@ from skyloop.messages import (
     Parameter,
     ProcessorResult,
 )
-from skyloop.messages.encoded import H264
-from skyloop.messages.log import MOCAP
-from skyloop.messages.payload import unpack
+from skyloop.messages.frame import H264
+from skyloop.messages.relayed import MOCAP, unpack
 from skyloop.recording import foxglove, layout
 from skyloop.recording.backlog import Item
 from skyloop.recording.layout import Channel, ClockPair, Drops, FrameRecord, ResultRecord, Topic

@@ -16,7 +16,7 @@ import msgspec
 from skyloop.clock import nanoseconds
 from skyloop.errors import UsageError
 from skyloop.messages import Severity
-from skyloop.messages.encoded import H264, Chain
+from skyloop.messages.frame import H264, Chain
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import VERSION, ClockPair, DroneRecord, End, Start
 from skyloop.recording.options import MB, Options, RecorderState, Room, judge_room, numbered

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
-from skyloop.messages.rate import RateLimiter
+from skyloop.messages.subscription import RateLimiter
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, SensorEffects
 from skyloop.sim.world import World

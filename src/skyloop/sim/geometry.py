@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skyloop.messages.world import Card, Opening, Solid, Start, WorldGeometry
+from skyloop.messages.parameter import Card, Opening, Solid, Start, WorldGeometry
 from skyloop.sim.world import World
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from msgspec import Meta, Struct, field
 
-from skyloop.messages.numbers import Finite
+from skyloop.messages.fields import Finite
 from skyloop.sim.world import MARKER_DICTIONARIES, TEXTURES
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import msgspec
 
 from skyloop.errors import LinkError, MissingExtraError
 from skyloop.messages import Encoding, FrameHeader, Intrinsics
-from skyloop.messages.video import VideoRequest
+from skyloop.messages.subscription import VideoRequest
 from skyloop.transport.base import Pixels
 
 _CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}

@@ -7,7 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.drivers.backlog import LATE_NS, MAX_FRAMES, Backlog, Coded
+from skyloop.drivers.live_frames import LATE_NS, MAX_FRAMES, Coded, FrameBacklog
 from skyloop.vehicles.ardrone.video import DroneStamps
 
 MS = 1_000_000
@@ -17,7 +17,7 @@ def coded(n: int, *, key: bool = False, arrived_ns: int = 0) -> Coded:
     return Coded(bytes([n % 256]), key, n, arrived_ns, 0)
 
 
-def drain(backlog: Backlog, now_ns: int) -> list[tuple[int, bool]]:
+def drain(backlog: FrameBacklog, now_ns: int) -> list[tuple[int, bool]]:
     taken = []
     while len(backlog):
         frame, show = backlog.take(now_ns)
@@ -26,7 +26,7 @@ def drain(backlog: Backlog, now_ns: int) -> list[tuple[int, bool]]:
 
 
 def test_in_time_every_frame_is_decoded_and_shown() -> None:
-    backlog = Backlog()
+    backlog = FrameBacklog()
     for n in range(4):
         backlog.put(coded(n, key=n == 2), wanted=True)
     assert drain(backlog, LATE_NS) == [(n, True) for n in range(4)]
@@ -34,7 +34,7 @@ def test_in_time_every_frame_is_decoded_and_shown() -> None:
 
 
 def test_when_late_it_goes_on_at_the_newest_key_frame_and_shows_only_the_newest() -> None:
-    backlog = Backlog()
+    backlog = FrameBacklog()
     for n in range(9):
         backlog.put(coded(n, key=n in (0, 3, 6)), wanted=True)
     assert drain(backlog, LATE_NS + 1) == [(6, False), (7, False), (8, True)]
@@ -42,7 +42,7 @@ def test_when_late_it_goes_on_at_the_newest_key_frame_and_shows_only_the_newest(
 
 
 def test_late_without_a_key_frame_all_are_decoded_and_the_newest_is_shown() -> None:
-    backlog = Backlog()
+    backlog = FrameBacklog()
     for n in range(3):
         backlog.put(coded(n), wanted=True)
     backlog.put(coded(3, arrived_ns=2), wanted=True)
@@ -52,7 +52,7 @@ def test_late_without_a_key_frame_all_are_decoded_and_the_newest_is_shown() -> N
 
 
 def test_while_nobody_looks_the_frames_since_the_newest_key_frame_are_kept_and_none_is_counted_as_skipped() -> None:
-    backlog = Backlog()
+    backlog = FrameBacklog()
     for n in range(1000):
         backlog.put(coded(n, key=n % 15 == 0), wanted=False)
     assert len(backlog) == 1000 % 15
@@ -61,7 +61,7 @@ def test_while_nobody_looks_the_frames_since_the_newest_key_frame_are_kept_and_n
 
 
 def test_more_than_it_holds_pushes_the_oldest_out() -> None:
-    backlog = Backlog()
+    backlog = FrameBacklog()
     for n in range(MAX_FRAMES + 5):
         backlog.put(coded(n), wanted=True)
     assert [number for number, _ in drain(backlog, 0)] == list(range(5, MAX_FRAMES + 5))
@@ -70,7 +70,7 @@ def test_more_than_it_holds_pushes_the_oldest_out() -> None:
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), max_size=400))
 def test_it_is_bounded_keeps_the_order_and_counts_every_wanted_frame(frames: list[tuple[bool, bool, bool]]) -> None:
-    backlog = Backlog()
+    backlog = FrameBacklog()
     shown: list[int] = []
     wanted_shown = 0
     wants = [wanted for _, wanted, _ in frames]

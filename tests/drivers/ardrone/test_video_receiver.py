@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.backlog import LATE_NS
+from skyloop.drivers.live_frames import LATE_NS
 from skyloop.drivers.live_video import VideoCounters, VideoEvent
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.vehicles.ardrone.video import VideoReceiver

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.backlog import Coded
+from skyloop.drivers.live_frames import Coded
 from skyloop.drivers.live_video import VideoEvent
 from skyloop.vehicles.ardrone.emulator.uvlc import encode
 from skyloop.vehicles.ardrone.video import WAKE, UvlcVideo

@@ -31,8 +31,8 @@ from skyloop.messages import (
     Position,
     ReturnToStart,
 )
-from skyloop.messages.annotation import Text
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
+from skyloop.messages.relayed import Text
 from skyloop.recording import rerun_log, rerun_viewer
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import FrameRecord

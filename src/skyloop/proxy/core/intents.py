@@ -1,7 +1,7 @@
 """What an application asked for, from its beginning to its one end. Pure: the time is an argument.
 
 The library repeats each command many times a second. A repeat asks the intent: it is judged again while the intent is
-under way, and never acts once it is over. :data:`skyloop.messages.intent.ENDINGS` lists all that ends one.
+under way, and never acts once it is over. :data:`skyloop.messages.command.ENDINGS` lists all that ends one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from skyloop.messages import (
     ReturnToStart,
     Takeoff,
 )
-from skyloop.messages.intent import ENDINGS, MAX_OUTCOME_TEXT
+from skyloop.messages.command import ENDINGS, MAX_OUTCOME_TEXT
 
 MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may lie: the error of the clocks' offset
 TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground by then ends

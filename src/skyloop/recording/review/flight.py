@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, MissingExtraError
 from skyloop.messages import FlightState
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.recording.pictures import Picture
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.charts import Mark, Span

@@ -17,7 +17,7 @@ from skyloop.clock import NS_PER_S
 from skyloop.drivers.h264 import IDR, PPS, SLICE, SPS, START, unit_type, units
 from skyloop.errors import FileFormatError, MissingExtraError
 from skyloop.files import replacing
-from skyloop.messages.image_header import MAX_PIXELS
+from skyloop.messages.frame import MAX_PIXELS
 from skyloop.pyav import require_pyav
 from skyloop.recording.layout import image_topic
 from skyloop.recording.pictures import Picture

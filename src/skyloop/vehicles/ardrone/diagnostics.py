@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.ardrone.wire.keys import NO_CEILING_MM
 from skyloop.vehicles.ardrone.wire.navdata import State
 

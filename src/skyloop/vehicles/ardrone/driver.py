@@ -7,7 +7,7 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.camera_options import intrinsics_of
 from skyloop.drivers.live_video import Picture, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
@@ -22,7 +22,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.ardrone.configuration import own_ids
 from skyloop.vehicles.ardrone.diagnostics import diagnose
 from skyloop.vehicles.ardrone.link import ArdroneLink

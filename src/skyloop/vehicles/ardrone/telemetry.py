@@ -12,8 +12,7 @@ import re
 from collections import Counter, deque
 from typing import Any, Final
 
-from skyloop.clock import nanoseconds, seconds
-from skyloop.drivers.live_clock import LiveClock
+from skyloop.clock import LiveClock, nanoseconds, seconds
 from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
 from skyloop.errors import DecodeError
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value

@@ -17,18 +17,16 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from skyloop.clock import Clock, monotonic_ns, nanoseconds
-from skyloop.drivers.backlog import Coded
+from skyloop.clock import Clock, LiveClock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import Sink
+from skyloop.drivers.camera_options import intrinsics_of
 from skyloop.drivers.h264 import Unit
-from skyloop.drivers.intrinsics import intrinsics_of
-from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.live_frames import Coded, StreamRelay
 from skyloop.drivers.live_video import Decoded, Decoder, LiveVideo, Picture, Stream, VideoEvent
-from skyloop.drivers.stream_relay import StreamRelay
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, Intrinsics
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame, PaveParser
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture, is_intra, is_p264
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final, Protocol
 
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.mavlink.microservices import VehicleCommand
 from skyloop.vehicles.mavlink.telemetry import PREARM, SLOW_S, Telemetry, VehicleState
 from skyloop.vehicles.mavlink.wire.codec import dialect as m

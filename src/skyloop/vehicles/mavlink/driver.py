@@ -19,7 +19,7 @@ from skyloop.messages import (
     Refusal,
     Value,
 )
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.mavlink.link import MavlinkLink
 from skyloop.vehicles.mavlink.microservices import pose_message
 from skyloop.vehicles.mavlink.options import options_of

@@ -8,9 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.clock import nanoseconds, seconds
+from skyloop.clock import LiveClock, nanoseconds, seconds
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
 from skyloop.messages import EventKind, Severity, Value
 from skyloop.messages.geometry import quaternion_from_euler

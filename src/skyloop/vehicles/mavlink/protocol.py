@@ -7,9 +7,16 @@ from typing import Final, NamedTuple
 
 from skyloop.clock import nanoseconds
 from skyloop.drivers.byte_stream import Rank
-from skyloop.drivers.link_reasons import LinkTrouble, serial_trouble, trouble_of
 from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.vehicle_session import Arrival, LinkTimeouts, VehicleEvent, VehicleSession
+from skyloop.drivers.vehicle_session import (
+    Arrival,
+    LinkTimeouts,
+    LinkTrouble,
+    VehicleEvent,
+    VehicleSession,
+    serial_trouble,
+    trouble_of,
+)
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EmergencyStop, EventKind, FlightState, Idle, LinkState, Severity, Takeoff, Value
 from skyloop.messages.feedback import WAKING_UP

@@ -11,7 +11,7 @@ from typing import Final
 from skyloop.clock import NS_PER_S, seconds
 from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
-from skyloop.messages.earth import EarthOrigin
+from skyloop.messages.feedback import EarthOrigin
 from skyloop.messages.geometry import turned
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Message

@@ -5,12 +5,11 @@ from __future__ import annotations
 from functools import partial
 
 from skyloop.drivers.base import Sink
-from skyloop.drivers.camera_source import CameraSource, source_of
-from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.camera_options import CameraSource, intrinsics_of, source_of
 from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.uri import VehicleUri
 from skyloop.messages import CameraInfo
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.vehicles.mavlink.options import FACINGS, CameraOptions
 
 

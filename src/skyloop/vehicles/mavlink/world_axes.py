@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from skyloop.messages.earth import EarthOrigin
+from skyloop.messages.feedback import EarthOrigin
 from skyloop.vehicles.mavlink.wire.axes import Vector, swap
 from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m

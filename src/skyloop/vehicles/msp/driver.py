@@ -10,7 +10,7 @@ from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, MissingExtraError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Parameter, Refusal, Takeoff, Value
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.msp.link import EXTRA, MspLink
 from skyloop.vehicles.msp.options import options_of
 from skyloop.vehicles.msp.parameters import DriverParameters

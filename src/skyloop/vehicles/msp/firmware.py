@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
 
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.msp.wire.curves import Curve, Rates, inav_curve, rate_curve, share_of
 from skyloop.vehicles.msp.wire.messages import (
     BETAFLIGHT,

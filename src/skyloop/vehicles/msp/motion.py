@@ -11,7 +11,7 @@ from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import ExternalPose
-from skyloop.messages.earth import EarthOrigin
+from skyloop.messages.feedback import EarthOrigin
 from skyloop.messages.geometry import wrap_angle
 from skyloop.vehicles.msp.wire.messages import Altitude, Attitude, Gps
 

@@ -9,12 +9,18 @@ from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.link_reasons import LinkTrouble, serial_trouble
-from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
+from skyloop.drivers.vehicle_session import (
+    LinkTimeouts,
+    LinkTrouble,
+    VehicleEvent,
+    VehicleSession,
+    message,
+    serial_trouble,
+)
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
-from skyloop.messages.checkup import Diagnostic
 from skyloop.messages.feedback import WAKING_UP
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.msp.firmware import SUPPORTED, Setup, hindrances
 from skyloop.vehicles.msp.identification import Identification
 from skyloop.vehicles.msp.motion import MotionEstimate

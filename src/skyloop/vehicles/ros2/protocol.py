@@ -320,7 +320,7 @@ def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
     """
     import numpy as np
 
-    from skyloop.messages.image_header import image_size
+    from skyloop.messages.frame import image_size
 
     data = np.frombuffer(message.data, np.uint8)
     if bytes(data[:2]) != b"\xff\xd8":

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from skyloop.clock import seconds
-from skyloop.drivers.live_clock import LiveClock
+from skyloop.clock import LiveClock, seconds
 from skyloop.vehicles.ros2.wire.conversions import euler_of, levelled_velocity
 
 PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: a stamp that is older, or in the future, is of another clock

@@ -24,7 +24,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.parameters import LIMIT_RANGES, Limits

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
-from skyloop.messages.world import WORLD, encode_world
+from skyloop.messages.parameter import WORLD, encode_world
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.geometry import geometry_of
 from skyloop.sim.parameters import LIMIT_RANGES, Limits

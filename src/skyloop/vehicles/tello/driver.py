@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from skyloop.drivers.backlog import Coded
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.h264 import Unit
+from skyloop.drivers.live_frames import Coded, StreamRelay
 from skyloop.drivers.live_video import LiveVideo, Picture, VideoEvent
-from skyloop.drivers.stream_relay import StreamRelay
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Hover, Intrinsics, Land, Parameter, Refusal, Value
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.link import TelloLink
 from skyloop.vehicles.tello.options import options_of
 from skyloop.vehicles.tello.parameters import DroneSettings

@@ -19,7 +19,7 @@ from skyloop.drivers.vehicle_session import (
 )
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, Hover, LinkState, Severity, Value
-from skyloop.messages.checkup import Diagnostic
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.setpoints import SetpointController
 from skyloop.vehicles.tello.telemetry import Health, feedback_of, native_of

@@ -13,8 +13,8 @@ from typing import Final
 from skyloop.clock import nanoseconds
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.messages import Feedback, FlightState, Severity, Value
-from skyloop.messages.checkup import Diagnostic
 from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.options import VelocityAxes
 from skyloop.vehicles.tello.wire.state import GROUND_CM, Pad, State, Vector
 

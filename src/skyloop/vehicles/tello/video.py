@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 
 from skyloop.clock import Clock, nanoseconds
-from skyloop.drivers.backlog import Coded
-from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.camera_options import intrinsics_of
+from skyloop.drivers.live_frames import Coded
 from skyloop.drivers.live_video import Decoded
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_link import MAX_DATAGRAM
 from skyloop.files import wait_readable
 from skyloop.messages import CameraInfo, Intrinsics
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.pyav import new_decoder, require_pyav
 from skyloop.vehicles.tello.link import receiving_socket
 from skyloop.vehicles.tello.options import TelloOptions

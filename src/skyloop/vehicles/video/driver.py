@@ -7,14 +7,13 @@ from functools import partial
 
 from skyloop.clock import monotonic_ns, seconds
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.camera_source import CameraSource
-from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.camera_options import CameraSource, intrinsics_of
 from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.live_video import VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError
 from skyloop.messages import CameraInfo, Capabilities, EventKind, Feedback, Hover, Intrinsics, Land, LinkState, Severity
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.vehicles.video.devices import cameras, described
 from skyloop.vehicles.video.options import options_of
 from skyloop.vehicles.video.player import FEEDBACK_NS, CameraPublisher, FilePlayer

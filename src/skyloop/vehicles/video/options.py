@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.drivers.base import reject_unknown_options
-from skyloop.drivers.camera_source import CameraSource, is_address, source_of
-from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
+from skyloop.drivers.camera_options import INTRINSICS_OPTIONS, CameraSource, check_intrinsics, is_address, source_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.files import expand
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.vehicles.video.devices import cameras, described
 from skyloop.vehicles.video.sources import DEFAULT_FPS, is_device
 from skyloop.vehicles.video.v4l2 import FORMATS, V4l2Device, opened

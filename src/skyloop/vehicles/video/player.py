@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.stream_relay import CheckedRelay, StreamRelay
+from skyloop.drivers.live_frames import CheckedRelay, StreamRelay
 from skyloop.errors import SkyloopError
 from skyloop.messages import EventKind, Feedback, Intrinsics, LinkState, Severity, Value
 from skyloop.vehicles.video.sources import DecodedImage, Source

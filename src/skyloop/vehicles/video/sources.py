@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from skyloop.drivers.h264 import Unit
 from skyloop.drivers.live_container import Units
 from skyloop.errors import FileFormatError, UsageError
-from skyloop.messages.encoded import H264
+from skyloop.messages.frame import H264
 from skyloop.pyav import limit_memory
 from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder, av
 from skyloop.vehicles.ardrone.wire.pave import Codec, PaveFrame, PaveParser

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from skyloop.messages.earth import EarthOrigin
+from skyloop.messages.feedback import EarthOrigin
 from skyloop.vehicles.mavlink.wire.axes import Vector
 
 ORIGIN: Final = EarthOrigin(47.397742, 8.545594, 488.0, math.degrees(111_320.0))

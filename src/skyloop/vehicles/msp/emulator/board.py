@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.messages.earth import EarthOrigin
+from skyloop.messages.feedback import EarthOrigin
 from skyloop.sim.host import Report
 from skyloop.vehicles.emulation.flight import FlightControl
 from skyloop.vehicles.emulation.vehicle import Vehicle

@@ -1,16 +1,92 @@
-"""What a consumer of video asks for: a camera, and in which form its frames are to come."""
+"""What a subscriber asks for: how much of the feedback, and which camera in which form. Pure.
+
+Each request has one topic, by which it is subscribed to and encoded once for all who ask for the same.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from dataclasses import dataclass, replace
-from typing import Final, Literal, get_args
+from typing import Final, Literal, Self, get_args
 from urllib.parse import parse_qsl, quote, unquote
 
+from skyloop.clock import NS_PER_S
 from skyloop.errors import UsageError
-from skyloop.messages.rate import RateLimiter
-from skyloop.messages.result import MAX_PARTS
+from skyloop.messages.relayed import MAX_PARTS
+
+TOPIC: Final = "feedback"
+MIN_HZ: Final = 0.001  #: a sample in a quarter of an hour; the time between two of much less has no end
+MAX_HZ: Final = 1000.0
+_RATE: Final = f"{TOPIC}?max_hz="
+
+
+@dataclass(frozen=True, slots=True)
+class FeedbackRequest:
+    """Feedback as one consumer wants it.
+
+    Two requests that give the same samples are equal and have the same :attr:`topic`.
+
+    Raises:
+        UsageError: ``max_hz`` is not within :data:`MIN_HZ` and :data:`MAX_HZ`.
+    """
+
+    max_hz: float | None = None  #: at most so many samples a second; None: all
+
+    def __post_init__(self) -> None:
+        rate = self.max_hz
+        if rate is not None:
+            known = isinstance(rate, int | float) and not isinstance(rate, bool)
+            if not (known and MIN_HZ <= rate <= MAX_HZ):
+                raise UsageError(f"max_hz is {rate!r} and must be from {MIN_HZ} to {MAX_HZ:g} samples a second")
+            # As it is written in a topic, so that both ends have the same request.
+            object.__setattr__(self, "max_hz", float(f"{rate:g}"))
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it asks for every sample."""
+        return self.max_hz is None
+
+    @property
+    def topic(self) -> str:
+        """The topic to subscribe to: ``feedback``, or for example ``feedback?max_hz=5``."""
+        return TOPIC if self.max_hz is None else f"{_RATE}{self.max_hz:g}"
+
+    @property
+    def period_s(self) -> float:
+        """Shortest time between two samples [s]; 0 for all samples."""
+        return 0.0 if self.max_hz is None else 1.0 / self.max_hz
+
+    @classmethod
+    def parse(cls, topic: str) -> Self:
+        """Parse the request of a topic, which must be written as :attr:`topic` writes it.
+
+        So each request has one topic, and is encoded once.
+
+        Raises:
+            UsageError: It is not a topic of feedback, or not written that way.
+        """
+        if topic == TOPIC:
+            return cls()
+        try:
+            if not topic.startswith(_RATE):
+                raise ValueError(f"it is {TOPIC}, or {_RATE} and a number")
+            request = cls(float(topic.removeprefix(_RATE)))
+        except (ValueError, UsageError) as error:
+            raise UsageError(f"{topic[:100]!r} is no request for feedback: {error}") from None
+        if request.topic != topic:
+            raise UsageError(f"{topic[:100]!r} is no request for feedback as it must be written: {request.topic!r}")
+        return request
+
+    def union(self, other: FeedbackRequest) -> FeedbackRequest:
+        """Return the smallest request that gives what either asks for."""
+        if self.max_hz is None or other.max_hz is None:
+            return PLAIN
+        return self if self.max_hz >= other.max_hz else other
+
+
+PLAIN: Final = FeedbackRequest()
+
 
 VideoEncoding = Literal["raw", "jpeg", "h264"]
 DEFAULT_QUALITY: Final = 80
@@ -194,3 +270,49 @@ def _is_part(part: object) -> bool:
         return False
     k, n = part
     return bool(0 <= k < n <= MAX_PARTS)
+
+
+TOLERANCE: Final = 0.1  #: of a period: a sample that comes so much too early is in time
+
+
+class RateLimiter:
+    """Selects samples of one series so that on average no more than so many a second are left.
+
+    It keeps state, so each series and each consumer needs its own.
+    """
+
+    def __init__(self, max_hz: float | None) -> None:
+        """Start with the first sample in time.
+
+        Args:
+            max_hz: Most samples a second, above 0; None: all.
+        """
+        self.max_hz = math.inf if max_hz is None else max_hz
+        self._due_ns: int | None = None
+
+    @property
+    def max_hz(self) -> float:
+        """Most samples a second that are in time; infinity: all."""
+        return NS_PER_S / self._period_ns if self._period_ns else math.inf
+
+    @max_hz.setter
+    def max_hz(self, max_hz: float) -> None:
+        self._period_ns = round(NS_PER_S / max_hz)  # 0: every sample is in time
+
+    def in_time(self, at_ns: int) -> bool:
+        """Return whether a sample is to be kept. Call it once for each sample, in order.
+
+        Args:
+            at_ns: Its time, on any one clock.
+        """
+        period_ns, due_ns = self._period_ns, self._due_ns
+        if not period_ns:
+            return True
+        # A time long before the last one is of another run of the source, and restarts the count.
+        if due_ns is None or at_ns < due_ns - 2 * period_ns or at_ns >= due_ns + period_ns:
+            self._due_ns = at_ns + period_ns
+            return True
+        if at_ns < due_ns - TOLERANCE * period_ns:
+            return False
+        self._due_ns = due_ns + period_ns
+        return True

@@ -1,8 +1,52 @@
-"""The closed vocabularies of the messages: each member is its own string, so ``state == "hovering"`` reads well."""
+"""What the fields of samples are made of: ranges of numbers, and closed vocabularies.
+
+A sample may come from anybody who may connect, and many programs use what is in it: as a size, an index, a time or
+the bound of a loop. So its numbers are bounded here once, where it comes in, and not at each place of use. Each member
+of a vocabulary is its own string, so ``state == "hovering"`` reads well.
+"""
 
 from __future__ import annotations
 
+import math
+import sys
+from collections.abc import Sequence
 from enum import StrEnum
+from typing import Annotated, Final
+
+import msgspec
+
+#: What counts up: sequence numbers, leases, numbers of applications. Python's ints have no end, others' have 64 bits.
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+#: 73 years: beyond what a monotonic clock shows, and little enough that a time, an offset between two clocks and the
+#: Unix time of their start can be added up in 64 bits.
+LATEST_NS: Final = 2**61
+#: A time on a monotonic clock [ns].
+TimeNs = Annotated[int, msgspec.Meta(ge=-LATEST_NS, le=LATEST_NS)]
+
+#: A number that is neither NaN nor infinite.
+Finite = Annotated[float, msgspec.Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+Pixels = Annotated[int, msgspec.Meta(ge=1, le=16384)]
+
+#: Three finite numbers, along x, y and z.
+Vector = tuple[Finite, Finite, Finite]
+#: A value of a vehicle's native telemetry, of a parameter or of an event's particulars.
+Value = bool | int | float | str | tuple[float, ...]
+
+
+def shape_fits(shape: Sequence[int], count: int, most: int) -> bool:
+    """Return whether an array of this shape has the given number of elements and no axis of excessive length.
+
+    An axis of length 0 makes any other lengths fit, and a loop over those would never end. So the lengths are also
+    multiplied with each 0 taken as 1, and bounded.
+
+    Args:
+        shape: The length of each axis.
+        count: The number of elements.
+        most: The largest product of the lengths, each 0 taken as 1.
+    """
+    return math.prod(shape) == count and math.prod(max(1, length) for length in shape) <= most
 
 
 class FlightState(StrEnum):

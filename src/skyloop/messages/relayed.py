@@ -1,0 +1,258 @@
+"""What applications publish through the proxy: annotations of frames, log entries, results of processors.
+
+The proxy relays it on the topics ``annotations``, ``logs``, ``results`` (of all processors) and ``results/NAME``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import msgspec
+
+from skyloop.errors import DecodeError, UsageError
+from skyloop.messages.fields import Count, Finite, Name, Pixels, Severity, TimeNs, shape_fits
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+# Annotations: what a controller or processor saw in a frame, for people and recorders to look at; the newest wins.
+# Coordinates are pixels of the frame named.
+
+Point = tuple[Finite, Finite]
+Channel = Annotated[int, msgspec.Meta(ge=0, le=255)]
+Colour = tuple[Channel, Channel, Channel]  #: red, green, blue, 0 to 255
+GREEN: Colour = (64, 220, 100)
+
+
+class Polyline(msgspec.Struct, frozen=True, array_like=True, tag=1):
+    """A line through points; closed: a polygon (a box has four points)."""
+
+    points: Annotated[tuple[Point, ...], msgspec.Meta(max_length=512)]
+    closed: bool = False
+    colour: Colour = GREEN
+
+
+class Points(msgspec.Struct, frozen=True, array_like=True, tag=2):
+    """Single points."""
+
+    points: Annotated[tuple[Point, ...], msgspec.Meta(max_length=1024)]
+    colour: Colour = GREEN
+
+
+class Text(msgspec.Struct, frozen=True, array_like=True, tag=3):
+    """A text beside a point."""
+
+    text: Annotated[str, msgspec.Meta(max_length=256)]
+    at: Point
+    colour: Colour = GREEN
+
+
+Shape = Polyline | Points | Text
+
+
+class Annotation(msgspec.Struct, frozen=True, array_like=True):
+    source: Name  #: which tracker or controller drew it; the newest per source and camera counts
+    camera: Name
+    captured_ns: TimeNs  #: of the frame that it belongs to
+    width: Pixels  #: of that frame
+    height: Pixels
+    shapes: Annotated[tuple[Shape, ...], msgspec.Meta(max_length=256)] = ()
+
+
+# Log entries: text, numbers and arrays, for recorders and for people to plot.
+
+MAX_LOG_TEXT: Final = 4096  #: characters
+MAX_VALUES: Final = 4096  #: numbers of an array
+#: The series of poses from motion capture, in world axes: arrays of x, y, z [m], quaternion x, y, z, w, and velocity
+#: x, y, z [m/s] if it is known.
+MOCAP: Final = "mocap"
+
+
+class LogEntry(msgspec.Struct, frozen=True, array_like=True):
+    """One entry: exactly one of ``text``, ``number`` and ``values`` is given.
+
+    Raises ``ValueError`` for none or several of them, and for a shape that is not that of the values.
+    """
+
+    source: Name  #: the application, or the part of it, that logged it
+    name: Annotated[str, msgspec.Meta(max_length=64)]  #: of the series; empty for text that belongs to none
+    at_ns: TimeNs  #: when it was logged, on the proxy's clock
+    text: Annotated[str, msgspec.Meta(max_length=MAX_LOG_TEXT)] | None = None
+    number: Finite | None = None
+    values: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=MAX_VALUES)] | None = None  #: an array, row by row
+    shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=8)] = ()  #: of that array
+    severity: Severity = Severity.INFO  #: of a text
+
+    def __post_init__(self) -> None:
+        if (self.text is not None) + (self.number is not None) + (self.values is not None) != 1:
+            raise ValueError("a log entry has exactly one of text, number and values")
+        values = self.values
+        if self.shape if values is None else not shape_fits(self.shape, len(values), MAX_VALUES):
+            raise ValueError(f"a log entry of {len(values or ())} values can't have the shape {self.shape!r:.200}")
+
+
+# Results: what a processor made of a frame, and how the workers of one processor share the frames.
+
+MAX_PAYLOAD: Final = 32_768  #: bytes of a result's value, packed
+MAX_CODE: Final = 128  #: characters of what identifies the code of a processor
+MAX_PARTS: Final = 1024  #: of a camera's frames, of which each worker takes one
+PROCESSOR_NAME: Final = r"^[A-Za-z0-9_.-]{1,64}$"
+ProcessorName = Annotated[str, msgspec.Meta(pattern=PROCESSOR_NAME, min_length=1, max_length=64)]
+
+
+class ProcessorResult(msgspec.Struct, frozen=True, array_like=True):
+    """What a processor made of one frame."""
+
+    processor: ProcessorName
+    camera: Name
+    seq: Count  #: of the frame
+    captured_ns: TimeNs  #: of the frame
+    made_ns: TimeNs  #: when the result was there, on the proxy's clock
+    took_ns: Count  #: how long the worker's ``process`` ran
+    number: Count  #: grows by one with each result of a worker
+    payload: Annotated[bytes, msgspec.Meta(max_length=MAX_PAYLOAD)]  #: see :func:`pack`
+    worker: Count = 0  #: number of the application that sent it; written by the proxy, whatever was there
+
+
+class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
+    """Tells a worker which frames are its own: those with ``seq % parts == part``."""
+
+    processor: ProcessorName
+    camera: Name
+    part: Count  #: from 0
+    #: 0: no frame, for it stated that it can take none; 1: every frame
+    parts: Annotated[int, msgspec.Meta(ge=0, le=MAX_PARTS)]
+    workers: Count  #: of this processor and camera, those that can take none included
+
+    def __post_init__(self) -> None:
+        if self.part >= max(1, self.parts):
+            raise ValueError(f"part {self.part} of {self.parts} is none")
+
+
+# The value of a result to bytes and back: one MessagePack value. A NumPy array is extension type 1, whose bytes are a
+# MessagePack array of its type's name, its shape and its elements (little-endian, row by row). A dataclass or
+# `msgspec.Struct` is encoded as a map and decoded as a dict.
+
+ARRAY: Final = 1  #: extension type
+MAX_DIMENSIONS: Final = 8
+MAX_DEPTH: Final = 32  #: of nested lists and maps, so that walking through a value needs a bounded stack
+#: Types of arrays that travel: the same on every machine.
+DTYPES: Final = (
+    "bool",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+    *(f"float{bits}" for bits in (16, 32, 64)),
+)
+_WHAT: Final = (
+    "None, bool, int (of 64 bits), float, str, bytes, list, tuple, dict, dataclass, msgspec.Struct and NumPy arrays of "
+    "numbers can be sent"
+)
+
+
+class _Array(msgspec.Struct, frozen=True, array_like=True):
+    dtype: str
+    shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=MAX_DIMENSIONS)]
+    data: bytes
+
+
+def pack(value: Any) -> bytes:
+    """Encode a value.
+
+    Args:
+        value: None, bool, int (64 bits), float, str, bytes, list, tuple, dict, dataclass, ``msgspec.Struct`` or a NumPy
+            array of :data:`DTYPES`, nested at most :data:`MAX_DEPTH` deep.
+
+    Raises:
+        UsageError: It can't be encoded, or takes more than 32 768 bytes.
+    """
+    try:
+        data = _encoder.encode(value)
+        if len(data) <= MAX_PAYLOAD:
+            _check_depth(_plain_decoder.decode(data))
+    except (TypeError, ValueError, OverflowError, RecursionError, msgspec.MsgspecError) as error:
+        raise UsageError(f"a result can't be sent: {error}; {_WHAT}") from None
+    if len(data) > MAX_PAYLOAD:
+        raise UsageError(
+            f"a result of {len(data)} bytes can't be sent, at most {MAX_PAYLOAD} can: send what was found in an "
+            "image, not the image"
+        )
+    return data
+
+
+def unpack(payload: bytes) -> Any:
+    """Decode a payload; arrays are read-only, tuples come back as lists.
+
+    Raises:
+        DecodeError: It is not a value that :func:`pack` could have encoded.
+    """
+    try:
+        value = _decoder.decode(payload)
+        _check_depth(value)
+    except (msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise DecodeError(f"a result that can't be understood: {error}") from None
+    return value
+
+
+def _check_depth(value: Any) -> None:
+    """Raise ``ValueError`` for lists and maps in one another deeper than :data:`MAX_DEPTH`, without recursion."""
+    level = [value]
+    for _ in range(MAX_DEPTH + 1):
+        inside: list[Any] = []
+        for item in level:
+            if isinstance(item, dict):
+                inside += (*item, *item.values())
+            elif isinstance(item, list | tuple):
+                inside += item
+        if not inside:
+            return
+        level = inside
+    raise ValueError(f"lists and maps in it lie more than {MAX_DEPTH} deep in one another")
+
+
+def _encode_other(value: Any) -> Any:
+    import numpy as np
+
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return msgspec.msgpack.Ext(ARRAY, _pack_array(value))
+    raise TypeError(f"there is a {type(value).__module__}.{type(value).__qualname__} in it")
+
+
+def _pack_array(array: NDArray[Any]) -> bytes:
+    import numpy as np
+
+    if array.dtype.name not in DTYPES or array.ndim > MAX_DIMENSIONS:
+        raise TypeError(
+            f"there is an array of {array.ndim} dimensions of {array.dtype} in it, and arrays have at most "
+            f"{MAX_DIMENSIONS} dimensions of {', '.join(DTYPES)}"
+        )
+    if array.nbytes > MAX_PAYLOAD or not shape_fits(array.shape, array.size, MAX_PAYLOAD):
+        raise ValueError(
+            f"there is an array of {array.nbytes} bytes in it, of shape {array.shape}, and results have at most "
+            f"{MAX_PAYLOAD} bytes, and no axis that is longer"
+        )
+    plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    return msgspec.msgpack.encode(_Array(array.dtype.name, array.shape, plain.tobytes()))
+
+
+def _decode_extension(code: int, data: memoryview) -> Any:
+    import numpy as np
+
+    if code != ARRAY:
+        raise ValueError(f"extension type {code} is not known")
+    packed = _array_decoder.decode(data)
+    if packed.dtype not in DTYPES:
+        raise ValueError(f"an array of {packed.dtype[:40]!r}")
+    dtype = np.dtype(packed.dtype).newbyteorder("<")
+    count, rest = divmod(len(packed.data), dtype.itemsize)
+    if rest or not shape_fits(packed.shape, count, MAX_PAYLOAD):
+        raise ValueError(
+            f"an array of shape {packed.shape!r:.200} and type {packed.dtype} with {len(packed.data)} bytes"
+        )
+    return np.frombuffer(packed.data, dtype).reshape(packed.shape).astype(packed.dtype, copy=False)
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=_encode_other)
+_decoder = msgspec.msgpack.Decoder(ext_hook=_decode_extension)
+_plain_decoder = msgspec.msgpack.Decoder()  # arrays of numbers stay bytes
+_array_decoder = msgspec.msgpack.Decoder(_Array)
