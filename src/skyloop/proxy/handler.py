@@ -82,7 +82,6 @@ from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.returning import ReturnSupervisor
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import COMMANDS, TransportServer
-from skyloop.zones import Space
 
 _LAND: Final = Land()
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
@@ -165,17 +164,20 @@ class CommandHandler:
         self.authority.last_command_ns = now_ns
 
     def configure(self, settings: FlightSettings) -> None:
-        """Let new values of the parameters take effect."""
+        """Let new values of the parameters take effect; what is the same object as before did not change."""
         with self._lock:
-            self._report_thin_zones(settings.airspace.space)
-            self.checks.airspace.settings = settings.airspace
+            airspace, space = self.checks.airspace, settings.airspace.space
+            if space is not airspace.settings.space:
+                if space.thin and space != airspace.settings.space:
+                    self._events.publish_draft(thin_zones_event(space))
+                self._executor.guarded = space.walled
+            airspace.settings = settings.airspace
             self.checks.returns = settings.returns
             self.checks.max_age_ns = settings.max_age_ns
             self.authority.timeout_ns = settings.authority_timeout_ns
             self.authority.ask_ns = settings.authority_ask_ns
             self.ladder.settings = settings.failsafe
             self.warm_s = settings.warm_s
-            self._executor.guarded = settings.airspace.space.walled
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
 
@@ -493,10 +495,6 @@ class CommandHandler:
         episodes, name = (self._episodes, "the proxy") if session is None else (session.episodes, session.name)
         for clamp in episodes.begun(clamps, now_ns):
             self._events.publish_draft(clamped_event(name, clamp))
-
-    def _report_thin_zones(self, space: Space) -> None:
-        if space.thin and space != self.checks.airspace.settings.space:
-            self._events.publish_draft(thin_zones_event(space))
 
     def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
         """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
