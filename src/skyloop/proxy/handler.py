@@ -75,7 +75,7 @@ from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import BELIEF_NS, Whose
 from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
 from skyloop.proxy.core.limits import Clamp, Episodes
-from skyloop.proxy.events import Counters, EventPublisher
+from skyloop.proxy.event_publisher import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.parameters import FlightSettings
 from skyloop.proxy.publisher import VehiclePublisher

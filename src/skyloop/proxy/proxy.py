@@ -60,7 +60,7 @@ from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
 from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.flight import Flight
-from skyloop.proxy.events import Counters, EventPublisher
+from skyloop.proxy.event_publisher import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.handler import CommandHandler

@@ -28,7 +28,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.proxy.core.events import EventDraft
-from skyloop.proxy.events import Counters, EventPublisher
+from skyloop.proxy.event_publisher import Counters, EventPublisher
 from skyloop.proxy.publisher import camera_problem
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import RESULTS, TransportServer, results
