@@ -11,7 +11,7 @@ from typing import Final
 from skyloop.clock import NS_PER_S, Clock
 from skyloop.errors import shortened
 from skyloop.messages import Event, EventKind, Severity, Value, encode
-from skyloop.proxy.core.events import EventDraft, RepeatedEvents
+from skyloop.proxy.events import EventDraft, RepeatedEvents
 from skyloop.transport.base import EVENTS
 
 #: Command delays that the distribution is taken over: about a minute of one pilot at 32 Hz.

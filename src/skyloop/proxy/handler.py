@@ -52,7 +52,7 @@ from skyloop.messages.numbers import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.command_checks import CommandChecks
-from skyloop.proxy.core.events import (
+from skyloop.proxy.events import (
     UNHEARD,
     EventContext,
     EventDraft,

@@ -58,7 +58,7 @@ from skyloop.messages import (
 from skyloop.messages.overview import MAX_ADDRESS, MAX_EVENT_TEXT
 from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
-from skyloop.proxy.core.events import EventDraft
+from skyloop.proxy.events import EventDraft
 from skyloop.proxy.core.flight import Flight
 from skyloop.proxy.event_publisher import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor

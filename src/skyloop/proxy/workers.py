@@ -27,7 +27,7 @@ from skyloop.messages import (
     Value,
     encode,
 )
-from skyloop.proxy.core.events import EventDraft
+from skyloop.proxy.events import EventDraft
 from skyloop.proxy.event_publisher import Counters, EventPublisher
 from skyloop.proxy.publisher import camera_problem
 from skyloop.proxy.sessions import Session
