@@ -1,27 +1,144 @@
-"""Events before they are numbered and published: kinds, texts for people, data, and how often one is repeated. Pure.
+"""What the proxy reports about itself: numbered events for all clients, and counters on request.
 
-Those of commands, failsafe and ownership come first, then those of the authority.
+The publisher comes first, then what it publishes: drafts, which are pure and made by the functions at the end; those of
+commands, failsafe and ownership before those of the authority.
 """
 
 from __future__ import annotations
 
+import logging
+import threading
+from collections import defaultdict, deque
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from skyloop.clock import NS_PER_S, seconds
-from skyloop.messages import Command, EventKind, Failsafe, Refusal, Severity, Value
+from skyloop.clock import NS_PER_S, Clock, seconds
+from skyloop.errors import shortened
+from skyloop.messages import Command, Event, EventKind, Failsafe, Refusal, Severity, Value, encode
 from skyloop.proxy.core import authority
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
 from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
 from skyloop.proxy.core.limits import Clamp
+from skyloop.transport.base import EVENTS
 from skyloop.zones import THINNEST_M, ZONES, Space
 
+#: Command delays that the distribution is taken over: about a minute of one pilot at 32 Hz.
+WINDOW: Final = 2000
+MAX_TEXT: Final = 1000  #: characters of an event's text
 REPEAT_NS: Final = NS_PER_S  #: how often an event that goes on is published again
+#: A limit not touched for so long begins a new episode when it is touched again.
+EPISODE_NS: Final = NS_PER_S
 #: Why a landing is given up.
 UNHEARD: Final = f"the vehicle was not heard for {seconds(BELIEF_NS):g} s, and may be on another flight by now"
 _ENFORCED: Final = "enforced: its position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
+
+_log = logging.getLogger(__name__)
+
+
+class Counters:
+    """Counts and the recent command delays. Each name is counted under one lock only, or by one thread."""
+
+    def __init__(self) -> None:
+        self.counts: defaultdict[str, int] = defaultdict(int)
+        self.delays_ns: deque[int] = deque(maxlen=WINDOW)  #: sent to applied, of accepted commands
+
+    def snapshot(self, **now: float) -> dict[str, float]:
+        """All counters, the distribution of the command delay [s], and what the caller adds."""
+        values: dict[str, float] = {name: float(count) for name, count in self.counts.copy().items()}
+        values.update(now)
+        delays = sorted(self.delays_ns.copy())
+        if delays:
+            values["commands.delay.median_s"] = delays[len(delays) // 2] / NS_PER_S
+            values["commands.delay.p99_s"] = delays[int(0.99 * (len(delays) - 1))] / NS_PER_S
+            values["commands.delay.max_s"] = delays[-1] / NS_PER_S
+            values["commands.delay.mean_s"] = sum(delays) / len(delays) / NS_PER_S
+            values["commands.delay.count"] = float(len(delays))
+        return dict(sorted(values.items()))
+
+
+class EventPublisher:
+    """Numbers and publishes the events of one run. Any thread; never raises."""
+
+    def __init__(
+        self,
+        publish: Callable[[str, bytes], int],
+        clock: Clock,
+        counters: Counters,
+        scrub: Callable[[str], str] = str,
+    ) -> None:
+        """Initialise; ``scrub`` takes what must not be told out of a text."""
+        self._scrub = scrub
+        self._publish = publish
+        self._clock = clock
+        self._counts = counters.counts
+        self._lock = threading.Lock()  # keeps the order of publishing that of the numbers
+        self._seq = 0
+        self._repeats = RepeatedEvents()
+        self._missed = 0
+        self.listener: Callable[[Event], None] | None = None  #: called with each event; must be quick and never raise
+        self.last: Event | None = None  #: the newest that is not about the coming and going of an application
+
+    def publish(
+        self,
+        kind: EventKind,
+        text: str,
+        severity: Severity = Severity.INFO,
+        *,
+        app: str | None = None,
+        data: dict[str, Value] | None = None,
+    ) -> None:
+        """Publish one event now."""
+        self.publish_drafts(EventDraft(kind, text, severity, app, data or {}))
+
+    def publish_drafts(self, *drafts: EventDraft) -> None:
+        """Publish these events now, in this order."""
+        for draft in drafts:
+            with self._lock:
+                self._number(draft, draft.text)
+
+    def publish_repeated(self, key: Hashable, make: Callable[[], EventDraft]) -> None:
+        """Publish an event that may come many times a second; ``make`` is called only when it is published."""
+        with self._lock:
+            if self._repeats.first(key, make):
+                draft = make()
+                self._repeats.begin(key, make, self._clock())
+                self._number(draft, draft.text, count=1)
+
+    def tick(self, now_ns: int) -> None:
+        """Publish sums of repeated events, and of those that could not be handed over. Call some times a second."""
+        with self._lock:
+            for draft, count in self._repeats.due(now_ns):
+                text = f"{draft.text} (and {count} more like it within the last second)"
+                self._number(draft, text, count=count)
+            if self._missed:
+                missed, self._missed = self._missed, 0
+                text = f"{missed} events could not be handed over to applications that are too slow"
+                self._number(EventDraft(EventKind.SAMPLES_LOST, text), text, count=missed)
+                self._missed = 0  # that this one was not handed over either needs no event
+
+    def _number(self, draft: EventDraft, text: str, **count: int) -> None:
+        self._seq += 1
+        kind, severity, app = draft.kind, draft.severity, draft.app
+        data = {name: self._scrub(value) if isinstance(value, str) else value for name, value in draft.data.items()}
+        text = shortened(self._scrub(text), MAX_TEXT)
+        event = Event(kind, text, self._clock(), severity, self._seq, app, {**data, **count})
+        try:
+            packet = encode(event)
+        except (ValueError, TypeError, OverflowError) as error:  # a driver's data may be anything
+            _log.error("event %s had particulars that cannot be sent: %s", kind, error)
+            packet = encode(Event(kind, text, event.at_ns, severity, self._seq, app))
+        if self.listener is not None:
+            self.listener(event)
+        if kind is not EventKind.APPLICATION_LINK:
+            self.last = event
+        missed = self._publish(EVENTS, packet)
+        self._counts["events.published"] += 1
+        self._counts[f"events.of.{kind.value}"] += 1
+        if missed:
+            self._missed += missed
+            self._counts["events.missed"] += missed
 
 
 @dataclass(slots=True)
@@ -72,6 +189,21 @@ class RepeatedEvents:
             else:
                 del self._published[key], self._counts[key]
         return due
+
+
+class Episodes:
+    """Which limits are touched now, so that each is published once and not with every repeat of a set-point."""
+
+    def __init__(self) -> None:
+        self._touched_ns: dict[tuple[str, str], int] = {}
+
+    def begun(self, clamps: tuple[Clamp, ...], now_ns: int) -> list[Clamp]:
+        """Return those of the clamps that begin an episode."""
+        touched, since_ns = self._touched_ns, now_ns - EPISODE_NS
+        new = [clamp for clamp in clamps if touched.get((clamp.limit, clamp.zone), since_ns) <= since_ns]
+        for clamp in clamps:
+            touched[clamp.limit, clamp.zone] = now_ns
+        return new
 
 
 def refused_event(name: str, command: Command, reason: Refusal, why: str) -> EventDraft:

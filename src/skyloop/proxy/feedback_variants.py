@@ -11,7 +11,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import Feedback, FeedbackRequest, encode
 from skyloop.messages.feedback_request import TOPIC
 from skyloop.messages.rate import RateLimiter
-from skyloop.proxy.event_publisher import Counters
+from skyloop.proxy.events import Counters
 from skyloop.proxy.forms import Forms
 from skyloop.transport.base import TransportServer
 

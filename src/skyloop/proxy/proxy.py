@@ -58,9 +58,8 @@ from skyloop.messages import (
 from skyloop.messages.overview import MAX_ADDRESS, MAX_EVENT_TEXT
 from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
-from skyloop.proxy.events import EventDraft
 from skyloop.proxy.core.flight import Flight
-from skyloop.proxy.event_publisher import Counters, EventPublisher
+from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.handler import CommandHandler
@@ -418,7 +417,7 @@ class Proxy:
             data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": reason, "app_id": session.app_id}
             news.append(EventDraft(EventKind.APPLICATION_LINK, text, app=session.name, data=data))
         if self._stopping.is_set():  # everybody leaves, and the driver may be closed already
-            self.events.publish_all(news)
+            self.events.publish_drafts(*news)
         else:
             self.handler.application_left(session, self.clock(), news)
         self.workers.application_left(session)

@@ -39,9 +39,8 @@ from skyloop.messages import (
 from skyloop.messages.encoded import H264, MAX_ENCODED
 from skyloop.messages.feedback import MAX_LINK_TEXT
 from skyloop.messages.result import PROCESSOR_NAME
-from skyloop.proxy.events import EventDraft
 from skyloop.proxy.core.intents import NO_INTENT, Intent
-from skyloop.proxy.event_publisher import Counters, EventPublisher
+from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.feedback_variants import PREFIX, FeedbackVariants
 from skyloop.proxy.streams import Streams
 from skyloop.transport.base import (

@@ -7,8 +7,7 @@ from typing import Final
 from skyloop.drivers.base import Driver, ExternalPose
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import Annotation, EventKind, Refusal, Role, VehiclePose
-from skyloop.proxy.events import EventDraft
-from skyloop.proxy.event_publisher import Counters, EventPublisher
+from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.publisher import VehiclePublisher, camera_problem
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import ANNOTATIONS, LOGS, TransportServer

@@ -37,7 +37,7 @@ from skyloop.messages import (
     Value,
     encode,
 )
-from skyloop.proxy.event_publisher import Counters, EventPublisher
+from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.handler import CommandHandler
 from skyloop.proxy.parameters import Parameters
 from skyloop.proxy.publisher import VehiclePublisher

@@ -26,7 +26,7 @@ from skyloop.messages.image_header import why_not_decoded
 from skyloop.messages.rate import RateLimiter
 from skyloop.messages.video import MAX_KBIT_S
 from skyloop.proxy.core.stream_rate import StreamRate, picture_form
-from skyloop.proxy.event_publisher import Counters
+from skyloop.proxy.events import Counters
 from skyloop.proxy.forms import Forms
 from skyloop.pyav import H264Encoder, require_pyav
 from skyloop.transport.base import TransportServer

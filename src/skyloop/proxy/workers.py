@@ -27,8 +27,7 @@ from skyloop.messages import (
     Value,
     encode,
 )
-from skyloop.proxy.events import EventDraft
-from skyloop.proxy.event_publisher import Counters, EventPublisher
+from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.publisher import camera_problem
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import RESULTS, TransportServer, results
