@@ -41,7 +41,7 @@ from skyloop.messages.feedback import MAX_LINK_TEXT
 from skyloop.messages.result import PROCESSOR_NAME
 from skyloop.proxy.core.intents import NO_INTENT, Intent
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
-from skyloop.proxy.feedback_variants import PREFIX, FeedbackVariants
+from skyloop.proxy.topics import PREFIX, FeedbackVariants
 from skyloop.proxy.streams import Streams
 from skyloop.transport.base import (
     ANNOTATIONS,
