@@ -63,12 +63,12 @@ from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.handler import CommandHandler
-from skyloop.proxy.overview import OverviewPublisher
 from skyloop.proxy.parameters import Parameters, described
 from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.relay import Relay
 from skyloop.proxy.requests import JobQueue, ParameterRequests, RequestDispatcher
 from skyloop.proxy.sessions import HELLO_NS, MAX_MALFORMED, Session
+from skyloop.proxy.topics import OverviewPublisher
 from skyloop.proxy.workers import ProcessorWorkers
 from skyloop.transport.base import Peer, TransportServer
 

@@ -8,8 +8,9 @@ from skyloop.drivers.base import Driver, ExternalPose
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import Annotation, EventKind, Refusal, Role, VehiclePose
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
-from skyloop.proxy.publisher import VehiclePublisher, camera_problem
+from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.sessions import Session
+from skyloop.proxy.topics import camera_problem
 from skyloop.transport.base import ANNOTATIONS, LOGS, TransportServer
 
 MAX_ANNOTATION: Final = 32_768  #: bytes of an annotation's packet

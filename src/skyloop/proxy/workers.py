@@ -28,8 +28,8 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
-from skyloop.proxy.publisher import camera_problem
 from skyloop.proxy.sessions import Session
+from skyloop.proxy.topics import camera_problem
 from skyloop.transport.base import RESULTS, TransportServer, results
 
 #: A worker that sent nothing for this long loses its share: it hangs, or its host does.
