@@ -1,6 +1,7 @@
-"""Workers of processors: which applications they are, which frames each takes, and what they find.
+"""What applications send to others: annotations, logs and results to subscribers, poses to the driver.
 
-:class:`WorkerRoster` decides, and is pure; :class:`ProcessorWorkers` sends each worker its share and relays results.
+Results come from workers of processors: :class:`WorkerRoster` decides which frames each takes, and is pure;
+:class:`ProcessorWorkers` sends each its share and relays what it finds.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from typing import Final
 import msgspec
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.base import Driver, ExternalPose
+from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import (
+    Annotation,
     AnyReply,
     Done,
     EventKind,
@@ -23,15 +27,19 @@ from skyloop.messages import (
     ProcessorShare,
     Refusal,
     Refused,
+    Role,
     Severity,
     Value,
+    VehiclePose,
     encode,
 )
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
+from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.sessions import Session
 from skyloop.proxy.topics import camera_problem
-from skyloop.transport.base import RESULTS, TransportServer, results
+from skyloop.transport.base import ANNOTATIONS, LOGS, RESULTS, TransportServer, results
 
+MAX_ANNOTATION: Final = 32_768  #: bytes of an annotation's packet
 #: A worker that sent nothing for this long loses its share: it hangs, or its host does.
 SILENT_S: Final = 1.0
 #: How far in the future a result's frame may lie, by the error of its camera's clock.
@@ -41,78 +49,74 @@ MAX_JOINED: Final = 8  #: processors that one application may work for
 _Key = tuple[int, str]  # application, processor
 
 
-@dataclass(slots=True)
-class Worker:
-    """One application as a worker of one processor."""
+class Relay:
+    """Passes on annotations, log entries and poses, on the receiving thread. The authority is not needed."""
 
-    asked: JoinProcessor
-    received_ns: int
-    silent: bool = False
+    def __init__(
+        self,
+        driver: Driver,
+        server: TransportServer,
+        publisher: VehiclePublisher,
+        events: EventPublisher,
+        counters: Counters,
+    ) -> None:
+        self._driver = driver
+        self._server = server
+        self._cameras = publisher.cameras
+        self._events = events
+        self._counts = counters.counts
 
-    @property
-    def works(self) -> bool:
-        return self.asked.ready and not self.silent
+    def annotation(self, session: Session, annotation: Annotation, packet: bytes) -> str:
+        """Pass an annotation on to its subscribers; returns why it is malformed, empty if it is not."""
+        unknown = camera_problem(annotation.camera, self._cameras)
+        if unknown:
+            return f"an annotation of no known frame: {unknown}"
+        if len(packet) > MAX_ANNOTATION:
+            return f"an annotation has {len(packet)} bytes, at most {MAX_ANNOTATION} are relayed"
+        return self._publish(session, ANNOTATIONS, packet)
 
+    def log(self, session: Session, packet: bytes) -> str:
+        """Pass a log entry on to its subscribers; returns why it is malformed, empty if it is not."""
+        return self._publish(session, LOGS, packet)
 
-class WorkerRoster:
-    """The workers of all processors, by application and name of the processor."""
+    def _publish(self, session: Session, topic: str, packet: bytes) -> str:
+        if session.role is None:
+            return f"a packet for {topic} came before Hello"
+        self._counts[f"{topic}.relayed"] += 1
+        self._server.publish(topic, packet)
+        return ""
 
-    def __init__(self) -> None:
-        self._workers: dict[_Key, Worker] = {}
+    def pose(self, session: Session, pose: VehiclePose) -> None:
+        """Pass a pose of the vehicle on to its driver. Refusals are published once a second at most."""
+        if session.role is not Role.PILOT:
+            self._refuse_pose(session, Refusal.OBSERVER, "observers can't send poses: connect as a pilot")
+            return
+        try:
+            self._driver.external_pose(
+                ExternalPose(
+                    pose.position_m, pose.quaternion, pose.captured_ns, pose.position_std_m, pose.attitude_std_rad
+                )
+            )
+        except UsageError as error:
+            self._refuse_pose(session, Refusal.NON_FINITE, str(error))
+        except UnsupportedError as error:
+            self._refuse_pose(session, Refusal.UNSUPPORTED, str(error))
+        except Exception as error:  # noqa: BLE001  the driver's code may raise anything
+            self._refuse_pose(session, Refusal.DRIVER_FAILED, f"the driver failed: {error}")
+        else:
+            self._counts["poses.told"] += 1
 
-    def find(self, app_id: int, processor: str) -> Worker | None:
-        """This application as a worker of that processor, if it is one."""
-        return self._workers.get((app_id, processor))
-
-    def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
-        """Make it a worker, or keep it as one."""
-        self._workers[app_id, asked.processor] = Worker(asked, now_ns)
-
-    def remove(self, app_id: int) -> list[JoinProcessor]:
-        """Remove an application; returns what it worked for."""
-        keys = [key for key in self._workers if key[0] == app_id]
-        return [self._workers.pop(key).asked for key in keys]
-
-    def joined(self, app_id: int) -> int:
-        """Return for how many processors it works."""
-        return sum(app == app_id for app, _ in self._workers)
-
-    def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:
-        """Return another worker of that name that does not go together with this one."""
-        for (app, name), worker in self._workers.items():
-            other = worker.asked
-            alike = (other.code, other.shared) == (asked.code, asked.shared)
-            if name == asked.processor and app != app_id and not alike:
-                return app, other
-        return None
-
-    def mark_silent(self, now_ns: int) -> list[tuple[int, JoinProcessor]]:
-        """Mark and return those that were silent for too long and were not marked before."""
-        found = []
-        for (app_id, _), worker in self._workers.items():
-            if not worker.silent and now_ns - worker.received_ns > nanoseconds(SILENT_S):
-                worker.silent = True
-                found.append((app_id, worker.asked))
-        return found
-
-    def shares(self) -> dict[_Key, ProcessorShare]:
-        """Return which frames each worker is to take."""
-        groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
-        for (app_id, name), worker in self._workers.items():
-            groups[name, worker.asked.camera].append(app_id)
-        found = {}
-        for (name, camera), members in groups.items():
-            working = sorted(app_id for app_id in members if self._workers[app_id, name].works)
-            for app_id in members:
-                part, parts = _part(app_id, working, shared=self._workers[app_id, name].asked.shared)
-                found[app_id, name] = ProcessorShare(name, camera, part, parts, len(members))
-        return found
-
-
-def _part(app_id: int, working: list[int], *, shared: bool) -> tuple[int, int]:
-    if app_id not in working:
-        return 0, 0
-    return (working.index(app_id), len(working)) if shared else (0, 1)
+    def _refuse_pose(self, session: Session, reason: Refusal, why: str) -> None:
+        self._counts["poses.refused"] += 1
+        self._events.publish_repeated(
+            (session.app_id, "pose", reason),
+            lambda: EventDraft(
+                EventKind.COMMAND_REFUSED,
+                f"{session.name}: a pose refused: {why}",
+                app=session.name,
+                data={"reason": reason.value, "app_id": session.app_id},
+            ),
+        )
 
 
 class ProcessorWorkers:
@@ -241,3 +245,77 @@ class ProcessorWorkers:
         severity = Severity.INFO if state in ("joined", "back") else Severity.WARNING
         data: dict[str, Value] = {"processor": asked.processor, "state": state, "app_id": session.app_id}
         self._events.publish(EventKind.PROCESSOR, f"{session.name} {text}", severity, app=session.name, data=data)
+
+
+@dataclass(slots=True)
+class Worker:
+    """One application as a worker of one processor."""
+
+    asked: JoinProcessor
+    received_ns: int
+    silent: bool = False
+
+    @property
+    def works(self) -> bool:
+        return self.asked.ready and not self.silent
+
+
+class WorkerRoster:
+    """The workers of all processors, by application and name of the processor."""
+
+    def __init__(self) -> None:
+        self._workers: dict[_Key, Worker] = {}
+
+    def find(self, app_id: int, processor: str) -> Worker | None:
+        """This application as a worker of that processor, if it is one."""
+        return self._workers.get((app_id, processor))
+
+    def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
+        """Make it a worker, or keep it as one."""
+        self._workers[app_id, asked.processor] = Worker(asked, now_ns)
+
+    def remove(self, app_id: int) -> list[JoinProcessor]:
+        """Remove an application; returns what it worked for."""
+        keys = [key for key in self._workers if key[0] == app_id]
+        return [self._workers.pop(key).asked for key in keys]
+
+    def joined(self, app_id: int) -> int:
+        """Return for how many processors it works."""
+        return sum(app == app_id for app, _ in self._workers)
+
+    def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:
+        """Return another worker of that name that does not go together with this one."""
+        for (app, name), worker in self._workers.items():
+            other = worker.asked
+            alike = (other.code, other.shared) == (asked.code, asked.shared)
+            if name == asked.processor and app != app_id and not alike:
+                return app, other
+        return None
+
+    def mark_silent(self, now_ns: int) -> list[tuple[int, JoinProcessor]]:
+        """Mark and return those that were silent for too long and were not marked before."""
+        found = []
+        for (app_id, _), worker in self._workers.items():
+            if not worker.silent and now_ns - worker.received_ns > nanoseconds(SILENT_S):
+                worker.silent = True
+                found.append((app_id, worker.asked))
+        return found
+
+    def shares(self) -> dict[_Key, ProcessorShare]:
+        """Return which frames each worker is to take."""
+        groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
+        for (app_id, name), worker in self._workers.items():
+            groups[name, worker.asked.camera].append(app_id)
+        found = {}
+        for (name, camera), members in groups.items():
+            working = sorted(app_id for app_id in members if self._workers[app_id, name].works)
+            for app_id in members:
+                part, parts = _part(app_id, working, shared=self._workers[app_id, name].asked.shared)
+                found[app_id, name] = ProcessorShare(name, camera, part, parts, len(members))
+        return found
+
+
+def _part(app_id: int, working: list[int], *, shared: bool) -> tuple[int, int]:
+    if app_id not in working:
+        return 0, 0
+    return (working.index(app_id), len(working)) if shared else (0, 1)
