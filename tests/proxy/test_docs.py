@@ -6,8 +6,7 @@ from pathlib import Path
 
 from skyloop.messages import Fate, FlightState, Refusal
 from skyloop.messages.intent import ENDINGS
-from skyloop.proxy import publisher, requests, serve, sessions
-from skyloop.proxy import workers as relay
+from skyloop.proxy import publisher, relay, requests, serve, sessions
 from skyloop.proxy.core import command_checks, failsafe, intents
 from skyloop.proxy.parameters import MAX_PARAMETER, OWN
 

@@ -65,10 +65,10 @@ from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.handler import CommandHandler
 from skyloop.proxy.parameters import Parameters, described
 from skyloop.proxy.publisher import VehiclePublisher
+from skyloop.proxy.relay import ProcessorWorkers, Relay
 from skyloop.proxy.requests import JobQueue, ParameterRequests, RequestDispatcher
 from skyloop.proxy.sessions import HELLO_NS, MAX_MALFORMED, Session
 from skyloop.proxy.topics import OverviewPublisher
-from skyloop.proxy.workers import ProcessorWorkers, Relay
 from skyloop.transport.base import Peer, TransportServer
 
 MAX_NAME: Final = 64  #: characters of a proxy's name
