@@ -13,7 +13,7 @@ from skyloop.clock import monotonic_ns
 from skyloop.errors import NoAnswerError
 from skyloop.messages import FlightState
 from skyloop.proxy import Proxy
-from skyloop.proxy.overview import OverviewRegistry
+from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.local import LocalServer
 from tests.proxy.fake import FakeDriver
 

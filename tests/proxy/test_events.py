@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import EventKind
-from skyloop.proxy.core.events import EventDraft, RepeatedEvents
+from skyloop.proxy.events import EventDraft, RepeatedEvents
 
 S = NS_PER_S
 DRAFT = EventDraft(EventKind.COMMAND_REFUSED, "no")

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pytest
 
 from skyloop.messages import EventKind, Feedback, Role, encode
-from skyloop.proxy import feedback_variants
-from skyloop.proxy.feedback_variants import MAX_VARIANTS
+from skyloop.proxy import topics
+from skyloop.proxy.topics import MAX_VARIANTS
 from skyloop.transport.base import FEEDBACK
 from tests.proxy.fake import App, Bench
 
@@ -80,7 +80,7 @@ def test_a_form_is_encoded_once_however_many_have_it(bench: Bench, monkeypatch: 
         encoded.append(sample)
         return encode(sample)
 
-    monkeypatch.setattr(feedback_variants, "encode", counted)
+    monkeypatch.setattr(topics, "encode", counted)
     fly(bench, 1.0)
     for app in apps:
         app.sync()

@@ -20,7 +20,7 @@ from skyloop.messages import (
     decode,
 )
 from skyloop.messages.feedback import OverviewPages
-from skyloop.proxy.overview import OverviewRegistry
+from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import OVERVIEW
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.memory import MemoryServer

@@ -173,3 +173,57 @@ def test_a_parameter_too_large_to_send_is_left_out() -> None:
     assert store.get("a.small").value == 1
     with pytest.raises(UnknownNameError):
         store.get("a.huge")
+
+
+NUMBERS = [parameter for parameter in OWN if parameter.type is T.FLOAT]
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(NUMBERS), st.floats(0.0, 1.0), st.sampled_from(["pilot", "vehicle", "gone"])),
+        max_size=12,
+    )
+)
+def test_settings_changed_one_by_one_are_those_of_a_store_that_had_all_values_at_once(
+    steps: list[tuple[Parameter, float, str]],
+) -> None:
+    native: dict[str, Parameter] = {}
+    store = Parameters(lambda: native.values(), lambda _, value: value)
+    own = {parameter.name: parameter.value for parameter in OWN}
+    for parameter, share, who in steps:
+        assert parameter.minimum is not None
+        assert parameter.maximum is not None
+        name, value = parameter.name, parameter.minimum + share * (parameter.maximum - parameter.minimum)
+        if who == "pilot":
+            try:
+                store.set(name, value)
+            except ParameterError:  # a wall of the box beyond the opposite one
+                continue
+            if name in native:
+                native[name] = P(name, T.FLOAT, value)
+            else:
+                own[name] = value
+        else:
+            native.pop(name, None)
+            if who == "vehicle":
+                native[name] = P(name, T.FLOAT, value)
+            store.refresh()
+        store.flight_settings()
+    fresh = Parameters(lambda: [*(P(name, T.FLOAT, own[name]) for name in own if name not in native), *native.values()])
+    fresh.refresh()
+    assert store.flight_settings() == fresh.flight_settings()
+
+
+def test_settings_that_a_parameter_does_not_concern_are_not_made_anew() -> None:
+    store = Parameters()
+    before = store.flight_settings()
+    store.set("alarms.video_age_s", 2.0)
+    store.set("limits.speed", before.airspace.limits.speed)
+    store.refresh()
+    assert store.flight_settings() is before
+    store.set("limits.speed", 0.5)
+    after = store.flight_settings()
+    assert after.airspace.limits.speed == 0.5
+    assert after.airspace.space is before.airspace.space
+    assert after.failsafe is before.failsafe
+    assert after.returns is before.returns

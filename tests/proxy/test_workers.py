@@ -23,7 +23,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.relayed import pack
-from skyloop.proxy.workers import MAX_JOINED, SILENT_S, WorkerRoster
+from skyloop.proxy.relay import MAX_JOINED, SILENT_S, WorkerRoster
 from skyloop.transport.base import RESULTS, results
 from tests.proxy.fake import App, Bench
 

@@ -24,8 +24,8 @@ from skyloop.messages import (
 )
 from skyloop.messages.relayed import pack
 from skyloop.network.frames import MAX_FORMS, MAX_FORMS_EACH, FramePublisher
-from skyloop.proxy.publisher import PLAIN, topic_problem
 from skyloop.proxy.sessions import MAX_MALFORMED
+from skyloop.proxy.topics import PLAIN, topic_problem
 from skyloop.transport.base import ANNOTATIONS, MAX_SUBSCRIPTIONS, RESULTS
 from skyloop.transport.testing import header, picture, wait_until
 from tests.proxy.fake import WAIT_S, App, Bench

@@ -25,8 +25,8 @@ from skyloop.host.watchdog import HANG_LOOKS, LOOK_S, STALL_LOOKS, SharedLoop, W
 from skyloop.host.workers import RequestWorkers
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
-from skyloop.proxy.overview import OverviewRegistry
 from skyloop.proxy.serve import at_once
+from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
 

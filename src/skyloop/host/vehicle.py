@@ -22,9 +22,9 @@ from skyloop.host.fleet import VehicleSettings
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
 from skyloop.proxy.flight_record import FlightRecord, record_path
-from skyloop.proxy.overview import OverviewRegistry
 from skyloop.proxy.requests import JobQueue
 from skyloop.proxy.serve import keep_trail
+from skyloop.proxy.topics import OverviewRegistry
 from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local.reactor import Reactor

@@ -1,22 +1,38 @@
-"""What the proxy reports about itself: numbered events for all clients, and counters on request."""
+"""What the proxy reports about itself: numbered events for all clients, and counters on request.
+
+The publisher comes first, then what it publishes: drafts, which are pure and made by the functions at the end; those of
+commands, failsafe and ownership before those of the authority.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Iterable
-from typing import Final
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from typing import Any, Final
 
-from skyloop.clock import NS_PER_S, Clock
+from skyloop.clock import NS_PER_S, Clock, seconds
 from skyloop.errors import shortened
-from skyloop.messages import Event, EventKind, Severity, Value, encode
-from skyloop.proxy.core.events import EventDraft, RepeatedEvents
+from skyloop.messages import Command, Event, EventKind, Failsafe, Refusal, Severity, Value, encode
+from skyloop.proxy.core import authority
+from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
+from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
+from skyloop.proxy.core.limits import Clamp
 from skyloop.transport.base import EVENTS
+from skyloop.zones import THINNEST_M, ZONES, Space
 
 #: Command delays that the distribution is taken over: about a minute of one pilot at 32 Hz.
 WINDOW: Final = 2000
 MAX_TEXT: Final = 1000  #: characters of an event's text
+REPEAT_NS: Final = NS_PER_S  #: how often an event that goes on is published again
+#: A limit not touched for so long begins a new episode when it is touched again.
+EPISODE_NS: Final = NS_PER_S
+#: Why a landing is given up.
+UNHEARD: Final = f"the vehicle was not heard for {seconds(BELIEF_NS):g} s, and may be on another flight by now"
+_ENFORCED: Final = "enforced: its position is known again"
+_NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
 
 _log = logging.getLogger(__name__)
 
@@ -74,18 +90,13 @@ class EventPublisher:
         data: dict[str, Value] | None = None,
     ) -> None:
         """Publish one event now."""
-        with self._lock:
-            self._number(kind, text, severity, app, data or {})
+        self.publish_drafts(EventDraft(kind, text, severity, app, data or {}))
 
-    def publish_draft(self, draft: EventDraft) -> None:
-        """Publish one event now."""
-        with self._lock:
-            self._number(draft.kind, draft.text, draft.severity, draft.app, draft.data)
-
-    def publish_all(self, drafts: Iterable[EventDraft]) -> None:
+    def publish_drafts(self, *drafts: EventDraft) -> None:
         """Publish these events now, in this order."""
         for draft in drafts:
-            self.publish_draft(draft)
+            with self._lock:
+                self._number(draft, draft.text)
 
     def publish_repeated(self, key: Hashable, make: Callable[[], EventDraft]) -> None:
         """Publish an event that may come many times a second; ``make`` is called only when it is published."""
@@ -93,29 +104,31 @@ class EventPublisher:
             if self._repeats.first(key, make):
                 draft = make()
                 self._repeats.begin(key, make, self._clock())
-                self._number(draft.kind, draft.text, draft.severity, draft.app, {**draft.data, "count": 1})
+                self._number(draft, draft.text, count=1)
 
     def tick(self, now_ns: int) -> None:
         """Publish sums of repeated events, and of those that could not be handed over. Call some times a second."""
         with self._lock:
             for draft, count in self._repeats.due(now_ns):
                 text = f"{draft.text} (and {count} more like it within the last second)"
-                self._number(draft.kind, text, draft.severity, draft.app, {**draft.data, "count": count})
+                self._number(draft, text, count=count)
             if self._missed:
                 missed, self._missed = self._missed, 0
                 text = f"{missed} events could not be handed over to applications that are too slow"
-                self._number(EventKind.SAMPLES_LOST, text, Severity.WARNING, None, {"count": missed})
+                self._number(EventDraft(EventKind.SAMPLES_LOST, text), text, count=missed)
                 self._missed = 0  # that this one was not handed over either needs no event
 
-    def _number(self, kind: EventKind, text: str, severity: Severity, app: str | None, data: dict[str, Value]) -> None:
+    def _number(self, draft: EventDraft, text: str, **count: int) -> None:
         self._seq += 1
-        data = {name: self._scrub(value) if isinstance(value, str) else value for name, value in data.items()}
-        event = Event(kind, shortened(self._scrub(text), MAX_TEXT), self._clock(), severity, self._seq, app, data)
+        kind, severity, app = draft.kind, draft.severity, draft.app
+        data = {name: self._scrub(value) if isinstance(value, str) else value for name, value in draft.data.items()}
+        text = shortened(self._scrub(text), MAX_TEXT)
+        event = Event(kind, text, self._clock(), severity, self._seq, app, {**data, **count})
         try:
             packet = encode(event)
         except (ValueError, TypeError, OverflowError) as error:  # a driver's data may be anything
             _log.error("event %s had particulars that cannot be sent: %s", kind, error)
-            packet = encode(Event(kind, event.text, event.at_ns, severity, self._seq, app))
+            packet = encode(Event(kind, text, event.at_ns, severity, self._seq, app))
         if self.listener is not None:
             self.listener(event)
         if kind is not EventKind.APPLICATION_LINK:
@@ -126,3 +139,258 @@ class EventPublisher:
         if missed:
             self._missed += missed
             self._counts["events.missed"] += missed
+
+
+@dataclass(slots=True)
+class EventDraft:
+    """An event without its number and time."""
+
+    kind: EventKind
+    text: str
+    severity: Severity = Severity.WARNING
+    app: str | None = None
+    data: dict[str, Value] = field(default_factory=dict)
+
+
+class RepeatedEvents:
+    """Decides when events that may come many times a second are published: the first at once, then sums once a second.
+
+    A sum has the text of the newest one: why something is refused may change while it is asked for again.
+    """
+
+    def __init__(self) -> None:
+        self._published: dict[Hashable, tuple[int, Callable[[], EventDraft]]] = {}
+        self._counts: dict[Hashable, int] = {}
+
+    def first(self, key: Hashable, draft: Callable[[], EventDraft]) -> bool:
+        """Count one more; returns whether it is the first of its key: publish it now and call :meth:`begin`."""
+        count = self._counts.get(key)
+        if count is None:
+            return True
+        self._counts[key] = count + 1
+        self._published[key] = (self._published[key][0], draft)
+        return False
+
+    def begin(self, key: Hashable, draft: Callable[[], EventDraft], now_ns: int) -> None:
+        """The first of its key, or a sum, was published."""
+        self._published[key] = (now_ns, draft)
+        self._counts[key] = 0
+
+    def due(self, now_ns: int) -> list[tuple[EventDraft, int]]:
+        """The events that went on for a second since they were last published, with their count; forgets the others."""
+        due: list[tuple[EventDraft, int]] = []
+        for key, (published_ns, draft) in list(self._published.items()):
+            if now_ns - published_ns < REPEAT_NS:
+                continue
+            count = self._counts[key]
+            if count:
+                due.append((draft(), count))
+                self.begin(key, draft, now_ns)
+            else:
+                del self._published[key], self._counts[key]
+        return due
+
+
+class Episodes:
+    """Which limits are touched now, so that each is published once and not with every repeat of a set-point."""
+
+    def __init__(self) -> None:
+        self._touched_ns: dict[tuple[str, str], int] = {}
+
+    def begun(self, clamps: tuple[Clamp, ...], now_ns: int) -> list[Clamp]:
+        """Return those of the clamps that begin an episode."""
+        touched, since_ns = self._touched_ns, now_ns - EPISODE_NS
+        new = [clamp for clamp in clamps if touched.get((clamp.limit, clamp.zone), since_ns) <= since_ns]
+        for clamp in clamps:
+            touched[clamp.limit, clamp.zone] = now_ns
+        return new
+
+
+def refused_event(name: str, command: Command, reason: Refusal, why: str) -> EventDraft:
+    """A command of the application ``name`` was refused."""
+    text = f"{name}: {command.action.name} refused: {why}"
+    return EventDraft(EventKind.COMMAND_REFUSED, text, app=name, data={"reason": reason.value, "seq": command.seq})
+
+
+def clamped_event(name: str, clamp: Clamp) -> EventDraft:
+    """A limit shortened a set-point of the application ``name``."""
+    zone = f" ({clamp.zone})" if clamp.zone else ""
+    text = f"{name}: {clamp.limit}{zone} made {clamp.applied:.3g} of {clamp.asked:.3g}"
+    data: dict[str, Value] = {"limit": clamp.limit, "asked": clamp.asked, "applied": clamp.applied}
+    if clamp.zone:
+        data["zone"] = clamp.zone
+    return EventDraft(EventKind.COMMAND_CLAMPED, text, Severity.INFO, name, data)
+
+
+def enforcement_event(enforced: bool) -> EventDraft:
+    """The safety box and zones are, or are not, enforced from now on."""
+    text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
+    severity = Severity.INFO if enforced else Severity.WARNING
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
+
+
+def thin_zones_event(space: Space) -> EventDraft:
+    """Some zones are kept clear of as if they were thicker than they are written."""
+    thin = "; ".join(str(zone) for zone in space.thin)
+    text = f"no-fly zones thinner than {THINNEST_M:g} m are kept clear of as if they were so thick: {thin} ({ZONES})"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "thin_zones"})
+
+
+def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
+    """The position changed by more than the vehicle can have flown; ``lands``: while it was landed."""
+    what = "goes on to land" if lands else "hovers, until something new is commanded"
+    text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
+    data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
+
+
+def landing_given_up_event() -> EventDraft:
+    """A pilot's landing is given up because the vehicle was not heard."""
+    text = f"the landing is given up: {UNHEARD}: land it again when it is heard"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": "landing_given_up"})
+
+
+def emergency_event(name: str) -> EventDraft:
+    """The application ``name`` stopped the motors."""
+    text = f"emergency stop by {name}"
+    return EventDraft(EventKind.EMERGENCY, text, Severity.ERROR, name, {"reason": text})
+
+
+def failsafe_event(change: StepChange) -> EventDraft:
+    """A step of the failsafe ladder was taken or left."""
+    why = REASONS.get(change.reason, change.reason)
+    if change.step is Failsafe.NONE:
+        text, severity = f"failsafe ended: {why}", Severity.INFO
+    else:
+        what = "return to the start and land there" if change.returns else change.step.value
+        text, severity = f"failsafe: {what}, because {why}", Severity.WARNING
+        if change.why:
+            text += f"; it can't return to its start: {change.why}"
+    data: dict[str, Value] = {"step": change.step.value, "reason": change.reason, "returns": change.returns}
+    return EventDraft(EventKind.FAILSAFE, text, severity, data=data)
+
+
+def battery_event(low: BatteryLow) -> EventDraft:
+    """The battery fell below the warning level."""
+    text = f"battery low: {low.battery:.0%} left"
+    return EventDraft(EventKind.BATTERY_LOW, text, data={"battery": low.battery})
+
+
+def taken_event(name: str, action: str, others: str) -> EventDraft:
+    """The application ``name`` took the vehicle from others by an action; ``others`` says what they did with it."""
+    text = f"{name} took the vehicle by {action}: {others}"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, app=name, data={"reason": "taken"})
+
+
+def ownership_event(changed: Changed) -> EventDraft:
+    """The flight is somebody else's, or an earlier run's."""
+    reason = "others" if changed.whose is Whose.OTHERS else "flight"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})
+
+
+def slept_event(slept_s: float) -> EventDraft:
+    """The computer slept in the meantime, for so long [s]."""
+    text = f"this computer slept for {slept_s:.1f} s: nothing that was asked for before is done any more"
+    data: dict[str, Value] = {"reason": "slept", "seconds": slept_s}
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
+
+
+@dataclass(frozen=True, slots=True)
+class EventContext:
+    """What an event's text needs besides the change itself."""
+
+    now_ns: int
+    name: Callable[[int], str]  #: name of an application, by its number
+    identity: Callable[[int], str]  #: what the transport knows about an application
+    holder: str  #: name of who holds the authority now; empty for nobody
+
+
+def authority_event(effect: authority.Effect, context: EventContext) -> EventDraft:
+    """Return the event of one change of the authority."""
+    draft = _DRAFTS[type(effect)](effect, context)
+    draft.app = context.name(effect.app_id)
+    draft.data = {"app_id": effect.app_id, **draft.data}
+    return draft
+
+
+def _granted(effect: authority.Granted, context: EventContext) -> EventDraft:
+    data: dict[str, Value] = {"priority": effect.priority, "lease": effect.lease}
+    data["identity"] = context.identity(effect.app_id)
+    term = ""
+    if effect.until_ns is not None:
+        data["until_ns"] = effect.until_ns
+        term = f", for {seconds(effect.until_ns - context.now_ns):.0f} s"
+    text = f"{context.name(effect.app_id)} has the authority (priority {effect.priority}, lease {effect.lease}{term})"
+    return EventDraft(EventKind.AUTHORITY_GRANTED, text, Severity.INFO, data=data)
+
+
+def _queued(effect: authority.Queued, context: EventContext) -> EventDraft:
+    data: dict[str, Value] = {"priority": effect.priority, "position": effect.position}
+    text = f"{context.name(effect.app_id)} waits for the authority, number {effect.position} in the queue"
+    if effect.wait_ns is not None:
+        data["wait_s"] = seconds(effect.wait_ns)
+        text += f", for about {seconds(effect.wait_ns):.0f} s"
+    return EventDraft(EventKind.AUTHORITY_QUEUED, text, Severity.INFO, data=data)
+
+
+def _lost(effect: authority.Lost, context: EventContext) -> EventDraft:
+    text = f"{context.name(effect.app_id)} lost the authority: {effect.reason}"
+    if effect.reason == "silent" and not context.holder:
+        text += "; it is still listed as the holder until another application asks"
+    data: dict[str, Value] = {"lease": effect.lease, "reason": effect.reason, "by": context.holder}
+    return EventDraft(EventKind.AUTHORITY_LOST, text, data=data)
+
+
+def _preempted(effect: authority.Preempted, context: EventContext) -> EventDraft:
+    name, by = context.name(effect.app_id), context.name(effect.by_id)
+    if effect.granted:
+        text = f"{name} handed the authority over to {by} (priority {effect.by_priority})"
+    else:
+        text = f"{by} (priority {effect.by_priority}) took the authority over from {name}"
+    return EventDraft(EventKind.AUTHORITY_PREEMPTED, text, data=_by(effect, context) | {"granted": effect.granted})
+
+
+def _asked(effect: authority.Asked, context: EventContext) -> EventDraft:
+    within_s = seconds(effect.until_ns - context.now_ns)
+    name, by = context.name(effect.app_id), context.name(effect.by_id)
+    text = f"{by} (priority {effect.by_priority}) asks {name} for the authority, within {within_s:.0f} s"
+    data = _by(effect, context) | {"within_s": within_s}
+    if effect.term_ns is not None:
+        data["for_s"] = seconds(effect.term_ns)
+    return EventDraft(EventKind.AUTHORITY_ASKED, text, data=data)
+
+
+def _declined(effect: authority.Declined, context: EventContext) -> EventDraft:
+    by, why = context.name(effect.holder_id), f": {effect.reason}" if effect.reason else ""
+    text = f"{by} does not hand the authority over to {context.name(effect.app_id)} yet{why}"
+    data: dict[str, Value] = {"by": by, "by_id": effect.holder_id, "reason": effect.reason}
+    return EventDraft(EventKind.AUTHORITY_DECLINED, text, Severity.INFO, data=data)
+
+
+def _withdrawn(effect: authority.Withdrawn, context: EventContext) -> EventDraft:
+    by = context.name(effect.by_id)
+    data: dict[str, Value] = {"lease": effect.lease, "by": by, "by_id": effect.by_id}
+    text = f"{by} no longer asks {context.name(effect.app_id)} for the authority"
+    return EventDraft(EventKind.AUTHORITY_WITHDRAWN, text, Severity.INFO, data=data)
+
+
+def _expired(effect: authority.Expired, context: EventContext) -> EventDraft:
+    text = f"the time of {context.name(effect.app_id)} is over: the next application that asks gets the authority"
+    return EventDraft(EventKind.AUTHORITY_EXPIRED, text, data={"lease": effect.lease})
+
+
+def _by(effect: authority.Preempted | authority.Asked, context: EventContext) -> dict[str, Value]:
+    by = context.name(effect.by_id)
+    return {"lease": effect.lease, "by": by, "by_id": effect.by_id, "by_priority": effect.by_priority}
+
+
+_DRAFTS: Final[dict[type[authority.Effect], Callable[[Any, EventContext], EventDraft]]] = {
+    authority.Granted: _granted,
+    authority.Queued: _queued,
+    authority.Lost: _lost,
+    authority.Preempted: _preempted,
+    authority.Asked: _asked,
+    authority.Declined: _declined,
+    authority.Withdrawn: _withdrawn,
+    authority.Expired: _expired,
+}

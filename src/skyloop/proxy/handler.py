@@ -52,10 +52,18 @@ from skyloop.messages.fields import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.command_checks import CommandChecks
-from skyloop.proxy.core.events import (
+from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
+from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
+from skyloop.proxy.core.flight import BELIEF_NS, Whose
+from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
+from skyloop.proxy.core.limits import Clamp
+from skyloop.proxy.events import (
     UNHEARD,
+    Counters,
+    Episodes,
     EventContext,
     EventDraft,
+    EventPublisher,
     authority_event,
     battery_event,
     clamped_event,
@@ -70,19 +78,12 @@ from skyloop.proxy.core.events import (
     taken_event,
     thin_zones_event,
 )
-from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
-from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
-from skyloop.proxy.core.flight import BELIEF_NS, Whose
-from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
-from skyloop.proxy.core.limits import Clamp, Episodes
-from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.parameters import FlightSettings
 from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.returning import ReturnSupervisor
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import COMMANDS, TransportServer
-from skyloop.zones import Space
 
 _LAND: Final = Land()
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
@@ -165,17 +166,20 @@ class CommandHandler:
         self.authority.last_command_ns = now_ns
 
     def configure(self, settings: FlightSettings) -> None:
-        """Let new values of the parameters take effect."""
+        """Let new values of the parameters take effect; what is the same object as before did not change."""
         with self._lock:
-            self._report_thin_zones(settings.airspace.space)
-            self.checks.airspace.settings = settings.airspace
+            airspace, space = self.checks.airspace, settings.airspace.space
+            if space is not airspace.settings.space:
+                if space.thin and space != airspace.settings.space:
+                    self._events.publish_drafts(thin_zones_event(space))
+                self._executor.guarded = space.walled
+            airspace.settings = settings.airspace
             self.checks.returns = settings.returns
             self.checks.max_age_ns = settings.max_age_ns
             self.authority.timeout_ns = settings.authority_timeout_ns
             self.authority.ask_ns = settings.authority_ask_ns
             self.ladder.settings = settings.failsafe
             self.warm_s = settings.warm_s
-            self._executor.guarded = settings.airspace.space.walled
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
 
@@ -489,14 +493,10 @@ class CommandHandler:
         """Publish what began to be in the way of a command of this application, or of what the proxy does itself."""
         if enforced is not None and enforced is not self._enforced:
             self._enforced = enforced
-            self._events.publish_draft(enforcement_event(enforced))
+            self._events.publish_drafts(enforcement_event(enforced))
         episodes, name = (self._episodes, "the proxy") if session is None else (session.episodes, session.name)
         for clamp in episodes.begun(clamps, now_ns):
-            self._events.publish_draft(clamped_event(name, clamp))
-
-    def _report_thin_zones(self, space: Space) -> None:
-        if space.thin and space != self.checks.airspace.settings.space:
-            self._events.publish_draft(thin_zones_event(space))
+            self._events.publish_drafts(clamped_event(name, clamp))
 
     def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
         """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
@@ -611,7 +611,7 @@ class CommandHandler:
         self._update_failsafe(now_ns, [*news, *ended])  # which hovers, before anybody learns of any of this
         for effect in effects:
             if not isinstance(effect, (Lost, Preempted)):
-                self._events.publish_draft(self._authority_draft(effect, now_ns))
+                self._events.publish_drafts(self._authority_draft(effect, now_ns))
 
     def _authority_draft(self, effect: AuthorityEffect, now_ns: int) -> EventDraft:
         holder = self.authority.holder
@@ -678,7 +678,7 @@ class CommandHandler:
             if landing is not None:
                 self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: land it again", Refusal.VEHICLE_LINK_LOST)
             self.ladder.give_up_landing()
-            self._events.publish_draft(landing_given_up_event())
+            self._events.publish_drafts(landing_given_up_event())
 
     def _observe_sleep(self, now_ns: int) -> None:
         """Act on a sleep of the computer: all that is known is older than its clock says."""
@@ -689,7 +689,7 @@ class CommandHandler:
         self._slept_ns, self._awake_ns = slept_ns, now_ns
         self.authority.slept(slept_ns)
         self.flight.slept(slept_ns)
-        self._events.publish_draft(slept_event(seconds(slept_ns)))
+        self._events.publish_drafts(slept_event(seconds(slept_ns)))
         self._start_over(Fate.SLEPT, now_ns)
 
     def _start_over(self, fate: Fate, now_ns: int) -> None:
@@ -727,7 +727,7 @@ class CommandHandler:
         self.flight.take()
         self._stamp()
         if others:
-            self._events.publish_draft(taken_event(session.name, applied.name, others))
+            self._events.publish_drafts(taken_event(session.name, applied.name, others))
         self.on_ownership(True)
 
     def _observe_flight(self, now_ns: int) -> None:
@@ -746,14 +746,14 @@ class CommandHandler:
         elif changed.why:  # found on a flight that is ours: its pilot may come back, as if a command had just come
             self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
         if changed.why and executor.supported:  # a recording that is played flies by itself, and nobody wonders
-            self._events.publish_draft(ownership_event(changed))
+            self._events.publish_drafts(ownership_event(changed))
 
     # Failsafe ----------------------------------------------------------------------------------------------------
 
     def _update_failsafe(self, now_ns: int, news: Sequence[EventDraft] = ()) -> None:
         """Let the ladder decide and act; ``news``: to be published then, before its own."""
         if self._left:
-            self._events.publish_all(news)
+            self._events.publish_drafts(*news)
             return
         self._observe_flight(now_ns)
         feedback = self._vehicle.feedback_now
@@ -798,4 +798,4 @@ class CommandHandler:
                     if taken:
                         self._echo_own(effect.action, now_ns)
         finally:
-            self._events.publish_all(drafts)
+            self._events.publish_drafts(*drafts)

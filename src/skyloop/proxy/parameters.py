@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -144,10 +144,21 @@ def check(parameter: Parameter, value: Value) -> Value:
     """
     if parameter.read_only:
         raise ParameterError(f"{parameter.name} can only be read", code=Refusal.READ_ONLY)
-    value = _typed(parameter, value)
-    numbers = value if isinstance(value, tuple) else () if isinstance(value, bool | str) else (value,)
-    for number in numbers:
-        _check_number(parameter, number)
+    kind, is_bool = parameter.type, isinstance(value, bool)
+    is_number = isinstance(value, int if kind is ParameterType.INT else int | float) and not is_bool
+    if kind in (ParameterType.FLOAT, ParameterType.INT) and is_number:
+        value = _number(parameter, value)
+    elif kind is ParameterType.VECTOR and isinstance(value, tuple):
+        length = len(parameter.value) if isinstance(parameter.value, tuple) else len(value)
+        if len(value) != length:
+            raise ParameterError(f"{parameter.name} takes {length} numbers, not {len(value)}", code=Refusal.WRONG_TYPE)
+        value = tuple(_number(parameter, number) for number in value)
+    elif not ((kind is ParameterType.BOOL and is_bool) or (kind is ParameterType.TEXT and isinstance(value, str))):
+        name = _KIND_NAMES.get(type(value), type(value).__name__)
+        unit = f" in {parameter.unit}" if parameter.unit else ""
+        raise ParameterError(
+            f"{parameter.name} takes a {kind.value}{unit}, not {name} ({value!r:.60})", code=Refusal.WRONG_TYPE
+        )
     if parameter.choices and value not in parameter.choices:
         choices = ", ".join(repr(choice) for choice in parameter.choices)
         raise ParameterError(f"{parameter.name} is one of {choices}, not {value!r}", code=Refusal.OUT_OF_RANGE)
@@ -158,38 +169,15 @@ def check(parameter: Parameter, value: Value) -> Value:
     return value
 
 
-def _typed(parameter: Parameter, value: Value) -> Value:
-    kind, is_bool = parameter.type, isinstance(value, bool)
-    if kind is ParameterType.FLOAT and isinstance(value, int | float) and not is_bool:
-        return _as_float(parameter, value)
-    if kind is ParameterType.VECTOR and isinstance(value, tuple):
-        length = len(parameter.value) if isinstance(parameter.value, tuple) else len(value)
-        if len(value) == length:
-            return tuple(_as_float(parameter, number) for number in value)
-        raise ParameterError(f"{parameter.name} takes {length} numbers, not {len(value)}", code=Refusal.WRONG_TYPE)
-    if kind is ParameterType.BOOL and is_bool:
-        return value
-    if kind is ParameterType.INT and isinstance(value, int) and not is_bool:
-        return value
-    if kind is ParameterType.TEXT and isinstance(value, str):
-        return value
-    name = _KIND_NAMES.get(type(value), type(value).__name__)
-    unit = f" in {parameter.unit}" if parameter.unit else ""
-    raise ParameterError(
-        f"{parameter.name} takes a {kind.value}{unit}, not {name} ({value!r:.60})", code=Refusal.WRONG_TYPE
-    )
-
-
-def _as_float(parameter: Parameter, number: float) -> float:
-    try:
-        return float(number)
-    except OverflowError:
-        raise ParameterError(f"{parameter.name} cannot be that large", code=Refusal.OUT_OF_RANGE) from None
-
-
-def _check_number(parameter: Parameter, number: float) -> None:
-    if isinstance(number, float) and not math.isfinite(number):
-        raise ParameterError(f"{parameter.name} must be finite, not {number}", code=Refusal.NON_FINITE)
+def _number(parameter: Parameter, number: float) -> float:
+    """Return a number as it may be written, or as part of what is: finite, and within the range."""
+    if parameter.type is not ParameterType.INT:
+        try:
+            number = float(number)
+        except OverflowError:
+            raise ParameterError(f"{parameter.name} cannot be that large", code=Refusal.OUT_OF_RANGE) from None
+        if not math.isfinite(number):
+            raise ParameterError(f"{parameter.name} must be finite, not {number}", code=Refusal.NON_FINITE)
     low, high = parameter.minimum, parameter.maximum
     if (low is not None and number < low) or (high is not None and number > high):
         unit = f" {parameter.unit}" if parameter.unit else ""
@@ -197,6 +185,7 @@ def _check_number(parameter: Parameter, number: float) -> None:
             f"{word} {bound:g}{unit}" for word, bound in (("at least", low), ("at most", high)) if bound is not None
         )
         raise ParameterError(f"{parameter.name} must be {allowed}, not {number!r}", code=Refusal.OUT_OF_RANGE)
+    return number
 
 
 def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
@@ -225,14 +214,14 @@ def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
 class FlightSettings:
     """What the parameters ask of the flight."""
 
-    airspace: AirspaceSettings
-    failsafe: FailsafeSettings
-    autopilot: AutopilotSettings
-    returns: ReturnSettings
-    max_age_ns: int  #: of a command
-    authority_timeout_ns: int
-    authority_ask_ns: int
-    warm_s: float  #: how often the code is run on a dummy while the vehicle is flown; 0: never
+    airspace: AirspaceSettings = field(default_factory=AirspaceSettings)
+    failsafe: FailsafeSettings = field(default_factory=FailsafeSettings)
+    autopilot: AutopilotSettings = field(default_factory=AutopilotSettings)
+    returns: ReturnSettings = field(default_factory=ReturnSettings)
+    max_age_ns: int = 0  #: of a command
+    authority_timeout_ns: int = 0
+    authority_ask_ns: int = 0
+    warm_s: float = 0.0  #: how often the code is run on a dummy while the vehicle is flown; 0: never
 
 
 class Parameters:
@@ -250,6 +239,10 @@ class Parameters:
         self._driver: dict[str, Parameter] = {}
         self._presets: dict[str, Value] = {}  # that the driver has not taken yet
         self.left_out: tuple[str, ...] = ()  #: driver's parameters that are too large to be sent
+        self._in_force: dict[str, Any] = {}  # the values that the proxy obeys, of its own parameters
+        self._changed: set[str] = set()  # how the names begin of those that the settings don't have yet
+        self._settings = FlightSettings()
+        self._apply(OWN)
 
     def preset(self, values: Mapping[str, Value]) -> None:
         """Give the proxy's own parameters other values before it starts.
@@ -261,6 +254,8 @@ class Parameters:
         for name, value in check_presets(values).items():
             self._own[name] = msgspec.structs.replace(self._own[name], value=value)
             self._presets[name] = value
+        with self._lock:
+            self._apply(OWN)
 
     def write_presets(self) -> list[tuple[str, str]]:
         """Write presets to the vehicle where it has such parameters. Returns which could not be written, and why."""
@@ -281,6 +276,7 @@ class Parameters:
         with self._lock:
             self._driver = {name: parameter for name, parameter in read.items() if name not in large}
             self.left_out = large
+            self._apply(OWN)
 
     def get(self, name: str) -> Parameter:
         """One parameter as last known. Raises :class:`UnknownNameError`."""
@@ -292,61 +288,82 @@ class Parameters:
 
     def number(self, name: str) -> float:
         """The value in force of one of the proxy's own parameters, the driver's where it has it too."""
-        value = self.get(name).value
-        if isinstance(value, int | float) and math.isfinite(value):
-            return float(value)
-        own = self._own[name].value  # a driver with another notion of this name: the proxy keeps its own
-        assert isinstance(own, float)
-        return own
+        value: float = self._in_force[name]
+        return value
 
-    def flag(self, name: str) -> bool:
-        """The value in force of one of the proxy's own parameters that is a bool, the driver's where it has it too."""
-        value = self.get(name).value
-        return value if isinstance(value, bool) else bool(self._own[name].value)
-
-    def text(self, name: str) -> str:
-        """The value in force of one of the proxy's own parameters that is a text, the driver's where it has it too."""
-        value = self.get(name).value
-        return value if isinstance(value, str) else ""
+    def _apply(self, parameters: Iterable[Parameter]) -> None:
+        """Let the values of these of the proxy's own parameters be in force, and note which changed. Holds the lock."""
+        for standard in parameters:
+            name, kind = standard.name, standard.type
+            own = self._own[name].value
+            value = self._driver[name].value if name in self._driver else own
+            if kind is ParameterType.TEXT:
+                value = value if isinstance(value, str) else ""
+            elif kind is ParameterType.BOOL:
+                value = value if isinstance(value, bool) else own
+            else:  # a driver with another notion of this name: the proxy keeps its own
+                value = float(value) if isinstance(value, int | float) and math.isfinite(value) else own
+            if self._in_force.get(name) != value:
+                self._in_force[name] = value
+                self._changed.add(name.partition(".")[0])
 
     def flight_settings(self) -> FlightSettings:
-        """Return what the values in force ask of the flight."""
-        number = self.number
-        limits = Limits(
-            tilt=number("limits.tilt"),
-            climb=number("limits.climb"),
-            yaw_rate=number("limits.yaw_rate"),
-            speed=number("limits.speed"),
-            altitude=number("limits.altitude"),
-        )
-        failsafe = FailsafeSettings(
-            hover_after_s=number("failsafe.hover_after_s"),
-            land_after_s=number("failsafe.land_after_s"),
-            retry_s=number("failsafe.retry_s"),
-            battery_warn=number("battery.warn"),
-            battery_land=number("battery.land"),
-            battery_return=number("battery.return"),
-            returns=self.flag("failsafe.return"),
-        )
-        autopilot = AutopilotSettings(
-            takeoff_altitude=min(number("autopilot.takeoff_altitude"), limits.altitude),
-            climb=min(number("autopilot.climb"), limits.climb),
-            descent=min(number("autopilot.descent"), limits.climb),
-            velocity_p=number("autopilot.velocity_p"),
-            velocity_i=number("autopilot.velocity_i"),
-            tilt=limits.tilt,
-        )
-        space = space_of(number, self.text)
-        return FlightSettings(
-            AirspaceSettings(limits, space, number("safety.deceleration"), number("safety.reaction_s")),
-            failsafe,
-            autopilot,
-            ReturnSettings(number("return.height"), number("return.speed"), self.flag("return.land")),
-            max_age_ns=nanoseconds(number("command.max_age_s")),
-            authority_timeout_ns=nanoseconds(number("authority.timeout_s")),
-            authority_ask_ns=nanoseconds(number("authority.ask_s")),
-            warm_s=0.0 if not (warm_s := number("warm.period_s")) else max(warm_s, SHORTEST_S),
-        )
+        """Return what the values in force ask of the flight; made anew is only what those that changed concern.
+
+        Raises:
+            ParameterError: The driver has no-fly zones that can't be read.
+        """
+        with self._lock:
+            changed, value, before = self._changed, self._in_force, self._settings
+            new: dict[str, Any] = {}
+            limits, space = before.airspace.limits, before.airspace.space
+            if "limits" in changed:
+                limits = Limits(
+                    tilt=value["limits.tilt"],
+                    climb=value["limits.climb"],
+                    yaw_rate=value["limits.yaw_rate"],
+                    speed=value["limits.speed"],
+                    altitude=value["limits.altitude"],
+                )
+            if "safety" in changed:
+                space = space_of(value.__getitem__, value.__getitem__)
+            if changed & {"limits", "safety"}:
+                new["airspace"] = AirspaceSettings(
+                    limits, space, value["safety.deceleration"], value["safety.reaction_s"]
+                )
+            if changed & {"limits", "autopilot"}:
+                new["autopilot"] = AutopilotSettings(
+                    takeoff_altitude=min(value["autopilot.takeoff_altitude"], limits.altitude),
+                    climb=min(value["autopilot.climb"], limits.climb),
+                    descent=min(value["autopilot.descent"], limits.climb),
+                    velocity_p=value["autopilot.velocity_p"],
+                    velocity_i=value["autopilot.velocity_i"],
+                    tilt=limits.tilt,
+                )
+            if changed & {"failsafe", "battery"}:
+                new["failsafe"] = FailsafeSettings(
+                    hover_after_s=value["failsafe.hover_after_s"],
+                    land_after_s=value["failsafe.land_after_s"],
+                    retry_s=value["failsafe.retry_s"],
+                    battery_warn=value["battery.warn"],
+                    battery_land=value["battery.land"],
+                    battery_return=value["battery.return"],
+                    returns=value["failsafe.return"],
+                )
+            if "return" in changed:
+                new["returns"] = ReturnSettings(value["return.height"], value["return.speed"], value["return.land"])
+            if "command" in changed:
+                new["max_age_ns"] = nanoseconds(value["command.max_age_s"])
+            if "authority" in changed:
+                new["authority_timeout_ns"] = nanoseconds(value["authority.timeout_s"])
+                new["authority_ask_ns"] = nanoseconds(value["authority.ask_s"])
+            if "warm" in changed:
+                warm_s = value["warm.period_s"]
+                new["warm_s"] = max(warm_s, SHORTEST_S) if warm_s else 0.0
+            if new:
+                self._settings = replace(before, **new)
+            self._changed = set()
+            return self._settings
 
     def set(self, name: str, value: Value) -> Parameter:
         """Write one parameter and return it as it is now.
@@ -364,6 +381,8 @@ class Parameters:
         written = msgspec.structs.replace(parameter, value=value)
         with self._lock:
             (self._driver if is_driver else self._own)[name] = written
+            if name in self._own:
+                self._apply((self._own[name],))
         return written
 
     def page(self, first: int) -> ParameterPage:

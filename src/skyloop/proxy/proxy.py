@@ -58,19 +58,17 @@ from skyloop.messages import (
 from skyloop.messages.feedback import MAX_ADDRESS, MAX_EVENT_TEXT
 from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
-from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.flight import Flight
-from skyloop.proxy.events import Counters, EventPublisher
+from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.handler import CommandHandler
-from skyloop.proxy.overview import OverviewPublisher
 from skyloop.proxy.parameters import Parameters, described
 from skyloop.proxy.publisher import VehiclePublisher
-from skyloop.proxy.relay import Relay
+from skyloop.proxy.relay import ProcessorWorkers, Relay
 from skyloop.proxy.requests import JobQueue, ParameterRequests, RequestDispatcher
 from skyloop.proxy.sessions import HELLO_NS, MAX_MALFORMED, Session
-from skyloop.proxy.workers import ProcessorWorkers
+from skyloop.proxy.topics import OverviewPublisher
 from skyloop.transport.base import Peer, TransportServer
 
 MAX_NAME: Final = 64  #: characters of a proxy's name
@@ -418,7 +416,7 @@ class Proxy:
             data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": reason, "app_id": session.app_id}
             news.append(EventDraft(EventKind.APPLICATION_LINK, text, app=session.name, data=data))
         if self._stopping.is_set():  # everybody leaves, and the driver may be closed already
-            self.events.publish_all(news)
+            self.events.publish_drafts(*news)
         else:
             self.handler.application_left(session, self.clock(), news)
         self.workers.application_left(session)

@@ -1,12 +1,8 @@
-"""Publishes what the driver reports: feedback, frames, streams, the vehicle's link, events; on the driver's thread.
-
-It also knows which topics the proxy has: no others can be subscribed to, so that made-up names cost nothing.
-"""
+"""Publishes what the driver reports: feedback, frames, streams, the vehicle's link, events; on the driver's thread."""
 
 from __future__ import annotations
 
 import math
-import re
 import threading
 from collections.abc import Callable, Collection
 from math import isfinite
@@ -17,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import NS_PER_S, Clock
-from skyloop.errors import SkyloopError, UnknownNameError, UsageError, shortened
+from skyloop.errors import SkyloopError, shortened
 from skyloop.messages import (
     CameraInfo,
     Capabilities,
@@ -38,20 +34,12 @@ from skyloop.messages import (
 )
 from skyloop.messages.feedback import MAX_LINK_TEXT
 from skyloop.messages.frame import H264, MAX_ENCODED
-from skyloop.messages.relayed import PROCESSOR_NAME
-from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.core.intents import NO_INTENT, Intent
-from skyloop.proxy.events import Counters, EventPublisher
-from skyloop.proxy.feedback_variants import PREFIX, FeedbackVariants
+from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.streams import Streams
+from skyloop.proxy.topics import PREFIX, STREAM_TOPIC, FeedbackVariants, topic_problem
 from skyloop.transport.base import (
-    ANNOTATIONS,
-    COMMANDS,
-    EVENTS,
     FEEDBACK,
-    LOGS,
-    OVERVIEW,
-    RESULTS,
     TransportServer,
     stream,
     video,
@@ -59,12 +47,6 @@ from skyloop.transport.base import (
 
 #: A vehicle silent for so long: the proxy publishes what it knows itself (authority, links), so at 4 Hz.
 KEEP_ALIVE_NS: Final = NS_PER_S // 4
-
-#: The topics without a name in them.
-PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
-_VIDEO_TOPIC: Final = video("")
-_STREAM_TOPIC: Final = stream("")
-_RESULTS_TOPIC: Final = RESULTS + "/"
 
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 _LINK_UP: Final = frozenset({LinkState.UP, LinkState.DEGRADED})
@@ -292,7 +274,7 @@ class VehiclePublisher:
         if topic.startswith(PREFIX):
             return self.variants.problem(topic)
         problem = topic_problem(topic, self.cameras)
-        if problem or not topic.startswith(_STREAM_TOPIC) or "?" not in topic:
+        if problem or not topic.startswith(STREAM_TOPIC) or "?" not in topic:
             return problem
         request = VideoRequest.parse(topic)
         info = self._cameras.get(request.camera) or CameraInfo(request.camera, 640, 480, 0.0)
@@ -398,28 +380,3 @@ class VehiclePublisher:
         self._events.publish_repeated(
             ("driver", where), lambda: EventDraft(EventKind.DRIVER_ERROR, text, Severity.ERROR, data={"where": where})
         )
-
-
-def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why a topic can't be subscribed to, with those that can; empty if it can.
-
-    What a processor finds may be waited for before it has a worker.
-    """
-    if topic in PLAIN:
-        return ""
-    if topic.startswith(_RESULTS_TOPIC):
-        name = topic.removeprefix(_RESULTS_TOPIC)
-        known = re.fullmatch(PROCESSOR_NAME, name)
-        return "" if known else f"{name[:64]!r} is no name of a processor: it has 1 to 64 letters, digits and _ . -"
-    if topic.startswith((_STREAM_TOPIC, _VIDEO_TOPIC)):
-        try:
-            return camera_problem(VideoRequest.parse(topic).camera, cameras)
-        except UsageError as error:
-            return str(error)
-    return UnknownNameError("topic", topic[:64], {*PLAIN, *map(video, cameras()), *map(stream, cameras())}).message
-
-
-def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why this is no camera of the vehicle, with those that are; empty if it is one."""
-    known = cameras()
-    return "" if camera in known else UnknownNameError("camera of this vehicle", camera[:64], known).message

@@ -1,19 +1,52 @@
-"""What applications send to others: annotations and logs to subscribers, poses from motion capture to the driver."""
+"""What applications send to others: annotations, logs and results to subscribers, poses to the driver.
+
+Results come from workers of processors: :class:`WorkerRoster` decides which frames each takes, and is pure;
+:class:`ProcessorWorkers` sends each its share and relays what it finds.
+"""
 
 from __future__ import annotations
 
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from typing import Final
 
+import msgspec
+
+from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import Driver, ExternalPose
 from skyloop.errors import UnsupportedError, UsageError
-from skyloop.messages import Annotation, EventKind, Refusal, Role, VehiclePose
-from skyloop.proxy.core.events import EventDraft
-from skyloop.proxy.events import Counters, EventPublisher
-from skyloop.proxy.publisher import VehiclePublisher, camera_problem
+from skyloop.messages import (
+    Annotation,
+    AnyReply,
+    Done,
+    EventKind,
+    JoinProcessor,
+    ProcessorResult,
+    ProcessorShare,
+    Refusal,
+    Refused,
+    Role,
+    Severity,
+    Value,
+    VehiclePose,
+    encode,
+)
+from skyloop.proxy.events import Counters, EventDraft, EventPublisher
+from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.sessions import Session
-from skyloop.transport.base import ANNOTATIONS, LOGS, TransportServer
+from skyloop.proxy.topics import camera_problem
+from skyloop.transport.base import ANNOTATIONS, LOGS, RESULTS, TransportServer, results
 
 MAX_ANNOTATION: Final = 32_768  #: bytes of an annotation's packet
+#: A worker that sent nothing for this long loses its share: it hangs, or its host does.
+SILENT_S: Final = 1.0
+#: How far in the future a result's frame may lie, by the error of its camera's clock.
+MAX_AHEAD_S: Final = 1.0
+MAX_JOINED: Final = 8  #: processors that one application may work for
+
+_Key = tuple[int, str]  # application, processor
 
 
 class Relay:
@@ -84,3 +117,205 @@ class Relay:
                 data={"reason": reason.value, "app_id": session.app_id},
             ),
         )
+
+
+class ProcessorWorkers:
+    """Sends workers their shares, and relays results. Any thread."""
+
+    def __init__(
+        self,
+        server: TransportServer,
+        events: EventPublisher,
+        counters: Counters,
+        cameras: Callable[[], Collection[str]],
+    ) -> None:
+        """``cameras()``: the names of those that the vehicle has."""
+        self._cameras = cameras
+        self._server = server
+        self._events = events
+        self._counts = counters.counts
+        self._lock = threading.Lock()
+        self._roster = WorkerRoster()
+        self._sessions: dict[int, Session] = {}
+        self._sent: dict[_Key, ProcessorShare] = {}
+
+    def join(self, session: Session, asked: JoinProcessor, now_ns: int) -> AnyReply:
+        """Make the application a worker, or keep it as one, and send it its share."""
+        app_id = session.app_id
+        with self._lock:
+            before = self._roster.find(app_id, asked.processor)
+            refused = self._refusal(session, asked, new=before is None)
+            if refused is not None:
+                return refused
+            self._sessions[app_id] = session
+            self._roster.register(app_id, asked, now_ns)
+            self._sent.pop((app_id, asked.processor), None)  # sent again each time: the last one may have been missed
+            self._send_shares()
+        if before is None:
+            self._publish_change(session, asked, "joined", f"works for processor {asked.processor}")
+        elif asked.ready and not before.works:
+            self._publish_change(session, asked, "back", f"works for processor {asked.processor} again")
+        elif before.works and not asked.ready:
+            text = f"gave up its share of processor {asked.processor}: it is busy too long"
+            self._publish_change(session, asked, "busy", text)
+        return Done()
+
+    def application_left(self, session: Session) -> None:
+        """The application's connection ended: its share goes to the others."""
+        with self._lock:
+            self._sessions.pop(session.app_id, None)
+            left = self._roster.remove(session.app_id)
+            self._send_shares()
+        for asked in left:
+            self._publish_change(session, asked, "left", f"left processor {asked.processor}")
+
+    def tick(self, now_ns: int) -> None:
+        """Take their share from those who are silent. Call some times a second."""
+        with self._lock:
+            silent = [(self._sessions[app_id], asked) for app_id, asked in self._roster.mark_silent(now_ns)]
+            if silent:
+                self._send_shares()
+        for session, asked in silent:
+            text = f"lost its share of processor {asked.processor}: silent for more than {SILENT_S:g} s"
+            self._publish_change(session, asked, "silent", text)
+
+    def relay(self, session: Session, result: ProcessorResult, now_ns: int) -> str:
+        """Pass a result on to its subscribers, under the number of the application that sent it.
+
+        Returns why it is malformed, empty if it is not. A refused one is published and counted.
+        """
+        if session.role is None:
+            return "a result came before Hello"
+        with self._lock:
+            worker = self._roster.find(session.app_id, result.processor)
+        why = ""
+        if worker is None:
+            why = f"it is no worker of processor {result.processor}"
+        elif result.camera != worker.asked.camera:
+            why = f"it works for {result.processor} on frames of {worker.asked.camera}, not of {result.camera}"
+        elif result.captured_ns - now_ns > nanoseconds(MAX_AHEAD_S):  # all that come after it would be older
+            why = f"its frame is to be captured only in {seconds(result.captured_ns - now_ns):.1f} s"
+        if why:
+            self._counts["results.refused"] += 1
+            text = f"a result of {session.name} was refused: {why}"
+            data: dict[str, Value] = {"processor": result.processor, "state": "refused", "app_id": session.app_id}
+            self._events.publish_repeated(
+                (session.app_id, "results"), lambda: EventDraft(EventKind.PROCESSOR, text, app=session.name, data=data)
+            )
+            return ""
+        packet = encode(msgspec.structs.replace(result, worker=session.app_id))
+        self._counts["results.relayed"] += 1
+        for topic in (RESULTS, results(result.processor)):
+            self._server.publish(topic, packet)
+        return ""
+
+    # Under the lock --------------------------------------------------------------------------------------------
+
+    def _refusal(self, session: Session, asked: JoinProcessor, *, new: bool) -> Refused | None:
+        unknown = camera_problem(asked.camera, self._cameras)
+        if unknown:
+            return Refused(Refusal.UNSUPPORTED, unknown)
+        conflict = self._roster.conflict(session.app_id, asked)
+        if conflict is not None:
+            return Refused(Refusal.NAME_TAKEN, self._explain(asked, *conflict))
+        if new and self._roster.joined(session.app_id) >= MAX_JOINED:
+            return Refused(Refusal.BUSY, f"one application works for at most {MAX_JOINED} processors")
+        return None
+
+    def _explain(self, asked: JoinProcessor, app_id: int, other: JoinProcessor) -> str:
+        who = f"{self._sessions[app_id].name} (application {app_id})"
+        if other.code != asked.code:
+            why = f"runs other code under the name {asked.processor}: {other.code}, and this is {asked.code}"
+            return f"{who} {why}; take another name, or stop that one"
+        ways = {True: "shares the frames", False: "takes all frames"}
+        why = f"works for {asked.processor} and {ways[other.shared]}, while this one {ways[asked.shared]}"
+        return f"{who} {why}: all its workers do the one or the other"
+
+    def _send_shares(self) -> None:
+        """Send each worker its share if it is not the one sent last."""
+        shares = self._roster.shares()
+        self._sent = {key: share for key, share in self._sent.items() if key in shares}
+        for key, share in shares.items():
+            if self._sent.get(key) != share and self._server.send(self._sessions[key[0]].peer, encode(share)):
+                self._sent[key] = share
+
+    # Not under the lock ----------------------------------------------------------------------------------------
+
+    def _publish_change(self, session: Session, asked: JoinProcessor, state: str, text: str) -> None:
+        severity = Severity.INFO if state in ("joined", "back") else Severity.WARNING
+        data: dict[str, Value] = {"processor": asked.processor, "state": state, "app_id": session.app_id}
+        self._events.publish(EventKind.PROCESSOR, f"{session.name} {text}", severity, app=session.name, data=data)
+
+
+@dataclass(slots=True)
+class Worker:
+    """One application as a worker of one processor."""
+
+    asked: JoinProcessor
+    received_ns: int
+    silent: bool = False
+
+    @property
+    def works(self) -> bool:
+        return self.asked.ready and not self.silent
+
+
+class WorkerRoster:
+    """The workers of all processors, by application and name of the processor."""
+
+    def __init__(self) -> None:
+        self._workers: dict[_Key, Worker] = {}
+
+    def find(self, app_id: int, processor: str) -> Worker | None:
+        """This application as a worker of that processor, if it is one."""
+        return self._workers.get((app_id, processor))
+
+    def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
+        """Make it a worker, or keep it as one."""
+        self._workers[app_id, asked.processor] = Worker(asked, now_ns)
+
+    def remove(self, app_id: int) -> list[JoinProcessor]:
+        """Remove an application; returns what it worked for."""
+        keys = [key for key in self._workers if key[0] == app_id]
+        return [self._workers.pop(key).asked for key in keys]
+
+    def joined(self, app_id: int) -> int:
+        """Return for how many processors it works."""
+        return sum(app == app_id for app, _ in self._workers)
+
+    def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:
+        """Return another worker of that name that does not go together with this one."""
+        for (app, name), worker in self._workers.items():
+            other = worker.asked
+            alike = (other.code, other.shared) == (asked.code, asked.shared)
+            if name == asked.processor and app != app_id and not alike:
+                return app, other
+        return None
+
+    def mark_silent(self, now_ns: int) -> list[tuple[int, JoinProcessor]]:
+        """Mark and return those that were silent for too long and were not marked before."""
+        found = []
+        for (app_id, _), worker in self._workers.items():
+            if not worker.silent and now_ns - worker.received_ns > nanoseconds(SILENT_S):
+                worker.silent = True
+                found.append((app_id, worker.asked))
+        return found
+
+    def shares(self) -> dict[_Key, ProcessorShare]:
+        """Return which frames each worker is to take."""
+        groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
+        for (app_id, name), worker in self._workers.items():
+            groups[name, worker.asked.camera].append(app_id)
+        found = {}
+        for (name, camera), members in groups.items():
+            working = sorted(app_id for app_id in members if self._workers[app_id, name].works)
+            for app_id in members:
+                part, parts = _part(app_id, working, shared=self._workers[app_id, name].asked.shared)
+                found[app_id, name] = ProcessorShare(name, camera, part, parts, len(members))
+        return found
+
+
+def _part(app_id: int, working: list[int], *, shared: bool) -> tuple[int, int]:
+    if app_id not in working:
+        return 0, 0
+    return (working.index(app_id), len(working)) if shared else (0, 1)

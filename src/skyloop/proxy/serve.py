@@ -21,8 +21,8 @@ from skyloop.errors import UsageError
 from skyloop.messages import EventKind, LinkState, Severity
 from skyloop.proxy.audit import AuditTrail, audit_path
 from skyloop.proxy.flight_record import FlightRecord, record_path
-from skyloop.proxy.overview import OverviewRegistry
 from skyloop.proxy.proxy import Proxy
+from skyloop.proxy.topics import OverviewRegistry
 from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 

@@ -8,7 +8,7 @@ from typing import Final
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Role
 from skyloop.proxy.core.intents import Intents
-from skyloop.proxy.core.limits import Episodes
+from skyloop.proxy.events import Episodes
 from skyloop.transport.base import Peer
 
 #: More malformed packets than this within a second restart the channel: its two ends no longer speak the same.

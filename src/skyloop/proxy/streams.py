@@ -25,7 +25,7 @@ from skyloop.messages.frame import H264, MAX_ENCODED, split, why_not_decoded
 from skyloop.messages.subscription import MAX_KBIT_S, RateLimiter
 from skyloop.proxy.core.stream_rate import StreamRate, picture_form
 from skyloop.proxy.events import Counters
-from skyloop.proxy.forms import Forms
+from skyloop.proxy.topics import Forms
 from skyloop.pyav import H264Encoder, require_pyav
 from skyloop.transport.base import TransportServer
 from skyloop.transport.frame_encoding import resized_header
@@ -296,7 +296,7 @@ class StreamForm:
         return kbit_s
 
 
-class Streams:
+class Streams(Forms[StreamForm]):
     """All forms of a vehicle's cameras.
 
     Args:
@@ -307,17 +307,10 @@ class Streams:
     """
 
     def __init__(self, server: TransportServer, counters: Counters, clock: Clock, fail: Callable[[str], None]) -> None:
+        super().__init__(MAX_FORMS, server.subscribers, clock)
         self._publish_packet = server.publish
-        self._subscribers = server.subscribers
         self._counts = counters.counts
-        self._clock = clock
         self._fail = fail
-        self._forms: Forms[StreamForm] = Forms(MAX_FORMS, server.subscribers, clock)
-
-    @property
-    def known(self) -> tuple[StreamForm, ...]:
-        """The forms that have, or may soon have, subscribers."""
-        return self._forms.known
 
     def problem(self, topic: str, request: VideoRequest, camera: CameraInfo) -> str:
         """Return why a form can't be subscribed to; empty if it can, and then it has a place here. Any thread."""
@@ -330,8 +323,8 @@ class Streams:
             require_pyav("encoding H.264")
         except MissingExtraError as error:
             return str(error)
-        if self._forms.claim(topic, lambda: StreamForm(topic, request, camera, self.publish, self._fail, self._clock)):
-            if (form := self._forms.find(topic)) is not None:
+        if self.claim(topic, lambda: StreamForm(topic, request, camera, self.publish, self._fail, self._clock)):
+            if (form := self.find(topic)) is not None:
                 form.asked()
             return ""
         return (
@@ -343,22 +336,23 @@ class Streams:
         """Return how many frames a second the encoded forms of this camera that anybody watches take at most."""
         watched = (
             one.max_fps
-            for one in self._forms.known
+            for one in self.known
             if one.request.camera == camera and not one.passing and self._subscribers(one.topic)
         )
         return max(watched, default=0.0)
 
     def wants_own(self, camera: str) -> bool:
         """Whether a form may hand on the vehicle's own pictures of this camera."""
-        forms = self._forms.known
-        return any(one.request.camera == camera and one.takes_own and self._subscribers(one.topic) for one in forms)
+        return any(
+            one.request.camera == camera and one.takes_own and self._subscribers(one.topic) for one in self.known
+        )
 
     def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
         """Have a frame encoded in the forms that want it. It is copied once if any does."""
         camera = header.camera
         wanted = [
             form
-            for form in self._forms.known
+            for form in self.known
             if form.request.camera == camera and form.wants(header, self._subscribers(form.topic))
         ]
         if not wanted:
@@ -370,7 +364,7 @@ class Streams:
     def own(self, picture: EncodedFrame) -> None:
         """Publish a picture that the vehicle encoded, in the form in which it came, too."""
         self.publish(picture)
-        for form in self._forms.known:
+        for form in self.known:
             if form.takes_own and form.request.camera == picture.camera:
                 sent = form.own(picture, self._subscribers(form.topic))
                 if sent is not None:
@@ -378,7 +372,7 @@ class Streams:
 
     def report(self, report: StreamReport) -> str:
         """Take in a subscriber's report; return why it makes no sense, empty if it does."""
-        form = self._forms.find(report.topic)
+        form = self.find(report.topic)
         if form is not None:
             form.report(report, self._clock())
             return ""
@@ -395,7 +389,7 @@ class Streams:
 
     def end(self) -> None:
         """End all threads."""
-        for form in self._forms.known:
+        for form in self.known:
             form.end()
 
 

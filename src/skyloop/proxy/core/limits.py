@@ -1,4 +1,4 @@
-"""The limits of set-points, and which of them begin to matter. Pure: the time is an argument."""
+"""The limits of set-points. Pure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.clock import NS_PER_S
 from skyloop.messages import AnyAction, Attitude, Velocity
 
 #: Climb allowed per metre that is left below ``limits.altitude`` [1/s]: the vehicle slows down before it is there, and
@@ -14,8 +13,6 @@ from skyloop.messages import AnyAction, Attitude, Velocity
 ALTITUDE_GAIN: Final = 1.0
 #: So little above ``limits.altitude`` is the altimeter's noise [m].
 SLACK_M: Final = 0.15
-#: A limit not touched for so long begins a new episode when it is touched again.
-EPISODE_NS: Final = NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,18 +68,3 @@ class Limits:
         if allowed_yaw_rate != yaw_rate:
             clamps.append(Clamp("limits.yaw_rate", yaw_rate, allowed_yaw_rate))
         return type(action)(x, y, allowed_up, allowed_yaw_rate), tuple(clamps)
-
-
-class Episodes:
-    """Which limits are touched now, so that each is published once and not with every repeat of a set-point."""
-
-    def __init__(self) -> None:
-        self._touched_ns: dict[tuple[str, str], int] = {}
-
-    def begun(self, clamps: tuple[Clamp, ...], now_ns: int) -> list[Clamp]:
-        """Return those of the clamps that begin an episode."""
-        touched, since_ns = self._touched_ns, now_ns - EPISODE_NS
-        new = [clamp for clamp in clamps if touched.get((clamp.limit, clamp.zone), since_ns) <= since_ns]
-        for clamp in clamps:
-            touched[clamp.limit, clamp.zone] = now_ns
-        return new

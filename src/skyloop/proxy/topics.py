@@ -1,0 +1,277 @@
+"""What a proxy publishes, and to whom: the topics there are, and those that are published only as somebody asks.
+
+No others can be subscribed to, so that made-up names cost nothing.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Collection
+from typing import Final, Generic, Protocol, TypeVar
+
+import msgspec
+
+from skyloop.clock import Clock, nanoseconds
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages import Feedback, FeedbackRequest, Overview, VehicleOverview, VideoRequest, encode
+from skyloop.messages.relayed import PROCESSOR_NAME
+from skyloop.messages.subscription import TOPIC, RateLimiter
+from skyloop.proxy.events import Counters
+from skyloop.transport.base import (
+    ANNOTATIONS,
+    COMMANDS,
+    EVENTS,
+    FEEDBACK,
+    LOGS,
+    OVERVIEW,
+    RESULTS,
+    TransportServer,
+    stream,
+    video,
+)
+
+#: The topics without a name in them.
+PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
+STREAM_TOPIC: Final = stream("")  #: how the topic of each stream begins
+PREFIX: Final = f"{TOPIC}?"  #: and that of each form of feedback
+_VIDEO_TOPIC: Final = video("")
+_RESULTS_TOPIC: Final = RESULTS + "/"
+
+MAX_VARIANTS: Final = 16  #: forms of feedback at a time, however many subscribers each has
+#: A form that was asked for and has no subscriber keeps its place for so long: its subscription may be under way.
+KEEP_NS: Final = nanoseconds(5.0)
+PERIOD_NS: Final = nanoseconds(1.0)  #: between two overviews
+_FRESH_NS: Final = PERIOD_NS // 2  # an overview so young is sent again instead of making another one
+_replace = msgspec.structs.replace
+
+
+def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
+    """Return why a topic can't be subscribed to, with those that can; empty if it can.
+
+    What a processor finds may be waited for before it has a worker.
+    """
+    if topic in PLAIN:
+        return ""
+    if topic.startswith(_RESULTS_TOPIC):
+        name = topic.removeprefix(_RESULTS_TOPIC)
+        known = re.fullmatch(PROCESSOR_NAME, name)
+        return "" if known else f"{name[:64]!r} is no name of a processor: it has 1 to 64 letters, digits and _ . -"
+    if topic.startswith((STREAM_TOPIC, _VIDEO_TOPIC)):
+        try:
+            return camera_problem(VideoRequest.parse(topic).camera, cameras)
+        except UsageError as error:
+            return str(error)
+    return UnknownNameError("topic", topic[:64], {*PLAIN, *map(video, cameras()), *map(stream, cameras())}).message
+
+
+def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
+    """Return why this is no camera of the vehicle, with those that are; empty if it is one."""
+    known = cameras()
+    return "" if camera in known else UnknownNameError("camera of this vehicle", camera[:64], known).message
+
+
+# Feedback at fewer samples a second, and what it has in common with encoded video ----------------------------------
+
+
+class Form(Protocol):
+    """A form in which samples are asked for: what is published on one topic."""
+
+    topic: str
+    asked_ns: int  #: when somebody asked for it last
+
+
+F = TypeVar("F", bound=Form)
+
+
+class Forms(Generic[F]):
+    """The forms that have, or may soon have, subscribers. Any thread.
+
+    Args:
+        most: How many there are at a time.
+        subscribers: Returns how many a topic has.
+        clock: The proxy's clock [ns].
+    """
+
+    def __init__(self, most: int, subscribers: Callable[[str], int], clock: Clock) -> None:
+        self.known: tuple[F, ...] = ()
+        self._most = most
+        self._subscribers = subscribers
+        self._clock = clock
+        self._lock = threading.Lock()  # guards changes of what is known
+
+    def find(self, topic: str) -> F | None:
+        """Return the form of a topic; None if nobody has asked for it."""
+        return next((form for form in self.known if form.topic == topic), None)
+
+    def claim(self, topic: str, make: Callable[[], F]) -> bool:
+        """Give a form a place, or keep the one that it has.
+
+        Args:
+            topic: The form's.
+            make: Makes it if it has none.
+
+        Returns:
+            False if all places are taken.
+        """
+        now_ns = self._clock()
+        with self._lock:
+            form = self.find(topic)
+            if form is None:
+                kept = [one for one in self.known if now_ns - one.asked_ns < KEEP_NS or self._subscribers(one.topic)]
+                if len(kept) >= self._most:
+                    return False
+                form = make()
+                self.known = (*kept, form)
+            form.asked_ns = now_ns
+        return True
+
+
+class _Variant:
+    """One form of feedback."""
+
+    def __init__(self, topic: str, request: FeedbackRequest) -> None:
+        self.topic = topic
+        self.rate = RateLimiter(request.max_hz)
+        self.asked_ns = 0
+        self.last_seq = 0
+
+
+class FeedbackVariants(Forms[_Variant]):
+    """The forms of feedback that have, or may soon have, subscribers."""
+
+    def __init__(self, server: TransportServer, counters: Counters, clock: Clock) -> None:
+        super().__init__(MAX_VARIANTS, server.subscribers, clock)
+        self._publish = server.publish
+        self._counts = counters.counts
+
+    def problem(self, topic: str) -> str:
+        """Return why a form can't be subscribed to; empty if it can, and then it has a place here. Any thread.
+
+        Args:
+            topic: Of feedback, with options.
+        """
+        try:
+            request = FeedbackRequest.parse(topic)
+        except UsageError as error:
+            return str(error)
+        if self.claim(topic, lambda: _Variant(topic, request)):
+            return ""
+        return (
+            f"this proxy sends feedback in {MAX_VARIANTS} forms at most at a time, and all are in use: "
+            f"subscribe to {TOPIC}, or to one of {', '.join(one.topic for one in self.known[:4])} …"
+        )
+
+    def publish(self, sample: Feedback, now_ns: int) -> None:
+        """Publish a sample in each form in which it is due. One thread at a time.
+
+        Args:
+            sample: As it is published to those who get all.
+            now_ns: The present time; not that of capture, which stands still while the vehicle is silent.
+        """
+        for variant in self.known:
+            if not self._subscribers(variant.topic) or not variant.rate.in_time(now_ns):
+                continue
+            skipped = sample.seq - variant.last_seq - 1 if variant.last_seq else 0
+            variant.last_seq = sample.seq
+            selected = _replace(sample, skipped=skipped)
+            try:
+                packet = encode(selected)
+            except (ValueError, TypeError, OverflowError):  # its native telemetry, as was published with the whole one
+                packet = encode(_replace(selected, native=None))
+            missed = self._publish(variant.topic, packet)
+            self._counts["feedback.selected"] += 1
+            if missed:
+                self._counts["feedback.missed"] += missed
+
+
+# The overview: a row of the vehicle, and of all others of the same process ------------------------------------------
+
+
+class OverviewRegistry:
+    """The rows of all proxies of a process, made and encoded once for all that publish them. Any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sources: dict[Callable[[], VehicleOverview], None] = {}
+        self._seq = 0
+        self._made_ns: int | None = None
+        self._packets: list[bytes] = []
+
+    def add(self, row: Callable[[], VehicleOverview]) -> None:
+        """Add a vehicle.
+
+        Args:
+            row: Returns its row; called on any proxy's ticker.
+        """
+        with self._lock:
+            self._sources[row] = None
+            self._made_ns = None
+
+    def remove(self, row: Callable[[], VehicleOverview]) -> None:
+        """Remove a vehicle. Does nothing if it is not there."""
+        with self._lock:
+            self._sources.pop(row, None)
+            self._made_ns = None
+
+    def packets(self, now_ns: int) -> list[bytes]:
+        """Return the overview of now, encoded, in as many packets as it needs."""
+        with self._lock:
+            if self._made_ns is None or not 0 <= now_ns - self._made_ns < _FRESH_NS:
+                rows = sorted((row() for row in self._sources), key=lambda row: row.name)
+                self._seq += 1
+                self._made_ns = now_ns
+                whole = Overview(at_ns=now_ns, seq=self._seq, total=len(rows), vehicles=tuple(rows))
+                self._packets = _encoded(whole)
+            return self._packets
+
+
+class OverviewPublisher:
+    """Publishes the overview on one proxy's transport while anybody subscribes to it, once a second.
+
+    A new subscriber is sent one at once.
+    """
+
+    def __init__(self, server: TransportServer, row: Callable[[], VehicleOverview]) -> None:
+        self.registry = OverviewRegistry()  #: whose rows are published; by default only one's own
+        self._server = server
+        self._row = row
+        self._subscribers = 0
+        self._due_ns = 0
+
+    def share(self, registry: OverviewRegistry) -> None:
+        """Publish the rows of others too, and give them one's own. Call before :meth:`begin`.
+
+        Does nothing where applications may be let in to one proxy and not to another: they would see the others' rows.
+        """
+        if not self._server.restricted:
+            self.registry = registry
+
+    def begin(self) -> None:
+        """Show the vehicle in the overview."""
+        self.registry.add(self._row)
+
+    def end(self) -> None:
+        """Show it no longer."""
+        self.registry.remove(self._row)
+
+    def tick(self, now_ns: int) -> None:
+        """Publish the overview if it is due. Call some times a second."""
+        before, self._subscribers = self._subscribers, self._server.subscribers(OVERVIEW)
+        if self._subscribers and (self._subscribers > before or now_ns >= self._due_ns):
+            self._due_ns = now_ns + PERIOD_NS
+            for packet in self.registry.packets(now_ns):
+                self._server.publish(OVERVIEW, packet)
+
+
+def _encoded(page: Overview) -> list[bytes]:
+    """Encode rows to one packet, or to several if they are too many for one."""
+    try:
+        return [encode(page)]
+    except ValueError:
+        if len(page.vehicles) < 2:
+            raise
+        half = len(page.vehicles) // 2
+        one = _replace(page, vehicles=page.vehicles[:half])
+        other = _replace(page, first=page.first + half, vehicles=page.vehicles[half:])
+        return _encoded(one) + _encoded(other)
