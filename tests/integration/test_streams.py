@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, streams
-from skyloop.client.streams import MOST_WAITING, StreamChannel, StreamDecoder
+from skyloop.client.video import MOST_WAITING, StreamChannel, StreamDecoder
 from skyloop.errors import UsageError
 from skyloop.messages import EncodedFrame
 from skyloop.messages.encoded import Chain

@@ -22,8 +22,8 @@ from skyloop.client.logbook import Logbook
 from skyloop.client.mailbox import Notifier
 from skyloop.client.parameters import Config, Restorer
 from skyloop.client.results import ResultChannel, checked_age, checked_name
-from skyloop.client.streams import StreamChannel
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
+from skyloop.client.video import StreamChannel
 from skyloop.client.worker import Membership
 from skyloop.errors import (
     ClosedError,

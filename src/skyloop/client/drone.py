@@ -50,8 +50,8 @@ from skyloop.client.results import (
     silence,
 )
 from skyloop.client.statistics import ChannelStats, Distribution
-from skyloop.client.streams import StreamChannel
 from skyloop.client.telemetry import LinkStatus, Wanted, as_predicate
+from skyloop.client.video import StreamChannel
 from skyloop.errors import (
     AuthorityError,
     ClosedError,

@@ -21,7 +21,7 @@ from skyloop.client.mailbox import Mailbox
 from skyloop.client.parameters import Restorer
 from skyloop.client.results import Result, ResultChannels, ResultMailbox
 from skyloop.client.statistics import ChannelCounter, ChannelStats
-from skyloop.client.streams import StreamChannel, StreamDecoder
+from skyloop.client.video import StreamChannel, StreamDecoder
 from skyloop.errors import UnknownNameError
 from skyloop.messages import (
     Annotation,

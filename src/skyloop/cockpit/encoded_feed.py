@@ -20,7 +20,7 @@ from skyloop.messages import CameraInfo, EncodedFrame
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.client.streams import StreamChannel
+    from skyloop.client.video import StreamChannel
 
 KEPT: Final = 16  #: newest pictures of a form; who is further behind goes on with a key picture
 SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: of pictures in panes, so that like panes share a form
