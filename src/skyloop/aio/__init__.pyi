@@ -5,7 +5,7 @@ from pathlib import Path
 from skyloop import client
 from skyloop.aio.bridge import Callback as Callback, Opening, T
 from skyloop.client.authority import Authority, AuthorityStatus, TakeoverAnswer, TakeoverRequest, TakeoverWay
-from skyloop.client.channels import VideoOptions
+from skyloop.client.video import VideoOptions
 from skyloop.client.connect import ConnectOptions, Missing, NetworkChoice, Target
 from skyloop.client.core import Access, OnExit
 from skyloop.client.frame import Arrival, Frame

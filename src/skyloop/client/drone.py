@@ -23,7 +23,7 @@ from skyloop.client.authority import (
     answering,
     authority_request,
 )
-from skyloop.client.channels import Channel, Listener, VideoOptions
+from skyloop.client.channels import Channel, Listener, Mailbox
 from skyloop.client.commands import (
     above_zero,
     all_finite,
@@ -39,7 +39,6 @@ from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.inspection import inspect
 from skyloop.client.logbook import checked_time
-from skyloop.client.mailbox import Mailbox
 from skyloop.client.preflight import PreflightFinding
 from skyloop.client.results import (
     Result,
@@ -51,7 +50,7 @@ from skyloop.client.results import (
 )
 from skyloop.client.statistics import ChannelStats, Distribution
 from skyloop.client.telemetry import LinkStatus, Wanted, as_predicate
-from skyloop.client.video import StreamChannel
+from skyloop.client.video import StreamChannel, VideoOptions
 from skyloop.errors import (
     AuthorityError,
     ClosedError,

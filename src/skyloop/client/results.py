@@ -11,10 +11,9 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 
-from skyloop.client.channels import Channel, Listener
+from skyloop.client.channels import Channel, Listener, Mailbox, Notifier
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.mailbox import Mailbox, Notifier
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, UsageError

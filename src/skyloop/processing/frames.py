@@ -8,9 +8,9 @@ from types import TracebackType
 from typing import Self
 
 from skyloop.client import Drone, Frame
-from skyloop.client.channels import VideoChannel
+from skyloop.client.channels import Mailbox
 from skyloop.client.frame import Arrival
-from skyloop.client.mailbox import Mailbox
+from skyloop.client.video import VideoChannel
 from skyloop.client.worker import Membership
 from skyloop.extend import video_channel
 from skyloop.messages import ProcessorShare
