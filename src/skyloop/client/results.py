@@ -13,7 +13,7 @@ import msgspec
 
 from skyloop.client.channels import Channel, Listener, Mailbox, Notifier
 from skyloop.client.connection import ProxyConnection, Scheduler
-from skyloop.client.feedback_history import FeedbackHistory
+from skyloop.client.frame import FeedbackHistory
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, UsageError

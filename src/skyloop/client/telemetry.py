@@ -15,8 +15,7 @@ from skyloop.client.channels import Channel, FollowingChannel, Mailbox
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.feedback_demand import FeedbackChannel, FeedbackDemand
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.frame import Arrival, Frame
+from skyloop.client.frame import Arrival, FeedbackHistory, Frame
 from skyloop.client.parameters import Restorer
 from skyloop.client.results import Result, ResultChannels, ResultMailbox
 from skyloop.client.statistics import ChannelCounter, ChannelStats

@@ -11,8 +11,7 @@ import numpy as np
 
 from skyloop.client.channels import Channel
 from skyloop.client.connection import ProxyConnection, Scheduler
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.frame import Arrival, Frame, SmallArrival
+from skyloop.client.frame import Arrival, FeedbackHistory, Frame, SmallArrival
 from skyloop.client.link_monitor import StallWatch
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
