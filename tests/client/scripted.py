@@ -15,7 +15,7 @@ from skyloop.client import Authority
 from skyloop.client.channels import Notifier
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone, open_drone
-from skyloop.client.link_monitor import Thresholds
+from skyloop.client.monitoring import Thresholds
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,

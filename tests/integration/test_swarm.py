@@ -20,7 +20,7 @@ from skyloop.client.commands import cancelled
 from skyloop.client.connect import choose
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import open_drone
-from skyloop.client.link_monitor import Thresholds
+from skyloop.client.monitoring import Thresholds
 from skyloop.client.swarm import in_parallel
 from skyloop.errors import (
     AuthorityError,

@@ -6,8 +6,8 @@ from skyloop.client.connect import Network, connect, swarm
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone
 from skyloop.client.frame import Frame
-from skyloop.client.link_monitor import Thresholds
 from skyloop.client.logbook import Logbook
+from skyloop.client.monitoring import Thresholds
 from skyloop.client.parameters import Config
 from skyloop.client.preflight import Level, PreflightFinding
 from skyloop.client.results import Result

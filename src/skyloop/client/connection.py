@@ -12,7 +12,7 @@ from functools import partial
 from typing import Final
 
 from skyloop.client.channels import Notifier
-from skyloop.client.link_monitor import Thresholds
+from skyloop.client.monitoring import Thresholds
 from skyloop.client.session import ConnectionHandler, ProxySession
 from skyloop.clock import Clock, nanoseconds
 from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError

@@ -12,7 +12,7 @@ import numpy as np
 from skyloop.client.channels import Channel
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.frame import Arrival, FeedbackHistory, Frame, SmallArrival
-from skyloop.client.link_monitor import StallWatch
+from skyloop.client.monitoring import StallWatch
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError
