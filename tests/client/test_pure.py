@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.client.frame import FeedbackHistory, interpolate
-from skyloop.client.monitoring import MAX_DRIFT, OffsetEstimator
-from skyloop.client.statistics import DEPTH, ChannelCounter, distribution
+from skyloop.client.monitoring import DEPTH, MAX_DRIFT, ChannelCounter, OffsetEstimator, distribution
 from skyloop.messages import Feedback, FlightState
 
 angles = st.floats(-math.pi, math.pi)

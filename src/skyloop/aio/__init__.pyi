@@ -11,7 +11,7 @@ from skyloop.client.core import Access, OnExit
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.preflight import PreflightFinding
 from skyloop.client.results import Result
-from skyloop.client.statistics import ChannelStats, Distribution
+from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.client.swarm import OnError, Tick
 from skyloop.client.telemetry import LinkStatus, Wanted
 from skyloop.messages import (

@@ -7,11 +7,10 @@ from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone
 from skyloop.client.frame import Frame
 from skyloop.client.logbook import Logbook
-from skyloop.client.monitoring import Thresholds
+from skyloop.client.monitoring import ChannelStats, Distribution, Thresholds
 from skyloop.client.parameters import Config
 from skyloop.client.preflight import Level, PreflightFinding
 from skyloop.client.results import Result
-from skyloop.client.statistics import ChannelStats, Distribution
 from skyloop.client.swarm import Swarm
 from skyloop.client.telemetry import LinkStatus
 

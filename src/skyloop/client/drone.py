@@ -39,6 +39,7 @@ from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.inspection import inspect
 from skyloop.client.logbook import checked_time
+from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.client.preflight import PreflightFinding
 from skyloop.client.results import (
     Result,
@@ -48,7 +49,6 @@ from skyloop.client.results import (
     is_old,
     silence,
 )
-from skyloop.client.statistics import ChannelStats, Distribution
 from skyloop.client.telemetry import LinkStatus, Wanted, as_predicate
 from skyloop.client.video import StreamChannel, VideoOptions
 from skyloop.errors import (

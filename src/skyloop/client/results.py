@@ -14,7 +14,7 @@ import msgspec
 from skyloop.client.channels import Channel, Listener, Mailbox, Notifier
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.frame import FeedbackHistory
-from skyloop.client.statistics import ChannelCounter, ChannelStats
+from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import Feedback, ProcessorResult

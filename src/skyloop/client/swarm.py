@@ -27,7 +27,7 @@ from skyloop.client.commands import (
     return_action,
 )
 from skyloop.client.drone import Drone
-from skyloop.client.statistics import DEPTH, Distribution, distribution
+from skyloop.client.monitoring import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
 from skyloop.errors import (
     AuthorityError,

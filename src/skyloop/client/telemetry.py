@@ -16,9 +16,9 @@ from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.feedback_demand import FeedbackChannel, FeedbackDemand
 from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.client.parameters import Restorer
 from skyloop.client.results import Result, ResultChannels, ResultMailbox
-from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.client.video import StreamChannel, StreamDecoder, VideoChannel, usual
 from skyloop.errors import UnknownNameError
 from skyloop.messages import (

@@ -12,8 +12,7 @@ import numpy as np
 from skyloop.client.channels import Channel
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.frame import Arrival, FeedbackHistory, Frame, SmallArrival
-from skyloop.client.monitoring import StallWatch
-from skyloop.client.statistics import ChannelCounter, ChannelStats
+from skyloop.client.monitoring import ChannelCounter, ChannelStats, StallWatch
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError
 from skyloop.messages import CameraInfo, EncodedFrame, FrameHeader, StreamReport, VideoRequest, encode

@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from skyloop.client.statistics import ChannelCounter, ChannelStats
+from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.clock import Clock, monotonic_ns, seconds
 from skyloop.cockpit.broadcast import Wake, call_soon
 from skyloop.extend import stream_channel
