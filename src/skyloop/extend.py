@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Unpack
 if TYPE_CHECKING:
     from skyloop.client import ChannelStats, Drone, Listener
     from skyloop.client.core import DroneOptions, InboxOptions, StreamOptions
+    from skyloop.client.publishing import Membership
     from skyloop.client.telemetry import Mailboxes
     from skyloop.client.video import StreamChannel, VideoChannel
-    from skyloop.client.worker import Membership
     from skyloop.errors import SkyloopError
     from skyloop.messages import AnyAction, Feedback, Outcome
     from skyloop.transport.base import Dialer

@@ -20,10 +20,10 @@ from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.logbook import Logbook
 from skyloop.client.parameters import Config, Restorer
+from skyloop.client.publishing import Membership
 from skyloop.client.results import ResultChannel, checked_age, checked_name
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
 from skyloop.client.video import StreamChannel, VideoChannel
-from skyloop.client.worker import Membership
 from skyloop.errors import (
     ClosedError,
     LinkError,
