@@ -6,10 +6,10 @@ from skyloop.client.connect import Network, connect, swarm
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone
 from skyloop.client.frame import Frame
-from skyloop.client.logbook import Logbook
 from skyloop.client.monitoring import ChannelStats, Distribution, Thresholds
 from skyloop.client.parameters import Config
 from skyloop.client.preflight import Level, PreflightFinding
+from skyloop.client.publishing import Logbook
 from skyloop.client.results import Result
 from skyloop.client.swarm import Swarm
 from skyloop.client.telemetry import LinkStatus

@@ -18,9 +18,8 @@ from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
 from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
-from skyloop.client.logbook import Logbook
 from skyloop.client.parameters import Config, Restorer
-from skyloop.client.publishing import Membership
+from skyloop.client.publishing import Logbook, Membership
 from skyloop.client.results import ResultChannel, checked_age, checked_name
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
 from skyloop.client.video import StreamChannel, VideoChannel

@@ -37,9 +37,9 @@ from skyloop.client.commands import (
 from skyloop.client.completion import ReturnWatch, is_there
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
-from skyloop.client.logbook import checked_time
 from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.client.preflight import PreflightFinding, inspect
+from skyloop.client.publishing import checked_time
 from skyloop.client.results import (
     Result,
     ResultListener,
