@@ -14,7 +14,7 @@ from benchmarks.moving_scene import MovingScene
 from benchmarks.video_judge import SIZE, Judge
 from skyloop.bench import CAMERA
 from skyloop.client import Drone, Frame
-from skyloop.client.channels import VideoOptions
+from skyloop.client.video import VideoOptions
 from skyloop.messages import CameraInfo
 from skyloop.network import FabricServer
 from skyloop.network.settings import LEASE_S as DEFAULT_LEASE_S

@@ -25,8 +25,8 @@ import numpy as np
 
 from skyloop.cli.text import columns
 from skyloop.client import Distribution, Drone, Frame, Swarm, swarm
-from skyloop.client.connect import Target
-from skyloop.client.statistics import distribution
+from skyloop.client.monitoring import distribution
+from skyloop.client.swarm import Target
 from skyloop.control import Controller
 from skyloop.errors import SkyloopError
 from skyloop.extend import Known

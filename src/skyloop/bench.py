@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.client import Drone, Frame, connect
-from skyloop.client.channels import VideoOptions
+from skyloop.client.video import VideoOptions
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import LinkError, NoAnswerError

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Unpack
 
 if TYPE_CHECKING:
     from skyloop.client import ChannelStats, Drone, Listener
-    from skyloop.client.channels import VideoChannel
     from skyloop.client.core import DroneOptions, InboxOptions, StreamOptions
-    from skyloop.client.streams import StreamChannel
+    from skyloop.client.publishing import Membership
     from skyloop.client.telemetry import Mailboxes
-    from skyloop.client.worker import Membership
+    from skyloop.client.video import StreamChannel, VideoChannel
     from skyloop.errors import SkyloopError
     from skyloop.messages import AnyAction, Feedback, Outcome
     from skyloop.transport.base import Dialer

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.swarm_flight import SwarmFlight, fly, missed, report
-from skyloop.client.statistics import Distribution
+from skyloop.client.monitoring import Distribution
 from tests.processes.conftest import Process
 
 DRONES = 10

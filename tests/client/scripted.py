@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 
 from skyloop.client import Authority
+from skyloop.client.channels import Notifier
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone, open_drone
-from skyloop.client.link_monitor import Thresholds
-from skyloop.client.mailbox import Notifier
+from skyloop.client.monitoring import Thresholds
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,

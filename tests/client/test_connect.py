@@ -18,10 +18,8 @@ from typing import Any
 import pytest
 
 import skyloop
-from skyloop.client import private_proxy
-from skyloop.client.connect import _script_name, connect, network_settings
+from skyloop.client.connect import PrivateProxy, _script_name, connect, network_settings
 from skyloop.client.drone import open_drone
-from skyloop.client.private_proxy import PrivateProxy
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import FlightState, LinkState
 from skyloop.messages.feedback import WAKING_UP
@@ -31,6 +29,7 @@ from tests.client.scripted import ScriptedProxy
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the local transport needs Linux")
 ROOT = Path(__file__).parents[2]
+CONNECT = sys.modules["skyloop.client.connect"]  # the module: its function has the same name
 
 #: A stand-in for ``skyloop proxy``: a scripted proxy on the local transport, that ends with its parent.
 CHILD = """
@@ -187,7 +186,7 @@ def test_a_private_proxy_ends_with_the_drone() -> None:
 @pytest.mark.process
 def test_a_private_proxy_that_still_lands_its_vehicle_is_left_to_that(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who closes a drone in the air waits for a moment only, and its proxy is not terminated meanwhile."""
-    monkeypatch.setattr(private_proxy, "GRACE_S", 0.1)
+    monkeypatch.setattr(CONNECT, "GRACE_S", 0.1)
     lands = CHILD.replace("os.read(descriptor, 1)", "os.read(descriptor, 1); import time; time.sleep(1.0)")
     proxy = PrivateProxy("fake://", command(lands))
     drone = open_drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close, timeout_s=20.0)
@@ -227,7 +226,7 @@ def test_a_vehicle_that_still_wakes_up_is_waited_for(alpha: ScriptedProxy, caplo
 
 @pytest.mark.process
 def test_by_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(private_proxy, "PrivateProxy", lambda uri: PrivateProxy(uri, command(CHILD)))
+    monkeypatch.setattr(CONNECT, "PrivateProxy", lambda uri: PrivateProxy(uri, command(CHILD)))
     with connect("fake://here") as drone:
         assert drone.authority.state == "held"
     with pytest.raises(UsageError, match="rate_hz"):
@@ -264,7 +263,7 @@ def test_a_private_proxy_that_cannot_start() -> None:
 
 @pytest.mark.process
 def test_a_private_proxy_that_takes_too_long_and_does_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(private_proxy, "GRACE_S", 0.2)
+    monkeypatch.setattr(CONNECT, "GRACE_S", 0.2)
     code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('x', flush=True); time.sleep(60)"
     proxy = PrivateProxy("fake://", [sys.executable, "-c", code])
     try:
@@ -283,7 +282,7 @@ def test_a_private_proxy_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
         """
         import sys, time
         sys.path.insert(0, {root!r})
-        from skyloop.client.private_proxy import PrivateProxy
+        from skyloop.client.connect import PrivateProxy
         proxy = PrivateProxy("fake://", {command!r})
         print(proxy.pid, flush=True)
         time.sleep(60)

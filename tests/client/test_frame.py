@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.frame import Arrival, size_error, to_bgr
+from skyloop.client.frame import Arrival, FeedbackHistory, size_error, to_bgr
 from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Encoding, Feedback, FrameHeader, Intrinsics
 

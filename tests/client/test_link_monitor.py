@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.client.link_monitor import LinkMonitor, StallWatch, Thresholds
+from skyloop.client.monitoring import LinkMonitor, StallWatch, Thresholds
 from skyloop.clock import ManualClock
 from skyloop.messages import LinkState
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.client.mailbox import Mailbox, Notifier
+from skyloop.client.channels import Mailbox, Notifier
 
 
 def in_thread(function: Callable[[], object]) -> threading.Thread:

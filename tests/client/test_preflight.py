@@ -12,8 +12,7 @@ import pytest
 
 import skyloop
 from skyloop.client import Level, LinkStatus, PreflightFinding
-from skyloop.client.inspection import inspect
-from skyloop.client.preflight import PreflightState, check_before_flight
+from skyloop.client.preflight import PreflightState, check_before_flight, inspect
 from skyloop.errors import ClosedError, NoAnswerError
 from skyloop.messages import CameraInfo, Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.parameter import MAX_CHECKUP_TEXT, Diagnostic, decode_checkup, encode_checkup
@@ -240,7 +239,7 @@ def test_a_link_that_is_down_is_a_line_and_no_error(tmp_path: Path, monkeypatch:
     def unreadable(_: Path) -> None:
         raise OSError("not readable")
 
-    monkeypatch.setattr("skyloop.client.inspection.shutil.disk_usage", unreadable)
+    monkeypatch.setattr("skyloop.client.preflight.shutil.disk_usage", unreadable)
     absent: Any = Absent(NoAnswerError("no answer to a read of parameters"))
     found = {finding.check: finding for finding in inspect(absent, None, 0.0, tmp_path / "not" / "there")}
     assert found["link"].level is Level.FAIL

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.client.feedback_history import FeedbackHistory, interpolate
-from skyloop.client.link_monitor import MAX_DRIFT, OffsetEstimator
-from skyloop.client.statistics import DEPTH, ChannelCounter, distribution
+from skyloop.client.frame import FeedbackHistory, interpolate
+from skyloop.client.monitoring import DEPTH, MAX_DRIFT, ChannelCounter, OffsetEstimator, distribution
 from skyloop.messages import Feedback, FlightState
 
 angles = st.floats(-math.pi, math.pi)

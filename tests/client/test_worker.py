@@ -10,7 +10,7 @@ import pytest
 
 from skyloop.client import Drone, Result
 from skyloop.client.drone import open_drone
-from skyloop.client.worker import Membership
+from skyloop.client.publishing import Membership
 from skyloop.errors import NameTakenError, UnknownNameError, UsageError
 from tests.client.scripted import QUICK
 from tests.integration.fake_vehicle import FakeVehicle

@@ -17,9 +17,8 @@ import numpy as np
 
 from skyloop.client import Authority, Drone
 from skyloop.client.drone import open_drone
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.frame import Arrival, Frame
-from skyloop.client.statistics import ChannelStats, Distribution
+from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.cockpit.access import Gate, OpenGate
 from skyloop.cockpit.alarms import PARAMETERS, USUAL
 from skyloop.cockpit.app import create_app

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.frame import Arrival, compressed
+from skyloop.client.frame import Arrival, FeedbackHistory, compressed
 from skyloop.cockpit.frame_keeper import KEPT_S, STRIDE_S, KeptFrames
 from skyloop.errors import RefusedError
 from skyloop.messages import Encoding, FrameHeader

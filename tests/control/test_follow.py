@@ -10,8 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.frame import Arrival, Frame
+from skyloop.client.frame import Arrival, FeedbackHistory, Frame
 from skyloop.control.follow import FollowMarker, FollowScore
 from skyloop.control.follow_law import Mode
 from skyloop.errors import UnknownNameError

@@ -14,8 +14,7 @@ import pytest
 
 from benchmarks.tracking_scenes import texture
 from skyloop.client import Drone
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.frame import Arrival, Frame
+from skyloop.client.frame import Arrival, FeedbackHistory, Frame
 from skyloop.clock import nanoseconds
 from skyloop.control import ChaseSettings, FollowTarget
 from skyloop.control.chase_law import FollowMode, TargetPhase

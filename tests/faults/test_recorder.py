@@ -13,8 +13,8 @@ import pytest
 import skyloop
 from skyloop.cli import record as command
 from skyloop.client import Drone
+from skyloop.client.channels import Notifier
 from skyloop.client.drone import open_drone
-from skyloop.client.mailbox import Notifier
 from skyloop.errors import SkyloopError
 from skyloop.messages import Applied, Capabilities, Event, EventKind, Feedback, Idle, LogEntry, Severity
 from skyloop.proxy import Proxy

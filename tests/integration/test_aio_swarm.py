@@ -29,7 +29,7 @@ def field(monkeypatch: pytest.MonkeyPatch) -> Iterator[Field]:
             raise UnknownNameError("running proxy", target, NAMES)
         return field.connect(target, **options)
 
-    monkeypatch.setattr(sys.modules["skyloop.client.connect"], "connect", connect)
+    monkeypatch.setattr(sys.modules["skyloop.client.swarm"], "connect", connect)
     yield field
     field.stop()
 

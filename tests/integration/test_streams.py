@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from skyloop.client import Drone, streams
-from skyloop.client.streams import MOST_WAITING, StreamChannel, StreamDecoder
+from skyloop.client import Drone, video
+from skyloop.client.video import MOST_WAITING, StreamChannel, StreamDecoder
 from skyloop.errors import UsageError
 from skyloop.messages import EncodedFrame
 from skyloop.messages.frame import Chain
@@ -184,7 +184,7 @@ def test_a_decoder_that_is_too_slow_goes_on_with_a_key(far: Node) -> None:
 
 
 def test_after_a_silence_the_stream_goes_on_without_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "_IDLE_S", 0.01)
+    monkeypatch.setattr(video, "_IDLE_S", 0.01)
     encoder, stream = H264Encoder(32, 24, 30.0, 200), Mock(spec=StreamChannel)
     shown: queue.Queue[int] = queue.Queue()
     decoder = StreamDecoder(stream, lambda header, _pixels, _came_ns: shown.put(header.seq), time.monotonic_ns, "d")

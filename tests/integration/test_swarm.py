@@ -17,11 +17,10 @@ import pytest
 import skyloop
 from skyloop.client import Authority, Drone, Swarm
 from skyloop.client.commands import cancelled
-from skyloop.client.connect import choose
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import open_drone
-from skyloop.client.link_monitor import Thresholds
-from skyloop.client.swarm import in_parallel
+from skyloop.client.monitoring import Thresholds
+from skyloop.client.swarm import choose, in_parallel
 from skyloop.errors import (
     AuthorityError,
     ClosedError,
@@ -522,7 +521,7 @@ def test_connecting_reports_all_that_failed_and_leaves_the_others(
             raise UnknownNameError("running proxy", target, NAMES)
         return field.connect(target, **options)
 
-    monkeypatch.setattr(sys.modules["skyloop.client.connect"], "connect", connect)
+    monkeypatch.setattr(sys.modules["skyloop.client.swarm"], "connect", connect)
     with pytest.raises(SwarmError) as raised:
         skyloop.swarm("alpha", "delta", "echo")
     assert list(raised.value.errors) == ["delta", "echo"]

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from skyloop.client.connection import Scheduler
-from skyloop.client.feedback_history import FeedbackHistory
+from skyloop.client.frame import FeedbackHistory
 from skyloop.client.results import MAX_CHANNELS, MAX_WORKERS, Result, ResultChannels, ResultMailbox
 from skyloop.messages import (
     Annotation,

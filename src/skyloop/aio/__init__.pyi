@@ -5,15 +5,15 @@ from pathlib import Path
 from skyloop import client
 from skyloop.aio.bridge import Callback as Callback, Opening, T
 from skyloop.client.authority import Authority, AuthorityStatus, TakeoverAnswer, TakeoverRequest, TakeoverWay
-from skyloop.client.channels import VideoOptions
-from skyloop.client.connect import ConnectOptions, Missing, NetworkChoice, Target
+from skyloop.client.connect import ConnectOptions, NetworkChoice
 from skyloop.client.core import Access, OnExit
 from skyloop.client.frame import Arrival, Frame
+from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.client.preflight import PreflightFinding
 from skyloop.client.results import Result
-from skyloop.client.statistics import ChannelStats, Distribution
-from skyloop.client.swarm import OnError, Tick
+from skyloop.client.swarm import Missing, OnError, Target, Tick
 from skyloop.client.telemetry import LinkStatus, Wanted
+from skyloop.client.video import VideoOptions
 from skyloop.messages import (
     Annotation,
     AnyAction,

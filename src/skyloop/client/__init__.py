@@ -2,17 +2,16 @@
 
 from skyloop.client.authority import Authority, AuthorityState, AuthorityStatus, TakeoverRequest
 from skyloop.client.channels import Listener
-from skyloop.client.connect import Network, connect, swarm
+from skyloop.client.connect import Network, connect
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone
 from skyloop.client.frame import Frame
-from skyloop.client.link_monitor import Thresholds
-from skyloop.client.logbook import Logbook
+from skyloop.client.monitoring import ChannelStats, Distribution, Thresholds
 from skyloop.client.parameters import Config
 from skyloop.client.preflight import Level, PreflightFinding
+from skyloop.client.publishing import Logbook
 from skyloop.client.results import Result
-from skyloop.client.statistics import ChannelStats, Distribution
-from skyloop.client.swarm import Swarm
+from skyloop.client.swarm import Swarm, swarm
 from skyloop.client.telemetry import LinkStatus
 
 #: Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.

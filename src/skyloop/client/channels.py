@@ -1,29 +1,24 @@
-"""Deliver samples from the receiving thread to an application's callbacks, each on a thread of its own."""
+"""Bring samples from the receiving thread to consumers: channels, callbacks, mailboxes in which the newest win."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
+from _thread import LockType, allocate_lock
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from types import TracebackType
-from typing import Any, Final, Generic, Protocol, Self, TypedDict, TypeVar
+from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
-from skyloop.client.connection import ProxyConnection, Scheduler
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.frame import Arrival, Frame, SmallArrival
-from skyloop.client.link_monitor import StallWatch
-from skyloop.client.mailbox import Holder, Mailbox
-from skyloop.client.statistics import ChannelCounter, ChannelStats
-from skyloop.errors import ClosedError, DecodeError, SkyloopError
-from skyloop.messages import CameraInfo, EventKind, FrameHeader, Severity, VideoRequest
-from skyloop.messages.subscription import FrameFilter, VideoEncoding
-from skyloop.transport.base import Pixels, video
+from skyloop.errors import ClosedError, SkyloopError
+from skyloop.messages import EventKind, Severity
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Channel[Any]")
+T_contra = TypeVar("T_contra", contravariant=True)
 
 #: Called with the name of a listener and the exception that its function raised.
 Report = Callable[[str, Exception | SystemExit], None]
@@ -145,7 +140,7 @@ class FollowingChannel(Channel[T], Generic[T, C]):
         """Deliver to ``consumer`` too; see :meth:`Channel.add`."""
         with self._lock:
             if not self._drops:
-                self._changes.add(self._looks, _none)
+                self._changes.add(self._looks, lambda: 0)
             self._drops[consumer] = dropped
             self.current.add(consumer, dropped)
 
@@ -165,137 +160,8 @@ class FollowingChannel(Channel[T], Generic[T, C]):
                 self.current.add(consumer, partial(_since, dropped, dropped()))
 
 
-def _none() -> int:
-    return 0
-
-
 def _since(dropped: Callable[[], int], before: int) -> int:
     return dropped() - before
-
-
-class VideoChannel(Channel[Arrival]):
-    """Frames of one camera, as one request wants them."""
-
-    def __init__(
-        self,
-        camera: CameraInfo,
-        connection: ProxyConnection,
-        scheduler: Scheduler,
-        history: FeedbackHistory,
-        request: VideoRequest | None = None,
-    ) -> None:
-        """Make a channel without consumers.
-
-        Args:
-            camera: The camera.
-            connection: Where its topics are subscribed to.
-            scheduler: Source of the time and of waiting.
-            history: Looked up for the state at a frame's capture.
-            request: How frames are wanted; None: see :func:`usual`.
-        """
-        self.camera = camera
-        self.request = request or usual(camera.name)
-        super().__init__(lambda on: connection.subscribe(self.request.topic, on))
-        #: Names its statistics: the camera's plain topic for the usual request, else the request's own.
-        self.name = video(camera.name) if self.request == usual(camera.name) else self.request.topic
-        self.newest: Arrival | None = None
-        self.notifier = scheduler.notifier()  #: notified with each frame
-        self.counter = ChannelCounter()
-        self.undecodable = 0
-        self.too_old = 0  #: frames that a consumer got and, by its ``max_age_s``, did not want
-        self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
-        self.filter = FrameFilter(self.request)  #: chooses the plain frames that this request asks for
-        self._read: Arrival | None = None  # what next_frame() gave last
-        self._connection = connection
-        self._history = history
-        self._clock = scheduler.clock
-
-    @property
-    def unread(self) -> bool:
-        """Whether there is a frame that :meth:`read` has not returned yet."""
-        return self.newest is not self._read
-
-    def read(self) -> Frame | None:
-        """Return the newest frame and mark it as read; None if there is none or it can't be decoded."""
-        self._read = arrival = self.newest
-        return None if arrival is None else self.picture(arrival)
-
-    def picture(self, arrival: Arrival, max_age_s: float | None = None) -> Frame | None:
-        """Decode the frame; None, and counted, if its pixels can't be decoded, or it is too old.
-
-        Args:
-            arrival: The frame.
-            max_age_s: Oldest age since the capture that is accepted [s]; None: any.
-        """
-        if max_age_s is not None and arrival.age_s > max_age_s:
-            self.too_old += 1
-            return None
-        try:
-            return arrival.frame()
-        except DecodeError:
-            self.undecodable += 1
-            return None
-
-    def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, *, as_asked: bool) -> None:
-        """Publish a frame that came; ignores one that is repeated or was overtaken.
-
-        Args:
-            header: Describes the pixels.
-            pixels: Bytes of the frame, shape (size,), uint8.
-            now_ns: When it came, on this process's clock.
-            as_asked: Whether the proxy made it for this request; if False it is scaled here where needed.
-        """
-        counter = self.counter
-        last = counter.last_seq
-        if last is not None and header.seq <= last:
-            return  # repeated or overtaken
-        offset_ns, scale = self._connection.offset_ns, self.request.scale
-        if as_asked or scale == 1.0:
-            arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock)
-        else:
-            arrival = SmallArrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
-        # Consumers first, then the statistics. The previous frame is released last: giving its memory back to the proxy
-        # takes longer than all of this.
-        before, self.newest = self.newest, arrival
-        self.publish(arrival)
-        self.notifier.notify()
-        del before
-        counter.follow(header.seq)
-        counter.add(now_ns + offset_ns - header.published_ns, header.captured_ns - offset_ns, now_ns)
-        self.watch.received_ns = now_ns
-
-    def restart(self, now_ns: int) -> None:
-        """Reset the frame number: a proxy was connected, which may count its frames from 0."""
-        self.counter.last_seq = None
-        self.watch.received_ns = now_ns
-
-    def stats(self, now_ns: int) -> ChannelStats:
-        """Return the statistics at ``now_ns``."""
-        return self.counter.stats(now_ns, dropped=self.dropped + self.too_old, malformed=self.undecodable)
-
-    def _period_s(self, fps: float) -> float:
-        """Expected time between two frames of this request [s]; 0 if unknown."""
-        most = self.request.max_fps
-        rate = min(fps, most) if fps > 0.0 and most is not None else fps or most or 0.0
-        parts = 1 if self.request.part is None else self.request.part[1]
-        return parts / rate if rate > 0.0 else 0.0
-
-
-class VideoOptions(TypedDict, total=False):
-    """How frames are requested; see :meth:`skyloop.Drone.frames`."""
-
-    encoding: VideoEncoding
-    quality: int
-    max_fps: float
-    scale: float
-    part: tuple[int, int]
-    kbit_s: int
-    max_age_s: float
-
-
-def usual(camera: str) -> VideoRequest:
-    """Return the request of a consumer that asks for nothing in particular: JPEG where frames travel over a network."""
-    return VideoRequest(camera, encoding="jpeg")
 
 
 class Listener(Generic[T]):
@@ -407,3 +273,145 @@ class Listener(Generic[T]):
         self._next_report_s = now_s + _REPORT_EVERY_S
         _log.error("%s raised %r (%d times so far)", self.name, error, self.errors, exc_info=error)
         self._report(self.name, error)
+
+
+class Holder(Protocol[T_contra]):
+    """Whatever samples can be put into: a mailbox, or several that are emptied together."""
+
+    def put(self, item: T_contra, /) -> None:
+        """Add the newest item and wake the consumer."""
+
+    @property
+    def dropped(self) -> int:
+        """Items that newer ones pushed out before they were taken."""
+
+
+class Mailbox(Generic[T]):
+    """Keeps the newest ``depth`` items that its consumer has not taken yet, and counts those that it had to drop.
+
+    Any number of threads put, one takes.
+    """
+
+    __slots__ = ("_items", "_lock", "_offered", "closed", "delivered", "depth", "notifier")
+
+    def __init__(self, depth: int = 1, notifier: Notifier | None = None) -> None:
+        """Make an empty mailbox.
+
+        Args:
+            depth: How many items are kept.
+            notifier: Notified with each item; one that is shared lets a thread wait for several mailboxes. None: an own
+                one.
+        """
+        self.depth = depth
+        self.notifier = notifier or Notifier()
+        self.closed = False
+        self.delivered = 0  #: how many were taken
+        self._offered = 0
+        self._items: deque[T] = deque(maxlen=depth)
+        self._lock = threading.Lock()
+
+    @property
+    def dropped(self) -> int:
+        """Items that newer ones pushed out before they were taken."""
+        with self._lock:
+            return self._offered - self.delivered - len(self._items)
+
+    @property
+    def waiting(self) -> bool:
+        """Whether there is an item to take."""
+        return bool(self._items)
+
+    def put(self, item: T) -> None:
+        """Add the newest item and wake the consumer."""
+        with self._lock:
+            self._offered += 1
+            self._items.append(item)
+        self.notifier.notify()
+
+    def take(self) -> T | None:
+        """Take the oldest of the items kept; None if there is none. Does not wait."""
+        with self._lock:
+            if not self._items:
+                return None
+            self.delivered += 1
+            return self._items.popleft()
+
+    def peek(self) -> T | None:
+        """Return what :meth:`take` would, without taking it."""
+        with self._lock:
+            return self._items[0] if self._items else None
+
+    def wait(self, timeout_s: float | None = None) -> T | None:
+        """Take an item like :meth:`take`, but wait for one.
+
+        Args:
+            timeout_s: How long to wait [s]; None: for ever.
+
+        Returns:
+            The item; None if none came in time or the mailbox was closed.
+        """
+        self.notifier.wait_for(lambda: bool(self._items) or self.closed, timeout_s)
+        return None if self.closed else self.take()
+
+    def close(self) -> None:
+        """Discard what is kept, and wake the consumer, which gets None from now on."""
+        self.closed = True
+        with self._lock:
+            self._offered -= len(self._items)  # discarded items count neither as delivered nor as dropped
+            self._items.clear()
+        self.notifier.notify()
+
+
+class Notifier:
+    """Wakes all threads that wait for a condition. Notifying costs one test when nobody waits.
+
+    Every waiting thread brings its own lock and checks its condition once more after adding it, so that no notification
+    is missed and the notifying thread, which receives for everybody, never acquires a lock.
+    """
+
+    __slots__ = ("_waiting",)
+
+    def __init__(self) -> None:
+        self._waiting: list[LockType] = []
+
+    def notify(self) -> None:
+        """Wake every thread that waits now."""
+        waiting = self._waiting
+        while waiting:
+            try:
+                lock = waiting.pop()
+            except IndexError:  # another thread notified at the same time
+                return
+            lock.release()
+
+    def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
+        """Wait until ``ready()`` is true.
+
+        Args:
+            ready: Checked on this thread, at first and after each notification.
+            timeout_s: How long to wait [s]; None: for ever.
+
+        Returns:
+            Whether it became true in time.
+        """
+        if ready():
+            return True
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            left = -1.0 if deadline is None else min(deadline - time.monotonic(), threading.TIMEOUT_MAX)
+            if deadline is not None and left <= 0.0:
+                return ready()
+            self._sleep(ready, left)
+            if ready():
+                return True
+
+    def _sleep(self, ready: Callable[[], bool], timeout_s: float) -> None:
+        lock = allocate_lock()
+        lock.acquire()
+        self._waiting.append(lock)
+        try:
+            if not ready():
+                lock.acquire(True, timeout_s)
+        finally:
+            with suppress(ValueError):  # the notifying thread has removed it
+                self._waiting.remove(lock)

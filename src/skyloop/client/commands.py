@@ -14,7 +14,7 @@ from skyloop.client.authority import AuthorityStatus, AuthorityTracker
 from skyloop.client.channels import Emit
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.connection import ProxyConnection, Scheduler
-from skyloop.client.statistics import ChannelCounter
+from skyloop.client.monitoring import ChannelCounter
 from skyloop.errors import (
     AuthorityError,
     ClosedError,

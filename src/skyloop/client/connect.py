@@ -1,25 +1,29 @@
-"""Connect to a proxy by name, to a vehicle by address through a private proxy, or to several drones at once."""
+"""Connect to a proxy by name, or to a vehicle by address through a private proxy: a child process that ends with us."""
 
 from __future__ import annotations
 
-import fnmatch
+import itertools
 import os
+import re
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Final, Literal, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar, Unpack
+from typing import Any, Final, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar
 
+from skyloop.address import shown_address
+from skyloop.child_process import GRACE_S, ChildProcess
 from skyloop.client.authority import Authority, check_seconds
 from skyloop.client.connection import Scheduler
 from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
-from skyloop.client.swarm import OnError, Swarm, check_policy, end_flights, in_parallel
 from skyloop.client.warm_up import keeper
-from skyloop.errors import Hint, LinkError, MissingExtraError, SwarmError, UnknownNameError, UsageError
+from skyloop.errors import Hint, LinkError, MissingExtraError, NoAnswerError, UnknownNameError, UsageError
+from skyloop.files import wait_readable
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 from skyloop.warmth import PERIOD_S
 
@@ -29,7 +33,11 @@ START_TIMEOUT_S: Final = 20.0  #: for a private proxy and its vehicle
 CONNECTORS: Final = "skyloop.connectors"
 #: Entry points of what reaches proxies beyond this host: a module as :class:`NetworkTransport`.
 NETWORKS: Final = "skyloop.networks"
-
+NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
+_USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address; it prints why in one line
+_LOOK_S: Final = 0.05
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: as long as the child waits for its vehicle to land
+_numbers = itertools.count(1)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -224,8 +232,6 @@ def _connector(uri: str) -> Connector:
         own: Connector | None = entry.load()(uri)
         if own is not None:
             return own
-    from skyloop.client.private_proxy import PrivateProxy
-
     return PrivateProxy(uri)
 
 
@@ -256,7 +262,84 @@ class Connector(Protocol):
         """End whatever was started. Idempotent."""
 
 
-NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
+class PrivateProxy:
+    """Runs ``python -m skyloop proxy URI`` as a child process.
+
+    The child ends with :meth:`close`, and with this process, however that ends; a vehicle that still flies then on a
+    flight of ours it lands first. Ctrl-C reaches only the application, which can then land.
+    """
+
+    def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
+        """Start the child.
+
+        Args:
+            uri: Address of the vehicle.
+            command: Command line before the address.
+        """
+        scheme = re.sub(r"[^a-z0-9]", "", uri.partition("://")[0].lower()) or "vehicle"
+        self.name = f"{scheme[:16]}-{os.getpid()}-{next(_numbers)}"
+        self.reach = self.name
+        self.uri = shown_address(uri)
+        self.scheduler = Scheduler()
+        self._served = False  # it may have a vehicle in the air
+        self._process = ChildProcess([*command, self.uri, "--name", self.name, "--parent-fd", "0"], handed=uri)
+        self.pid = self._process.pid  #: process id of the child
+
+    def dialer(self, deadline_s: float) -> Dialer:
+        """Return a dialer that at first waits until the proxy serves.
+
+        It raises :class:`NoAnswerError` if that takes too long, :class:`UsageError` if the address makes no sense, and
+        :class:`LinkError` if the child has ended, with the end of what it wrote to standard error.
+
+        Args:
+            deadline_s: Until when it waits at most, on ``time.monotonic``.
+        """
+        inner = _local(self.name)
+
+        def dial(handler: ClientHandler) -> TransportClient:
+            while True:
+                try:
+                    end = inner(handler)
+                except (LinkError, UsageError) as error:
+                    self._check_alive()
+                    if time.monotonic() > deadline_s:
+                        if self._served:
+                            raise
+                        raise NoAnswerError(
+                            f"the proxy for {self.uri} did not start in time{self._process.quoted_output}"
+                        ) from error
+                    self._wait_for_output()
+                else:
+                    self._served = True
+                    return end
+
+        return dial
+
+    def close(self) -> None:
+        """End the child and wait for it, 4 s at most while it lands what flies. Idempotent.
+
+        One that never served is terminated after 4 s, and killed after another 4 s.
+        """
+        self._process.part()
+        if not self._served or self._process.wait(GRACE_S) is not None:
+            self._process.close(GRACE_S, GRACE_S)
+        else:
+            end = partial(self._process.close, ORPHAN_LANDS_WITHIN_S + GRACE_S, GRACE_S)
+            threading.Thread(target=end, name="skyloop-private-proxy", daemon=True).start()
+
+    def _check_alive(self) -> None:
+        child = self._process
+        if child.code is None:
+            return
+        if child.code == _USAGE_ERROR and (words := child.last_words.removeprefix("skyloop: ")):
+            raise UsageError(words)
+        raise LinkError(f"the proxy for {self.uri} {child.ending}{child.quoted_output}")
+
+    def _wait_for_output(self) -> None:
+        """Sleep until the child prints something (that it is ready), ends, or a moment has passed."""
+        stdout = self._process.stdout
+        if wait_readable(stdout, _LOOK_S) and not os.read(stdout.fileno(), 4096):
+            time.sleep(0.005)  # it closed its output and is about to end
 
 
 def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> NetworkSettings | None:
@@ -338,93 +421,6 @@ def _hinting(near: Dialer) -> Dialer:
             raise error.with_hint(Hint.SEARCH_NETWORK) from None
 
     return dialer
-
-
-Target = str | Mapping[str, str]
-Missing = Literal["raise", "skip"]
-_WILD: Final = frozenset("*?[")
-
-
-@explains_moved_options
-def swarm(
-    *targets: Target, on_error: OnError = "continue", missing: Missing = "raise", **options: Unpack[ConnectOptions]
-) -> Swarm:
-    """Connect to several drones at the same time; returns when all are connected.
-
-    Args:
-        *targets: Names of running proxies, patterns such as ``"drone*"`` for all that run now, addresses of vehicles
-            such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
-            either, ``{"left": "sim://?seed=1"}``.
-        on_error: What happens to the others when one fails; see :class:`Swarm`.
-        missing: A drone that can't be connected to fails the call (``"raise"``) or is left out (``"skip"``), as long
-            as one is left.
-        **options: As for :func:`skyloop.connect`, for each drone.
-
-    Returns:
-        The swarm, a context manager.
-
-    Raises:
-        SwarmError: With the reason of each drone that can't be connected to, after leaving the others.
-        UnknownNameError: If a pattern matches no running proxy.
-        UsageError: If a drone is named twice, none is named, or ``on_error`` or ``missing`` is unknown.
-    """
-    if missing not in ("raise", "skip"):
-        raise UsageError(f'missing is {missing!r} and must be "raise" or "skip"')
-    check_policy(on_error)
-    chosen = choose(targets, lambda: running_names(options.get("network")))
-
-    def join(target: str) -> Callable[[], Drone]:
-        return lambda: connect(target, **options)
-
-    drones, errors = in_parallel({name: join(target) for name, target in chosen.items()})
-    if errors and (missing == "raise" or not drones):
-        end_flights(drones)
-        raise SwarmError("connecting", errors, len(chosen))
-    return Swarm(drones, on_error=on_error, missing=errors)
-
-
-def choose(targets: Iterable[Target], running: Callable[[], Iterable[str]]) -> dict[str, str]:
-    """Return what to connect to, by name, in the order given. Pure.
-
-    Args:
-        targets: As for :func:`swarm`.
-        running: Returns the names of running proxies; called only if there is a pattern.
-
-    Raises:
-        UsageError: If a target makes no sense or is named twice, or there is none.
-        UnknownNameError: If a pattern matches no running proxy.
-    """
-    chosen: dict[str, str] = {}
-    counts: dict[str, int] = {}
-    for target in targets:
-        for name, address in _named(target, running, counts):
-            if name in chosen:
-                raise UsageError(f"{name!r} is named twice: each drone can be in a swarm once")
-            chosen[name] = address
-    if not chosen:
-        raise UsageError('a swarm needs at least one drone: swarm("alpha", "bravo"), or a pattern as swarm("drone*")')
-    return chosen
-
-
-def _named(target: Target, running: Callable[[], Iterable[str]], counts: dict[str, int]) -> Iterable[tuple[str, str]]:
-    if isinstance(target, Mapping):
-        for name, address in target.items():
-            if not isinstance(name, str) or not name or not isinstance(address, str) or not address:
-                raise UsageError(f"{name!r}: {address!r} is no drone: a name and what to connect to are needed")
-        return list(target.items())
-    if not isinstance(target, str) or not target:
-        raise UsageError(f"{target!r} is neither the name of a proxy, a pattern, nor a vehicle's address")
-    if "://" in target:
-        scheme = target.partition("://")[0]
-        counts[scheme] = counts.get(scheme, 0) + 1
-        return [(f"{scheme}{counts[scheme]}", target)]
-    if _WILD.isdisjoint(target):
-        return [(target, target)]
-    known = sorted(running())
-    found = fnmatch.filter(known, target)
-    if not found:
-        raise UnknownNameError("running proxy", target, known)
-    return [(name, name) for name in found]
 
 
 def running_names(network: NetworkChoice = None) -> list[str]:

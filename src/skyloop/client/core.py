@@ -13,18 +13,16 @@ from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 
 from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
-from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, VideoChannel
+from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, Notifier
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
 from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
-from skyloop.client.logbook import Logbook
-from skyloop.client.mailbox import Notifier
 from skyloop.client.parameters import Config, Restorer
+from skyloop.client.publishing import Logbook, Membership
 from skyloop.client.results import ResultChannel, checked_age, checked_name
-from skyloop.client.streams import StreamChannel
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
-from skyloop.client.worker import Membership
+from skyloop.client.video import StreamChannel, VideoChannel
 from skyloop.errors import (
     ClosedError,
     LinkError,

@@ -23,7 +23,7 @@ from skyloop.client.authority import (
     answering,
     authority_request,
 )
-from skyloop.client.channels import Channel, Listener, VideoOptions
+from skyloop.client.channels import Channel, Listener, Mailbox
 from skyloop.client.commands import (
     above_zero,
     all_finite,
@@ -37,10 +37,9 @@ from skyloop.client.commands import (
 from skyloop.client.completion import ReturnWatch, is_there
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
-from skyloop.client.inspection import inspect
-from skyloop.client.logbook import checked_time
-from skyloop.client.mailbox import Mailbox
-from skyloop.client.preflight import PreflightFinding
+from skyloop.client.monitoring import ChannelStats, Distribution
+from skyloop.client.preflight import PreflightFinding, inspect
+from skyloop.client.publishing import checked_time
 from skyloop.client.results import (
     Result,
     ResultListener,
@@ -49,9 +48,8 @@ from skyloop.client.results import (
     is_old,
     silence,
 )
-from skyloop.client.statistics import ChannelStats, Distribution
-from skyloop.client.streams import StreamChannel
 from skyloop.client.telemetry import LinkStatus, Wanted, as_predicate
+from skyloop.client.video import StreamChannel, VideoOptions
 from skyloop.errors import (
     AuthorityError,
     ClosedError,

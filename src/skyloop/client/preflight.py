@@ -1,14 +1,23 @@
-"""The checks before a flight: what is wrong, why it matters, and what to do. Pure."""
+"""The checks before a flight: what is asked of a drone; then, pure, what is wrong, why it matters, and what to do."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+import shutil
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Final
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Protocol
 
+from skyloop.client.frame import Frame
+from skyloop.client.parameters import Config
 from skyloop.client.telemetry import LinkStatus
+from skyloop.errors import ClosedError, SkyloopError
 from skyloop.messages import Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.parameter import CHECKUP, Diagnostic, decode_checkup
 
@@ -79,6 +88,82 @@ class PreflightState:
     free_bytes: int | None = None
     video_waited_s: float = 0.0
     name: str = "NAME"
+
+
+class Inspected(Protocol):
+    """What is asked of a drone."""
+
+    config: Config
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def link(self) -> LinkStatus: ...
+    @property
+    def capabilities(self) -> Capabilities: ...
+    @property
+    def clock_uncertainty_ns(self) -> int: ...
+    @property
+    def app_id(self) -> int: ...
+    def age_s(self, sample: Feedback | Frame) -> float: ...
+    def on_frame(self, function: Callable[[Frame], object], camera: str | None = None) -> Any: ...
+
+
+def inspect(
+    drone: Inspected, feedback: Feedback | None, video_s: float, folder: str | Path | None
+) -> list[PreflightFinding]:
+    """Return the checklist of a drone; see :meth:`skyloop.client.Drone.preflight`."""
+    try:
+        parameters = dict(drone.config.items())
+    except ClosedError:
+        raise
+    except SkyloopError:
+        parameters = {}  # the link is not up, which is a finding of its own
+    shown = shown_cameras(drone.capabilities, parameters)
+    return check_before_flight(
+        PreflightState(
+            name=drone.name,
+            link=drone.link,
+            capabilities=drone.capabilities,
+            feedback=feedback,
+            feedback_age_s=None if feedback is None else drone.age_s(feedback),
+            video_age_s=_picture_ages(drone, shown, video_s) if video_s > 0 else {},
+            video_waited_s=video_s,
+            parameters=parameters,
+            clock_uncertainty_s=drone.clock_uncertainty_ns / 1e9,
+            app_id=drone.app_id,
+            free_bytes=None if folder is None else _free_bytes(Path(folder)),
+        )
+    )
+
+
+def _picture_ages(drone: Inspected, shown: Collection[str], timeout_s: float) -> dict[str, float | None]:
+    """Return the age of a picture of each camera; None where none came in time. Waits for those that are shown."""
+    deadline = time.monotonic() + timeout_s
+    ages: dict[str, float | None] = {camera.name: None for camera in drone.capabilities.cameras}
+    came = {name: threading.Event() for name in ages}
+
+    def note(name: str, frame: Frame) -> None:
+        ages[name] = drone.age_s(frame)
+        came[name].set()
+
+    with ExitStack() as listening:
+        for name in ages:
+            listening.callback(drone.on_frame(partial(note, name), name).cancel)
+        for name in shown:
+            came[name].wait(max(0.0, deadline - time.monotonic()))
+    return dict(ages)
+
+
+def _free_bytes(folder: Path) -> int | None:
+    """Return the bytes that are free where a folder is, or will be; None if that can't be found out."""
+    there = folder.absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    try:
+        return shutil.disk_usage(there).free
+    except OSError:
+        return None
 
 
 def check_before_flight(state: PreflightState) -> list[PreflightFinding]:

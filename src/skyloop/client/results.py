@@ -11,11 +11,10 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 
-from skyloop.client.channels import Channel, Listener
+from skyloop.client.channels import Channel, Listener, Mailbox, Notifier
 from skyloop.client.connection import ProxyConnection, Scheduler
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.mailbox import Mailbox, Notifier
-from skyloop.client.statistics import ChannelCounter, ChannelStats
+from skyloop.client.frame import FeedbackHistory
+from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import Feedback, ProcessorResult

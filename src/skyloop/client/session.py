@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from skyloop.client.frame import size_error
-from skyloop.client.link_monitor import LinkMonitor, Offset, OffsetEstimator, StallWatch, Thresholds
+from skyloop.client.monitoring import LinkMonitor, Offset, OffsetEstimator, StallWatch, Thresholds
 from skyloop.clock import Clock, clock_identity, nanoseconds
 from skyloop.errors import DecodeError, LinkError, NoAnswerError
 from skyloop.messages import (

@@ -1,16 +1,17 @@
-"""Several drones commanded and waited for together, and a policy for what follows when one of them fails."""
+"""Several drones: connected, commanded and waited for together, with a policy for what follows when one fails."""
 
 from __future__ import annotations
 
+import fnmatch
 import logging
 import threading
 import time
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import copy_context
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Final, Literal, Self, TypeVar, get_args
+from typing import Final, Literal, Self, TypeVar, Unpack, get_args
 
 import numpy as np
 
@@ -26,8 +27,9 @@ from skyloop.client.commands import (
     position_action,
     return_action,
 )
+from skyloop.client.connect import ConnectOptions, connect, explains_moved_options, running_names
 from skyloop.client.drone import Drone
-from skyloop.client.statistics import DEPTH, Distribution, distribution
+from skyloop.client.monitoring import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
 from skyloop.errors import (
     AuthorityError,
@@ -55,7 +57,10 @@ from skyloop.messages import (
 T = TypeVar("T")
 R = TypeVar("R")
 OnError = Literal["continue", "raise", "stop", "land"]
+Target = str | Mapping[str, str]
+Missing = Literal["raise", "skip"]
 
+_WILD: Final = frozenset("*?[")  #: what makes a name a pattern
 _THERE: Final = frozenset({LinkState.UP, LinkState.DEGRADED})
 _ROUNDING_S: Final = 1e-6
 _log = logging.getLogger("skyloop")
@@ -68,6 +73,88 @@ class Tick:
     number: int  #: from 0
     elapsed_s: float  #: since the first
     late_s: float  #: how much later than it was due
+
+
+@explains_moved_options
+def swarm(
+    *targets: Target, on_error: OnError = "continue", missing: Missing = "raise", **options: Unpack[ConnectOptions]
+) -> Swarm:
+    """Connect to several drones at the same time; returns when all are connected.
+
+    Args:
+        *targets: Names of running proxies, patterns such as ``"drone*"`` for all that run now, addresses of vehicles
+            such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
+            either, ``{"left": "sim://?seed=1"}``.
+        on_error: What happens to the others when one fails; see :class:`Swarm`.
+        missing: A drone that can't be connected to fails the call (``"raise"``) or is left out (``"skip"``), as long
+            as one is left.
+        **options: As for :func:`skyloop.connect`, for each drone.
+
+    Returns:
+        The swarm, a context manager.
+
+    Raises:
+        SwarmError: With the reason of each drone that can't be connected to, after leaving the others.
+        UnknownNameError: If a pattern matches no running proxy.
+        UsageError: If a drone is named twice, none is named, or ``on_error`` or ``missing`` is unknown.
+    """
+    if missing not in ("raise", "skip"):
+        raise UsageError(f'missing is {missing!r} and must be "raise" or "skip"')
+    check_policy(on_error)
+    chosen = choose(targets, lambda: running_names(options.get("network")))
+
+    def join(target: str) -> Callable[[], Drone]:
+        return lambda: connect(target, **options)
+
+    drones, errors = in_parallel({name: join(target) for name, target in chosen.items()})
+    if errors and (missing == "raise" or not drones):
+        end_flights(drones)
+        raise SwarmError("connecting", errors, len(chosen))
+    return Swarm(drones, on_error=on_error, missing=errors)
+
+
+def choose(targets: Iterable[Target], running: Callable[[], Iterable[str]]) -> dict[str, str]:
+    """Return what to connect to, by name, in the order given. Pure.
+
+    Args:
+        targets: As for :func:`swarm`.
+        running: Returns the names of running proxies; called only if there is a pattern.
+
+    Raises:
+        UsageError: If a target makes no sense or is named twice, or there is none.
+        UnknownNameError: If a pattern matches no running proxy.
+    """
+    chosen: dict[str, str] = {}
+    counts: dict[str, int] = {}
+    for target in targets:
+        for name, address in _named(target, running, counts):
+            if name in chosen:
+                raise UsageError(f"{name!r} is named twice: each drone can be in a swarm once")
+            chosen[name] = address
+    if not chosen:
+        raise UsageError('a swarm needs at least one drone: swarm("alpha", "bravo"), or a pattern as swarm("drone*")')
+    return chosen
+
+
+def _named(target: Target, running: Callable[[], Iterable[str]], counts: dict[str, int]) -> Iterable[tuple[str, str]]:
+    if isinstance(target, Mapping):
+        for name, address in target.items():
+            if not isinstance(name, str) or not name or not isinstance(address, str) or not address:
+                raise UsageError(f"{name!r}: {address!r} is no drone: a name and what to connect to are needed")
+        return list(target.items())
+    if not isinstance(target, str) or not target:
+        raise UsageError(f"{target!r} is neither the name of a proxy, a pattern, nor a vehicle's address")
+    if "://" in target:
+        scheme = target.partition("://")[0]
+        counts[scheme] = counts.get(scheme, 0) + 1
+        return [(f"{scheme}{counts[scheme]}", target)]
+    if _WILD.isdisjoint(target):
+        return [(target, target)]
+    known = sorted(running())
+    found = fnmatch.filter(known, target)
+    if not found:
+        raise UnknownNameError("running proxy", target, known)
+    return [(name, name) for name in found]
 
 
 def check_policy(on_error: str) -> None:

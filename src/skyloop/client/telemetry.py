@@ -11,17 +11,15 @@ from functools import partial
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
-from skyloop.client.channels import Channel, FollowingChannel, VideoChannel, usual
+from skyloop.client.channels import Channel, FollowingChannel, Mailbox
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.feedback_demand import FeedbackChannel, FeedbackDemand
-from skyloop.client.feedback_history import FeedbackHistory
-from skyloop.client.frame import Arrival, Frame
-from skyloop.client.mailbox import Mailbox
+from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.client.parameters import Restorer
 from skyloop.client.results import Result, ResultChannels, ResultMailbox
-from skyloop.client.statistics import ChannelCounter, ChannelStats
-from skyloop.client.streams import StreamChannel, StreamDecoder
+from skyloop.client.video import StreamChannel, StreamDecoder, VideoChannel, usual
 from skyloop.errors import UnknownNameError
 from skyloop.messages import (
     Annotation,
@@ -179,7 +177,7 @@ class ClientState:
 
         Args:
             camera: The camera.
-            request: How frames are wanted; None: see :func:`skyloop.client.channels.usual`.
+            request: How frames are wanted; None: see :func:`skyloop.client.video.usual`.
         """
         topic = (request or usual(camera.name)).topic
         with self._making:

@@ -12,10 +12,10 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from skyloop.client.channels import Notifier
 from skyloop.client.connection import ConnectionSupervisor, Scheduler
 from skyloop.client.core import DroneCore
 from skyloop.client.drone import Drone
-from skyloop.client.mailbox import Notifier
 from skyloop.clock import ManualClock, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.messages import (

@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from skyloop.client.statistics import ChannelCounter, ChannelStats
+from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.clock import Clock, monotonic_ns, seconds
 from skyloop.cockpit.broadcast import Wake, call_soon
 from skyloop.extend import stream_channel
@@ -20,7 +20,7 @@ from skyloop.messages import CameraInfo, EncodedFrame
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.client.streams import StreamChannel
+    from skyloop.client.video import StreamChannel
 
 KEPT: Final = 16  #: newest pictures of a form; who is further behind goes on with a key picture
 SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: of pictures in panes, so that like panes share a form

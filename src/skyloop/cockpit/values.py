@@ -14,7 +14,7 @@ from skyloop.clock import seconds
 from skyloop.messages import ACTION_NAMES, AnyAction, Event, Feedback, Value
 
 if TYPE_CHECKING:
-    from skyloop.client.statistics import ChannelStats
+    from skyloop.client.monitoring import ChannelStats
 
 Json = dict[str, Any]
 

@@ -8,10 +8,10 @@ from types import TracebackType
 from typing import Self
 
 from skyloop.client import Drone, Frame
-from skyloop.client.channels import VideoChannel
+from skyloop.client.channels import Mailbox
 from skyloop.client.frame import Arrival
-from skyloop.client.mailbox import Mailbox
-from skyloop.client.worker import Membership
+from skyloop.client.publishing import Membership
+from skyloop.client.video import VideoChannel
 from skyloop.extend import video_channel
 from skyloop.messages import ProcessorShare
 

@@ -18,7 +18,7 @@ import msgspec
 
 from skyloop.child_process import ChildProcess, on_parent_end
 from skyloop.client import Drone, connect
-from skyloop.client.mailbox import Notifier
+from skyloop.client.channels import Notifier
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
 from skyloop.extend import Known
 from skyloop.messages import EventKind, Severity

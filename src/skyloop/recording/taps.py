@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.client import Drone, Result
-from skyloop.client.channels import Listener
+from skyloop.client.channels import Listener, Mailbox
 from skyloop.client.frame import Arrival, to_bgr
-from skyloop.client.mailbox import Mailbox
 from skyloop.clock import nanoseconds
 from skyloop.errors import MissingExtraError, SkyloopError
 from skyloop.extend import Known, stream_channel, video_channel

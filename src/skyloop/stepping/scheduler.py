@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable
 from typing import Final, Protocol
 
+from skyloop.client.channels import Notifier
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, Scheduler
-from skyloop.client.mailbox import Notifier
 from skyloop.clock import NS_PER_S, ManualClock, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.messages import LinkState

@@ -1,31 +1,159 @@
-"""Encoded video: pictures as they come, put together from their packets, and decoded on a thread of its own."""
+"""Channels of video: frames of a camera as one request wants them, and encoded streams, decoded on a thread."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypedDict
 
 import numpy as np
 
 from skyloop.client.channels import Channel
+from skyloop.client.connection import ProxyConnection, Scheduler
+from skyloop.client.frame import Arrival, FeedbackHistory, Frame, SmallArrival
+from skyloop.client.monitoring import ChannelCounter, ChannelStats, StallWatch
 from skyloop.clock import Clock
-from skyloop.messages import EncodedFrame, FrameHeader, StreamReport, encode
+from skyloop.errors import DecodeError
+from skyloop.messages import CameraInfo, EncodedFrame, FrameHeader, StreamReport, VideoRequest, encode
 from skyloop.messages.frame import H264, Chain, Pieces
+from skyloop.messages.subscription import FrameFilter, VideoEncoding
 from skyloop.pyav import new_decoder
-from skyloop.transport.base import Pixels
+from skyloop.transport.base import Pixels, video
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
-
-    from skyloop.client.connection import ProxyConnection
 
 #: Pictures that may wait to be decoded. With more, decoding is too slow for what comes: they are left out up to a key.
 MOST_WAITING: Final = 6
 ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key picture before it is asked for again
 _IDLE_S: Final = 2.0
 _PURPOSE: Final = "reading H.264"
+
+
+class VideoOptions(TypedDict, total=False):
+    """How frames are requested; see :meth:`skyloop.Drone.frames`."""
+
+    encoding: VideoEncoding
+    quality: int
+    max_fps: float
+    scale: float
+    part: tuple[int, int]
+    kbit_s: int
+    max_age_s: float
+
+
+def usual(camera: str) -> VideoRequest:
+    """Return the request of a consumer that asks for nothing in particular: JPEG where frames travel over a network."""
+    return VideoRequest(camera, encoding="jpeg")
+
+
+class VideoChannel(Channel[Arrival]):
+    """Frames of one camera, as one request wants them."""
+
+    def __init__(
+        self,
+        camera: CameraInfo,
+        connection: ProxyConnection,
+        scheduler: Scheduler,
+        history: FeedbackHistory,
+        request: VideoRequest | None = None,
+    ) -> None:
+        """Make a channel without consumers.
+
+        Args:
+            camera: The camera.
+            connection: Where its topics are subscribed to.
+            scheduler: Source of the time and of waiting.
+            history: Looked up for the state at a frame's capture.
+            request: How frames are wanted; None: see :func:`usual`.
+        """
+        self.camera = camera
+        self.request = request or usual(camera.name)
+        super().__init__(lambda on: connection.subscribe(self.request.topic, on))
+        #: Names its statistics: the camera's plain topic for the usual request, else the request's own.
+        self.name = video(camera.name) if self.request == usual(camera.name) else self.request.topic
+        self.newest: Arrival | None = None
+        self.notifier = scheduler.notifier()  #: notified with each frame
+        self.counter = ChannelCounter()
+        self.undecodable = 0
+        self.too_old = 0  #: frames that a consumer got and, by its ``max_age_s``, did not want
+        self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
+        self.filter = FrameFilter(self.request)  #: chooses the plain frames that this request asks for
+        self._read: Arrival | None = None  # what next_frame() gave last
+        self._connection = connection
+        self._history = history
+        self._clock = scheduler.clock
+
+    @property
+    def unread(self) -> bool:
+        """Whether there is a frame that :meth:`read` has not returned yet."""
+        return self.newest is not self._read
+
+    def read(self) -> Frame | None:
+        """Return the newest frame and mark it as read; None if there is none or it can't be decoded."""
+        self._read = arrival = self.newest
+        return None if arrival is None else self.picture(arrival)
+
+    def picture(self, arrival: Arrival, max_age_s: float | None = None) -> Frame | None:
+        """Decode the frame; None, and counted, if its pixels can't be decoded, or it is too old.
+
+        Args:
+            arrival: The frame.
+            max_age_s: Oldest age since the capture that is accepted [s]; None: any.
+        """
+        if max_age_s is not None and arrival.age_s > max_age_s:
+            self.too_old += 1
+            return None
+        try:
+            return arrival.frame()
+        except DecodeError:
+            self.undecodable += 1
+            return None
+
+    def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, *, as_asked: bool) -> None:
+        """Publish a frame that came; ignores one that is repeated or was overtaken.
+
+        Args:
+            header: Describes the pixels.
+            pixels: Bytes of the frame, shape (size,), uint8.
+            now_ns: When it came, on this process's clock.
+            as_asked: Whether the proxy made it for this request; if False it is scaled here where needed.
+        """
+        counter = self.counter
+        last = counter.last_seq
+        if last is not None and header.seq <= last:
+            return  # repeated or overtaken
+        offset_ns, scale = self._connection.offset_ns, self.request.scale
+        if as_asked or scale == 1.0:
+            arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock)
+        else:
+            arrival = SmallArrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
+        # Consumers first, then the statistics. The previous frame is released last: giving its memory back to the proxy
+        # takes longer than all of this.
+        before, self.newest = self.newest, arrival
+        self.publish(arrival)
+        self.notifier.notify()
+        del before
+        counter.follow(header.seq)
+        counter.add(now_ns + offset_ns - header.published_ns, header.captured_ns - offset_ns, now_ns)
+        self.watch.received_ns = now_ns
+
+    def restart(self, now_ns: int) -> None:
+        """Reset the frame number: a proxy was connected, which may count its frames from 0."""
+        self.counter.last_seq = None
+        self.watch.received_ns = now_ns
+
+    def stats(self, now_ns: int) -> ChannelStats:
+        """Return the statistics at ``now_ns``."""
+        return self.counter.stats(now_ns, dropped=self.dropped + self.too_old, malformed=self.undecodable)
+
+    def _period_s(self, fps: float) -> float:
+        """Expected time between two frames of this request [s]; 0 if unknown."""
+        most = self.request.max_fps
+        rate = min(fps, most) if fps > 0.0 and most is not None else fps or most or 0.0
+        parts = 1 if self.request.part is None else self.request.part[1]
+        return parts / rate if rate > 0.0 else 0.0
 
 
 class StreamChannel(Channel[EncodedFrame]):
