@@ -56,7 +56,7 @@ from skyloop.transport.local import LocalServer
 if TYPE_CHECKING:
     from skyloop.sim import Simulation
     from skyloop.sim.camera import CameraModel
-    from skyloop.sim.firmware import Readings
+    from skyloop.sim.instruments import Readings
 
 Image = NDArray[np.uint8]
 Setpoint = tuple[float, float, float]  #: forward and left [m/s], yaw rate [rad/s]
@@ -842,7 +842,7 @@ def rounds(seconds: float, progress: Callable[[float], None]) -> Iterator[None]:
 def _one_core() -> Iterator[None]:
     """Keep OpenCV to the calling thread; afterwards it may use as many threads as before."""
     from skyloop.sim.render import use_one_core
-    from skyloop.sim.render.opencv import cv2
+    from skyloop.sim.render.base import cv2
 
     before = cv2.getNumThreads()
     use_one_core()

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 import skyloop
-from skyloop.sim.firmware import GpsFix, Readings
+from skyloop.sim.instruments import GpsFix, Readings
 from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
 from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind
 

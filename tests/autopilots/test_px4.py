@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.errors import UsageError
-from skyloop.sim.rotor_parameters import InstrumentParameters
+from skyloop.sim.parameters import InstrumentParameters
 from skyloop.vehicles.sim.firmware import coupling, px4
 from skyloop.vehicles.sim.firmware.coupling import STOPPED
 from skyloop.vehicles.sim.firmware.ports import bound

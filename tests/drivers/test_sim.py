@@ -27,7 +27,7 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
-from skyloop.sim import load_world, pacing
+from skyloop.sim import load_world, options
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.sim.driver import SimDriver
@@ -293,7 +293,7 @@ def riding(host: SimHost, drone: int) -> SimDriver:
 
 
 def test_a_computer_that_is_too_slow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pacing, "SLOW_NS", 200_000_000)
+    monkeypatch.setattr(options, "SLOW_NS", 200_000_000)
     host = SimHost(SimOptions(world="empty", cameras=(), speed=4.0, most_lag_s=0.02))
     monkeypatch.setattr(host.simulation, "step", lambda _: time.sleep(0.1))
     with opened(riding(host, 0)) as (_, heard):

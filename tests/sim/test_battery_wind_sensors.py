@@ -8,10 +8,9 @@ import pytest
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, FlightState, Idle, Land, Takeoff
 from skyloop.sim import Limits, OccurrenceKind, Simulation, VehicleParameters, Wind
-from skyloop.sim.dynamics import STEP_S
+from skyloop.sim.dynamics import STEP_S, WindField
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.streams import NormalBlocks, Purpose, stream
-from skyloop.sim.wind import WindField
 from tests.sim.helpers import HALL, IDEAL, flying, steps
 
 

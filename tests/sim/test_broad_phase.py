@@ -12,9 +12,8 @@ from hypothesis.extra.numpy import arrays
 
 from skyloop.messages import AnyAction, Attitude, Land, Takeoff, Velocity
 from skyloop.sim import Limits, Simulation, VehicleParameters, VehicleTruth, collisions, load_world
-from skyloop.sim.broad_phase import overlapping
 from skyloop.sim.reports import Occurrence
-from skyloop.sim.solids import Solids
+from skyloop.sim.solids import Solids, overlapping
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack
 

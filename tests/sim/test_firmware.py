@@ -12,12 +12,9 @@ import pytest
 from skyloop.errors import UsageError
 from skyloop.messages import EmergencyStop, FlightState, Hover, Takeoff
 from skyloop.sim import Simulation, VehicleParameters, World, load_world, parse_world
-from skyloop.sim.earth import MAGNETIC_FIELD_GAUSS, geodetic, local, pressure_pa
-from skyloop.sim.firmware import Firmware, Readings
-from skyloop.sim.instruments import Instruments
-from skyloop.sim.parameters import GRAVITY_M_S2, with_ideal_sensors
+from skyloop.sim.instruments import MAGNETIC_FIELD_GAUSS, Firmware, Instruments, Readings, geodetic, local, pressure_pa
+from skyloop.sim.parameters import GRAVITY_M_S2, InstrumentParameters, with_ideal_sensors
 from skyloop.sim.reports import OccurrenceKind
-from skyloop.sim.rotor_parameters import InstrumentParameters
 from skyloop.sim.solids import Solids
 from skyloop.sim.targets import TargetTrack
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER

@@ -21,7 +21,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.sim import STEP_S, Limits, OccurrenceKind, Simulation, VehicleParameters, Wind, load_world
-from skyloop.sim.flight_logic import TRANSITIONS, Happening, next_state
+from skyloop.sim.autopilot import TRANSITIONS, Happening, next_state
 from skyloop.sim.parameters import GRAVITY_M_S2
 from tests.sim.helpers import HALL, IDEAL, flying, steps
 

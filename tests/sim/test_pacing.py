@@ -13,8 +13,7 @@ from skyloop.clock import ManualClock
 from skyloop.errors import UsageError
 from skyloop.sim import STEP_S, Pacer
 from skyloop.sim.host import Report, SimHost
-from skyloop.sim.options import SimOptions
-from skyloop.sim.pacing import MOST_LAG_S, SLOW_AGAIN_NS, SLOW_NS, SlownessWatch
+from skyloop.sim.options import MOST_LAG_S, SLOW_AGAIN_NS, SLOW_NS, SimOptions, SlownessWatch
 from skyloop.sim.reports import Occurrence
 
 

@@ -291,6 +291,6 @@ def test_a_prepared_lens_is_computed_once_for_all_renderers(
 ) -> None:
     model = replace(FRONT_CAMERA, width=40, height=30, fx=26.0 + list(Quality).index(quality))
     prepare(model, quality)
-    monkeypatch.setattr("skyloop.sim.render.raster._rays", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr("skyloop.sim.render.painter._rays", lambda *_: pytest.fail("computed again"))
     for _ in range(2):
         view_from(scene, state_at([(0.0, 0.0, 1.0), (2.0, 0.0, 1.0)]), (-1.0, 0.0, 1.0), model=model, quality=quality)

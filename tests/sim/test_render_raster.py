@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
-from skyloop.sim.render.raster import Raster
+from skyloop.sim.render.painter import Raster
 
 PINHOLE = replace(FRONT_CAMERA, distortion=(0.0,) * 5)
 STRONG = replace(FRONT_CAMERA, distortion=(-0.3, 0.1, 0.01, -0.01, 0.0))

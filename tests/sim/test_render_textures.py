@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from skyloop.errors import UnknownNameError
-from skyloop.sim.render.atlas import BORDER, GAP, LEVELS, AtlasBuilder
-from skyloop.sim.render.markers import draw_card
+from skyloop.sim.render.models import draw_card
+from skyloop.sim.render.quads import BORDER, GAP, LEVELS, AtlasBuilder
 from skyloop.sim.render.textures import draw_paint, draw_surface
 from skyloop.sim.world import TEXTURES, MarkerPattern
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
 from skyloop.sim.columns import ARRAYS, NUMBERS, Operations
-from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters, with_ideal_sensors
+from skyloop.sim.parameters import GRAVITY_M_S2, InstrumentParameters, VehicleParameters, with_ideal_sensors
 from skyloop.sim.rotor_dynamics import (
     PLANT_STEP_S,
     Constants,
@@ -27,7 +27,6 @@ from skyloop.sim.rotor_dynamics import (
     rotation,
     spin,
 )
-from skyloop.sim.rotor_parameters import InstrumentParameters
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
 from tests.docs.pages import rows, section
 

@@ -4,8 +4,8 @@ Nothing here knows of proxies or networks, and nothing reads a wall clock but :c
 """
 
 from skyloop.sim.dynamics import STEP_S
-from skyloop.sim.firmware import Firmware, Readings
-from skyloop.sim.pacing import Pacer
+from skyloop.sim.instruments import Firmware, Readings
+from skyloop.sim.options import Pacer
 from skyloop.sim.parameters import LIMIT_RANGES, Limits, VehicleParameters
 from skyloop.sim.reports import Occurrence, OccurrenceKind, VehicleFeedback, VehicleTruth
 from skyloop.sim.simulation import Simulation

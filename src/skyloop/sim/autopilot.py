@@ -1,9 +1,16 @@
-"""The drones' flight logic: handles commands, follows the table of states, sets the loops' set-points."""
+"""The drones' flight logic: handles commands, follows a table of states, sets the loops' set-points.
+
+What changes a state is a :class:`Happening`; one that is not in the table of :data:`TRANSITIONS` for a state is
+ignored, as firmware ignores what does not fit. The charge of the :class:`Batteries` is one of the things that do.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from enum import Enum, auto
+
+import numpy as np
 
 from skyloop.messages import (
     AnyAction,
@@ -18,14 +25,104 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.geometry import clamped
-from skyloop.sim.battery import Batteries
 from skyloop.sim.collisions import Contacts
 from skyloop.sim.control_loops import ControlLoops
-from skyloop.sim.flight_logic import Happening, next_state
+from skyloop.sim.dynamics import column
 from skyloop.sim.parameters import Limits, VehicleParameters
 from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.sim.rotors import RotorBodies
 from skyloop.sim.sensors import Sensors
+from skyloop.sim.streams import Floats
+
+
+class Happening(Enum):
+    """What changes a state: the pilot's commands first, then what the vehicle detects itself."""
+
+    TAKEOFF = auto()
+    LAND = auto()
+    HOVER = auto()
+    SET_POINT = auto()
+    STOP = auto()
+    RESET = auto()  # only on the ground: the caller checks
+    HEIGHT_REACHED = auto()
+    TOUCHED_GROUND = auto()
+    CRASHED = auto()
+    BATTERY_LOW = auto()
+    BATTERY_EMPTY = auto()
+
+
+_S, _H = FlightState, Happening
+_IN_FLIGHT = {
+    _H.HOVER: _S.HOVERING,
+    _H.SET_POINT: _S.FLYING,
+    _H.LAND: _S.LANDING,
+    _H.STOP: _S.EMERGENCY,
+    _H.CRASHED: _S.EMERGENCY,
+    _H.BATTERY_LOW: _S.LANDING,
+    _H.BATTERY_EMPTY: _S.EMERGENCY,
+}
+
+TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
+    _S.LANDED: {_H.TAKEOFF: _S.TAKING_OFF, _H.STOP: _S.EMERGENCY},
+    _S.TAKING_OFF: {
+        _H.HEIGHT_REACHED: _S.HOVERING,
+        _H.LAND: _S.LANDING,
+        _H.STOP: _S.EMERGENCY,
+        _H.CRASHED: _S.EMERGENCY,
+        _H.BATTERY_LOW: _S.LANDING,
+        _H.BATTERY_EMPTY: _S.EMERGENCY,
+    },
+    _S.HOVERING: _IN_FLIGHT,
+    _S.FLYING: _IN_FLIGHT,
+    _S.LANDING: {
+        _H.HOVER: _S.HOVERING,  # as autopilots do: it breaks the landing off
+        _H.TAKEOFF: _S.TAKING_OFF,
+        _H.TOUCHED_GROUND: _S.LANDED,
+        _H.STOP: _S.EMERGENCY,
+        _H.CRASHED: _S.EMERGENCY,
+        _H.BATTERY_EMPTY: _S.EMERGENCY,
+    },
+    _S.EMERGENCY: {_H.RESET: _S.LANDED},
+}
+
+
+def next_state(state: FlightState, happening: Happening) -> FlightState | None:
+    """Return the state that follows, or None where the happening is ignored."""
+    return TRANSITIONS[state].get(happening)
+
+
+class Batteries:
+    """The drones' batteries.
+
+    Attributes:
+        charge: What is left, 0 to 1, (n,).
+        voltage: At the terminals, (n,) [V].
+    """
+
+    def __init__(self, parameters: Sequence[VehicleParameters], charge: Floats) -> None:
+        self.charge = charge.copy()
+        self._capacity = column(parameters, lambda p: p.battery_charge_c)
+        self._full = column(parameters, lambda p: p.battery_full_v)
+        self._empty = column(parameters, lambda p: p.battery_empty_v)
+        self._resistance = column(parameters, lambda p: p.battery_resistance_ohm)
+        self.voltage = self.open_voltage()
+
+    def drain(self, power: Floats, period_s: float) -> None:
+        """Discharge by ``power``, (n,) [W], over a period."""
+        current = power / np.maximum(self.voltage, 1.0)
+        np.maximum(self.charge - current * period_s / self._capacity, 0.0, out=self.charge)
+        self.voltage = self.open_voltage() - current * self._resistance
+
+    def strength(self) -> Floats:
+        """Return the share of the full battery's thrust that is left, (n,): thrust grows with voltage squared."""
+        share: Floats = np.clip(self.voltage / self._full, 0.0, 1.0) ** 2
+        return share
+
+    def open_voltage(self) -> Floats:
+        """Return the voltage without load, (n,) [V]."""
+        voltage: Floats = self._empty + (self._full - self._empty) * self.charge
+        return voltage
+
 
 LOW_BATTERY = 0.03  # share of the charge at which the vehicle lands by itself
 _HEIGHT_TOLERANCE_M = 0.08

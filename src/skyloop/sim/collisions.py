@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from skyloop.messages.geometry import clamped
-from skyloop.sim.broad_phase import Indices, overlapping
 from skyloop.sim.columns import ARRAYS, NUMBERS, N, Operations, few
 from skyloop.sim.dynamics import STEP_S, BodyTable, column
 from skyloop.sim.parameters import VehicleParameters
-from skyloop.sim.solids import Overlap, Solids
+from skyloop.sim.solids import Indices, Overlap, Solids, overlapping
 from skyloop.sim.streams import Floats
 from skyloop.sim.world import Vec3
 

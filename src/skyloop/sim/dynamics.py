@@ -1,4 +1,4 @@
-"""Dynamics of quadrotors in fixed steps: all drones at once, one array column each; a few of them one by one.
+"""Dynamics of quadrotors, and the wind, in fixed steps: all drones at once, one array column each; a few one by one.
 
 Both ways give the same bits, to which ``tests/sim/test_columns.py`` holds them.
 """
@@ -13,7 +13,8 @@ import numpy as np
 
 from skyloop.sim.columns import Fields, N, columns, few
 from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
-from skyloop.sim.streams import Floats
+from skyloop.sim.streams import Floats, NormalBlocks, Purpose
+from skyloop.sim.world import Wind
 
 STEP_S = 0.004
 
@@ -375,3 +376,26 @@ def rotations(sin: Floats, cos: Floats) -> Floats:
         [-sp, cp * sr, cp * cr],
     ]
     return np.moveaxis(np.array(rows), 2, 0)
+
+
+class WindField:
+    """Velocity of the air at each drone: the world's mean, and gusts of its own, which are small beside the distances.
+
+    Gusts are a first-order Gauss-Markov process per axis (the low-pass part of the Dryden gust model of MIL-F-8785C).
+    """
+
+    def __init__(self, wind: Wind, seed: int, drones: int, period_s: float) -> None:
+        self._mean = np.array(wind.mean_m_s)[:, None]
+        self._keep = math.exp(-period_s / wind.time_constant_s)
+        deviation = wind.gust_m_s * np.array([[1.0], [1.0], [0.5]])
+        self._fresh = deviation * math.sqrt(1.0 - self._keep**2)
+        self._calm = wind.gust_m_s == 0
+        self._normals = NormalBlocks(seed, Purpose.WIND, 3, drones)
+        self._gust: Floats = np.zeros((3, drones)) if self._calm else deviation * self._normals.take()
+
+    def blow(self, air: Floats) -> None:
+        """Advance by one period, and write the air's velocity, world axes, shape (3, drones) [m/s]."""
+        if not self._calm:
+            np.multiply(self._gust, self._keep, out=self._gust)
+            np.add(self._gust, self._fresh * self._normals.take(), out=self._gust)
+        np.add(self._mean, self._gust, out=air)

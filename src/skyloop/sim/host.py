@@ -12,8 +12,7 @@ import numpy as np
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.sim.dynamics import STEP_S
-from skyloop.sim.options import SimOptions
-from skyloop.sim.pacing import Pacer, SlownessWatch
+from skyloop.sim.options import Pacer, SimOptions, SlownessWatch
 from skyloop.sim.reports import Occurrence, OccurrenceKind, VehicleFeedback, VehicleTruth
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world import TargetState, Wind

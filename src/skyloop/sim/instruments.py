@@ -1,19 +1,142 @@
-"""The instruments of one rotor-level drone, as its firmware reads them: each with its noise, bias, rate and delay."""
+"""The instruments of one rotor-level drone, as its firmware reads them: each with its noise, bias, rate and delay.
+
+Every world's origin is at one place on Earth, in Zürich, where PX4's simulations start by default.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, Protocol
 
+import msgspec
 import numpy as np
 
-from skyloop.sim.earth import MAGNETIC_FIELD_GAUSS, geodetic, pressure_pa
-from skyloop.sim.firmware import FlowSample, GpsFix, Readings
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.rotor_dynamics import PLANT_STEP_S, rotation, rotors_of
 from skyloop.sim.streams import Purpose, stream
 from skyloop.sim.world import Vec3
+
+
+class GpsFix(msgspec.Struct, frozen=True, gc=False):
+    """A fix of the satellite receiver, with its error, as old as its delay. Altitude is above mean sea level."""
+
+    time_s: float  #: of the simulation, when the receiver was there
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    velocity_m_s: Vec3  #: east, north, up
+    horizontal_error_m: float  #: one standard deviation, as the receiver states it
+    vertical_error_m: float
+    satellites: int
+
+
+class FlowSample(msgspec.Struct, frozen=True, gc=False):
+    """What a camera that looks down saw move, over an interval.
+
+    Angles are about the body's forward and left axes, as if the vehicle had turned by them over ground that is far
+    away: a drone at height h that flies forward at v and turns at the rate ω about its left axis sees ω - v/h; one that
+    flies left at v and turns at ω about its forward axis sees ω + v/h.
+    """
+
+    interval_s: float
+    about_forward_rad: float
+    about_left_rad: float
+    gyro_forward_rad: float  #: what the gyro turned in the interval, about the same axes
+    gyro_left_rad: float
+    quality: float  #: 0 to 1; at 0 there is nothing to be seen, and the angles are 0
+
+
+class Readings(msgspec.Struct, frozen=True, gc=False):
+    """Readings of one drone's instruments at one time, and its true state beside them.
+
+    Body axes are forward, left, up; world axes east, north, up. Barometer, magnetometer and range finder keep their
+    newest sample until the next.
+    """
+
+    time_s: float  #: of the simulation
+    gyro_rad_s: Vec3
+    acceleration_m_s2: Vec3  #: specific force: at rest, +g along z
+    pressure_pa: float
+    temperature_c: float
+    magnetic_gauss: Vec3  #: body axes
+    gps: GpsFix | None  #: a new fix, only in the step in which it comes
+    range_m: float | None  #: down along the body's axis to the floor or something solid; None out of reach
+    flow: FlowSample | None  #: a new sample, only in the step in which it comes
+    battery_v: float
+    battery_a: float
+    position_m: Vec3  #: true, of the body's centre
+    velocity_m_s: Vec3  #: true, world axes
+    quaternion: tuple[float, float, float, float]  #: true: w, x, y, z, world from body
+    rates_rad_s: Vec3  #: true, about the body's axes
+
+
+class Firmware(Protocol):
+    """Flies one drone of a simulation: see :meth:`~skyloop.sim.simulation.Simulation.fly_by`."""
+
+    def exchange(self, readings: Readings) -> Sequence[float] | None:
+        """Take the readings of a step and return what the rotors do in it.
+
+        Called once per step of the plant (1 ms) on the thread that steps the simulation, which holds its lock: it must
+        return in bounded time, and call no method of the simulation.
+
+        Args:
+            readings: At the begin of the step.
+
+        Returns:
+            Commands of the rotors, 0 (stands) to 1 (full): front left, front right, rear left, rear right; what is
+            beyond is clamped. None: no new ones, the last stay in force.
+
+        Raises:
+            Exception: What it raises, ends the step, and is raised by :meth:`Simulation.step`.
+        """
+        ...
+
+
+LATITUDE_DEG: Final = 47.397742  #: of the worlds' origin, WGS 84
+LONGITUDE_DEG: Final = 8.545594
+ALTITUDE_M: Final = 488.0  #: of the worlds' floor above mean sea level
+
+#: Of the Earth there, east, north, up: the World Magnetic Model 2025, at the beginning of 2026.
+MAGNETIC_FIELD_GAUSS: Final[Vec3] = (0.01334, 0.21523, -0.43290)
+
+_EQUATOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
+_SEA_LEVEL_PA, _SEA_LEVEL_K, _LAPSE_K_M, _EXPONENT = 101325.0, 288.15, 0.0065, 5.25588  # ISO 2533, standard atmosphere
+
+
+def _radii_m() -> tuple[float, float]:
+    """Return the Earth's radii of curvature at the origin: along the meridian, and across it."""
+    squared = _FLATTENING * (2 - _FLATTENING)
+    bulge = 1 - squared * math.sin(math.radians(LATITUDE_DEG)) ** 2
+    return _EQUATOR_M * (1 - squared) / bulge**1.5, _EQUATOR_M / math.sqrt(bulge)
+
+
+_MERIDIAN_M, _NORMAL_M = _radii_m()
+_DEG_PER_NORTH_M = math.degrees(1 / (_MERIDIAN_M + ALTITUDE_M))
+_DEG_PER_EAST_M = math.degrees(1 / ((_NORMAL_M + ALTITUDE_M) * math.cos(math.radians(LATITUDE_DEG))))
+
+
+def geodetic(position_m: Vec3) -> Vec3:
+    """Return latitude, longitude [deg] and altitude above mean sea level [m] of a place, world axes.
+
+    The Earth counts as flat: a kilometre away that is wrong by less than 0.1 m.
+    """
+    east, north, up = position_m
+    return LATITUDE_DEG + north * _DEG_PER_NORTH_M, LONGITUDE_DEG + east * _DEG_PER_EAST_M, ALTITUDE_M + up
+
+
+def local(latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
+    """Return the place in world axes: the inverse of :func:`geodetic`."""
+    north = (latitude_deg - LATITUDE_DEG) / _DEG_PER_NORTH_M
+    return (longitude_deg - LONGITUDE_DEG) / _DEG_PER_EAST_M, north, altitude_m - ALTITUDE_M
+
+
+def pressure_pa(height_m: float) -> float:
+    """Return the air's pressure at a height above the worlds' floor, in the standard atmosphere."""
+    share = 1 - _LAPSE_K_M * (ALTITUDE_M + height_m) / _SEA_LEVEL_K
+    return float(_SEA_LEVEL_PA * share**_EXPONENT)
+
 
 #: Distance from a point along a unit vector, both in world axes, to the first solid thing; infinite without any.
 Ranging = Callable[[Vec3, Vec3], float]

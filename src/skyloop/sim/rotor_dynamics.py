@@ -22,8 +22,7 @@ import numpy as np
 
 from skyloop.errors import UsageError
 from skyloop.sim.columns import N, Operations
-from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
-from skyloop.sim.rotor_parameters import YAW_SIGNS, RotorParameters
+from skyloop.sim.parameters import GRAVITY_M_S2, YAW_SIGNS, RotorParameters, VehicleParameters
 
 PLANT_STEP_S = 0.001  #: of the rotor-level model and its instruments
 

@@ -13,8 +13,7 @@ import numpy as np
 from skyloop.errors import UsageError
 from skyloop.sim.columns import ARRAYS, NUMBERS, Fields, columns
 from skyloop.sim.dynamics import STEP_S, BodyTable, body_rates, column
-from skyloop.sim.firmware import Firmware
-from skyloop.sim.instruments import Instruments
+from skyloop.sim.instruments import Firmware, Instruments
 from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.rotor_dynamics import (
     PLANT_STEP_S,

@@ -1,7 +1,7 @@
 """A world with drones in it, stepped by its owner.
 
 Deterministic: the same world, seed, drones and commands at the same steps give the same bits. Nothing here reads a wall
-clock; :class:`~skyloop.sim.pacing.Pacer` makes it run in real time.
+clock; :class:`~skyloop.sim.options.Pacer` makes it run in real time.
 """
 
 from __future__ import annotations
@@ -16,22 +16,18 @@ from numpy.typing import NDArray
 from skyloop.errors import UsageError
 from skyloop.messages import Action, AnyAction, FlightState
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
-from skyloop.sim.autopilot import Autopilot
-from skyloop.sim.battery import Batteries
+from skyloop.sim.autopilot import Autopilot, Batteries
 from skyloop.sim.collisions import Collisions
 from skyloop.sim.control_loops import ControlLoops
-from skyloop.sim.dynamics import STEP_S, Bodies, BodyTable
-from skyloop.sim.firmware import Firmware
-from skyloop.sim.instruments import Instruments
+from skyloop.sim.dynamics import STEP_S, Bodies, BodyTable, WindField
+from skyloop.sim.instruments import Firmware, Instruments
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
-from skyloop.sim.placement import place
 from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
 from skyloop.sim.rotors import RotorBodies
 from skyloop.sim.sensors import Sensors
-from skyloop.sim.solids import Solids
+from skyloop.sim.solids import Solids, place
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack
-from skyloop.sim.wind import WindField
 from skyloop.sim.world import TargetState, Vec3, Wind, World
 
 LOOP_STEPS = 4  # the autopilot's outer loops, altimeter and velocity: 62.5 Hz

@@ -1,4 +1,4 @@
-"""The solid things of a world, and how far drones are from them or within them."""
+"""The solid things of a world: how far drones are from them or within them, and where drones find room to stand."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from skyloop.sim.broad_phase import Indices
+from skyloop.errors import UsageError
+from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack, top_speed
-from skyloop.sim.world import FigureTarget, FixedYaw, PlatformTarget, Vec3, World
+from skyloop.sim.world import FigureTarget, FixedYaw, PlatformTarget, Spawn, Vec3, World
 
 
 class Overlap(NamedTuple):
@@ -254,3 +256,95 @@ def _top_speed(target: PlatformTarget | FigureTarget) -> float:
     """Return a speed [m/s] that no point of a target exceeds, those at its corners included."""
     turn = 0.0 if isinstance(target.yaw, FixedYaw) else target.yaw.turn_rate_rad_s
     return top_speed(target.path) + turn * math.hypot(*target.size_m[:2]) / 2
+
+
+Indices = NDArray[np.intp]
+
+
+def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indices]:
+    """Return the pairs of boxes that overlap, by sweeping over them along the axis on which they are spread most.
+
+    Args:
+        low: Least coordinates of the boxes, shape (3, n) [m].
+        high: Greatest coordinates, shape (3, n).
+        movable: Only pairs with at least one of the first so many boxes are wanted.
+
+    Returns:
+        The lesser and the greater number of each pair, in ascending order. Boxes that touch overlap.
+    """
+    if low.shape[1] < 2:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    axis = int((low.max(axis=1) - low.min(axis=1)).argmax())
+    order = low[axis].argsort(kind="stable")
+    begins, ends = low[axis, order], high[axis, order]
+    # In this order a box overlaps, along the axis, those after it that begin before it ends.
+    numbers = np.arange(len(order))
+    counts = begins.searchsorted(ends, side="right") - numbers - 1
+    first = numbers.repeat(counts)
+    before = counts.cumsum() - counts  # pairs of the boxes before each
+    second = np.arange(len(first)) - (before - numbers - 1).repeat(counts)
+    one, other = order.take(first), order.take(second)
+    for across in {0, 1, 2} - {axis}:
+        begins, ends = low[across], high[across]
+        overlap = (begins.take(one) <= ends.take(other)) & (begins.take(other) <= ends.take(one))
+        one, other = one.compress(overlap), other.compress(overlap)
+    lesser, greater = np.minimum(one, other), np.maximum(one, other)
+    wanted = (lesser < movable).nonzero()[0]
+    wanted = wanted.take((lesser.take(wanted) * len(order) + greater.take(wanted)).argsort())
+    return lesser.take(wanted), greater.take(wanted)
+
+
+_MARGINS_M = (0.6, 0.3, 0.15)  # between hulls, and to what stands around: the first that leaves enough places
+
+
+def place(world: World, parameters: Sequence[VehicleParameters], solids: Solids) -> list[Spawn]:
+    """Return a free place at the start for each drone: the world's own first, then a grid around the first of them.
+
+    Raises:
+        UsageError: There are not enough, or one of the world's own is within something solid.
+    """
+    spawns = list(world.spawns[: len(parameters)])
+    for spawn, drone in zip(spawns, parameters, strict=False):
+        if not _is_clear(spawn, drone, solids, 0.0):
+            raise UsageError(f"world {world.name!r}: the spawn {spawn.name!r} leaves no room for a drone to stand")
+    if len(spawns) == len(parameters):
+        return spawns
+    for margin in _MARGINS_M:
+        placed = _fill(world, parameters, solids, spawns, margin)
+        if len(placed) == len(parameters):
+            return placed
+    raise UsageError(f"world {world.name!r} has place for {len(placed)} drones only, not for {len(parameters)}")
+
+
+def _fill(
+    world: World, parameters: Sequence[VehicleParameters], solids: Solids, first: list[Spawn], margin_m: float
+) -> list[Spawn]:
+    spawns = list(first)
+    spacing = 2 * max(drone.radius_m for drone in parameters) + margin_m
+    yaw = spawns[0].yaw_rad if spawns else 0.0
+    for x, y in _grid(world, spacing, spawns[0] if spawns else None):
+        if len(spawns) == len(parameters):
+            break
+        spawn = Spawn(f"spawn {len(spawns) + 1}", (x, y, 0.0), yaw)
+        apart = all(math.hypot(x - s.position_m[0], y - s.position_m[1]) >= spacing - 1e-9 for s in spawns)
+        if apart and _is_clear(spawn, parameters[len(spawns)], solids, margin_m):
+            spawns.append(spawn)
+    return spawns
+
+
+def _grid(world: World, spacing: float, around: Spawn | None) -> list[tuple[float, float]]:
+    """Points of a square grid over the floor, nearest to ``around`` first."""
+    x0, y0 = around.position_m[:2] if around else (0.0, 0.0)
+    reach_x, reach_y = (math.ceil(world.room.size_m[axis] / spacing) for axis in (0, 1))
+    points = [
+        (x0 + column * spacing, y0 + row * spacing)
+        for column in range(-reach_x, reach_x + 1)
+        for row in range(-reach_y, reach_y + 1)
+    ]
+    return sorted(points, key=lambda p: (round(math.hypot(p[0] - x0, p[1] - y0), 6), p))
+
+
+def _is_clear(spawn: Spawn, drone: VehicleParameters, solids: Solids, margin_m: float) -> bool:
+    x, y, z = spawn.position_m
+    radius = drone.radius_m + margin_m
+    return solids.overlap((x, y, z + drone.half_height_m + 1e-6), radius, drone.half_height_m) is None

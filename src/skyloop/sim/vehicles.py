@@ -18,8 +18,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from skyloop.sim.parameters import VehicleParameters
-from skyloop.sim.rotor_parameters import RotorParameters
+from skyloop.sim.parameters import RotorParameters, VehicleParameters
 
 #: The Parrot AR.Drone: identified by ``scripts/identify_ardrone.py`` from the pitch steps of an AR.Drone 1 that are
 #: described in ``docs/ardrone-model.md``, fitted to five runs and judged on three that the fit has not seen.

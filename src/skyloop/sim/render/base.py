@@ -1,4 +1,4 @@
-"""What the renderer draws, and what it returns."""
+"""What the renderer draws, what it returns, and OpenCV, with a clear word where it is not installed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.errors import MissingExtraError
 from skyloop.sim.world import TargetState
+
+try:
+    import cv2
+except ImportError as error:
+    raise MissingExtraError("the simulator", "sim", cause=str(error)) from error
+
+__all__ = ["Image", "SceneState", "cv2"]
 
 Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
 

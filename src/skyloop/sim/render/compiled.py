@@ -1,4 +1,4 @@
-"""Drawing by the ``kernels``, compiled by Numba where it is installed: the picture of ``plain``, several times faster.
+"""Drawing by the ``kernels``, compiled by Numba where it is installed: the same pictures, several times faster.
 
 Importing Numba takes the better part of a second, and compiling some more; afterwards the machine code is in Numba's
 cache on the disk. Neither holds up a picture: both happen on a thread of their own.
@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 
 from skyloop.sim.camera import BOTTOM_CAMERA, CameraModel, CameraPose
 from skyloop.sim.render import kernels, shading
-from skyloop.sim.render.atlas import GAP, Atlas, AtlasBuilder
 from skyloop.sim.render.base import Image
-from skyloop.sim.render.painter import Painter
-from skyloop.sim.render.quads import Floats, QuadBuilder, Quads
-from skyloop.sim.render.raster import Raster
-from skyloop.sim.render.shadows import Placed
+from skyloop.sim.render.painter import Painter, Raster
+from skyloop.sim.render.quads import GAP, Atlas, AtlasBuilder, Floats, QuadBuilder, Quads
+from skyloop.sim.render.shading import Placed
 from skyloop.sim.render.visibility import EDGE_ON_M, PRIORITY_SHARE
 
 _log = logging.getLogger(__name__)

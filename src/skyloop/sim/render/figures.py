@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skyloop.sim.render.atlas import AtlasBuilder, Texture
-from skyloop.sim.render.opencv import cv2
-from skyloop.sim.render.quads import Floats, QuadBuilder, Quads, concatenate, moved_each
-from skyloop.sim.render.shadows import Shadow
+from skyloop.sim.render.base import cv2
+from skyloop.sim.render.quads import AtlasBuilder, Floats, QuadBuilder, Quads, Texture, concatenate, moved_each
+from skyloop.sim.render.shading import Shadow
 from skyloop.sim.render.textures import draw_paint, paint
 from skyloop.sim.world import FIGURE_SIZES_M, FigureTarget, Rgb, Vec3
 

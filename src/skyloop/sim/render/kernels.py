@@ -1,6 +1,6 @@
 """The planar renderer's work as loops over quads and pixels, for Numba to compile (``compiled``).
 
-They compute what ``visibility``, ``shading`` and ``shadows`` compute, operation by operation in the same order and the
+They compute what ``visibility`` and ``shading`` compute, operation by operation in the same order and the
 same precision, so the picture is the same bit by bit; those modules explain the mathematics. They also run
 uncompiled, slowly, which is how they are tested where Numba is not installed. Each is one flat function, because a
 compiled one can't call one that is not. None holds the interpreter lock once compiled.

@@ -1,19 +1,20 @@
-"""The shapes of what moves: quadrotors, marker boards on their stands, platforms. Each in its own axes."""
+"""The shapes of quadrotors, marker boards on their stands, platforms, and cards of markers. Each in its own axes."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from skyloop.errors import UnknownNameError, UsageError
 from skyloop.sim.render import figures
-from skyloop.sim.render.atlas import AtlasBuilder
-from skyloop.sim.render.markers import draw_card
-from skyloop.sim.render.noise import finished, tinted
-from skyloop.sim.render.opencv import cv2
-from skyloop.sim.render.quads import QuadBuilder, Quads
+from skyloop.sim.render.base import cv2
+from skyloop.sim.render.pictures import finished, tinted
+from skyloop.sim.render.quads import AtlasBuilder, QuadBuilder, Quads
 from skyloop.sim.render.textures import draw_surface, paint
-from skyloop.sim.world import BoardTarget, FigureTarget, MarkerPattern, PlatformTarget, Rgb, Target
+from skyloop.sim.world import MARKER_DICTIONARIES, BoardTarget, FigureTarget, MarkerPattern, PlatformTarget, Rgb, Target
 
 # Hull colours, one drone after the other.
 HULLS: tuple[Rgb, ...] = (
@@ -129,3 +130,47 @@ def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
     # face axes (right, up, normal) to (x ahead, y left, z up): the picture's up is ahead, its right is -y
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     return face.build().moved(np.zeros(3), turn).joined(body.build())
+
+
+_CELL = 24  # texels a cell of the marker
+_PAPER = 235
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """An image of a marker.
+
+    Attributes:
+        image: BGR.
+        uv: The part that the card shows: left, top, right, bottom in texels, with fractions.
+    """
+
+    image: NDArray[np.uint8]
+    uv: tuple[float, float, float, float]
+
+
+def draw_card(pattern: MarkerPattern) -> Card:
+    """Draw a marker with its margin.
+
+    The black square is ``pattern.size_m`` of the card's ``card_size_m`` to the texel's fraction.
+
+    Raises:
+        UnknownNameError: OpenCV has no such dictionary.
+        UsageError: The dictionary has no such id.
+    """
+    code = getattr(cv2.aruco, pattern.dictionary, None) if pattern.dictionary.startswith("DICT_") else None
+    if code is None:
+        raise UnknownNameError("marker dictionary", pattern.dictionary, MARKER_DICTIONARIES)
+    dictionary = cv2.aruco.getPredefinedDictionary(code)
+    count = len(dictionary.bytesList)
+    if not 0 <= pattern.marker_id < count:
+        raise UsageError(f"{pattern.dictionary} has ids 0 to {count - 1}, so there is no marker {pattern.marker_id}")
+    cells = dictionary.markerSize + 2
+    black = cells * _CELL
+    margin = pattern.margin_m / pattern.size_m * black
+    border = int(np.ceil(margin)) + 2
+    square = cv2.aruco.generateImageMarker(dictionary, pattern.marker_id, black, borderBits=1)
+    ink = np.where(square > 127, _PAPER, 22).astype(np.uint8)
+    image = cv2.copyMakeBorder(ink, border, border, border, border, cv2.BORDER_CONSTANT, value=_PAPER)
+    start, end = border - margin, border + black + margin
+    return Card(np.repeat(image[..., None], 3, axis=2).astype(np.uint8), (start, start, end, end))

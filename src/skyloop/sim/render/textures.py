@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import UnknownNameError
-from skyloop.sim.render.atlas import AtlasBuilder, Texture
-from skyloop.sim.render.noise import clouds, finished, fractal, grain, tinted
-from skyloop.sim.render.opencv import cv2
-from skyloop.sim.render.pictures import PICTURES
+from skyloop.sim.render.base import cv2
+from skyloop.sim.render.pictures import PICTURES, clouds, finished, fractal, grain, tinted
+from skyloop.sim.render.quads import AtlasBuilder, Texture
 
 Picture = NDArray[np.float32]
 Bgr = tuple[float, float, float]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.sim.camera import CameraPose
-from skyloop.sim.render.opencv import cv2
+from skyloop.sim.render.base import cv2
 from skyloop.sim.render.quads import Floats, Quads
 
 # How much nearer a picture on a wall counts than the wall behind it, per step of priority, as a share of the distance.

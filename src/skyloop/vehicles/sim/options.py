@@ -25,8 +25,7 @@ from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FPV_CAMERA, FRONT_CAMERA, CameraModel
-from skyloop.sim.options import EVERY_ACTION, SimOptions
-from skyloop.sim.pacing import MOST_LAG_S
+from skyloop.sim.options import EVERY_ACTION, MOST_LAG_S, SimOptions
 from skyloop.sim.vehicles import VEHICLES
 from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
 

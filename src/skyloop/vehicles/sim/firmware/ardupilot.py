@@ -14,8 +14,7 @@ from typing import ClassVar, Final
 
 from skyloop.errors import DecodeError
 from skyloop.files import wait_readable
-from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG
-from skyloop.sim.firmware import Readings
+from skyloop.sim.instruments import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, Readings
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
 from skyloop.vehicles.sim.firmware.ardupilot_json import MAX_PACKET, SimulatedState, decode_servos, encode_state
 from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware

@@ -16,8 +16,7 @@ from typing import ClassVar, Final
 
 from skyloop.child_process import ChildProcess
 from skyloop.errors import DecodeError, UsageError
-from skyloop.sim.earth import geodetic
-from skyloop.sim.firmware import GpsFix, Readings
+from skyloop.sim.instruments import GpsFix, Readings, geodetic
 from skyloop.vehicles.mavlink.wire.axes import turned_axes
 from skyloop.vehicles.msp.wire.frames import Frame, encode
 from skyloop.vehicles.msp.wire.messages import Function

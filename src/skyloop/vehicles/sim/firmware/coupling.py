@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import ClassVar, Final
 
-from skyloop.sim.firmware import Readings
+from skyloop.sim.instruments import Readings
 from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind, Launch, Program
 
 WAIT_S: Final = 0.3  #: longest wait for an answer; after one in vain there is none until it answers
@@ -21,9 +21,9 @@ Commands = Sequence[float]
 class CoupledFirmware(ABC):
     """Flies a drone of a simulation by a real firmware, which runs as a process of its own.
 
-    It is a :class:`~skyloop.sim.firmware.Firmware`: give it to :meth:`~skyloop.sim.simulation.Simulation.fly_by`. The
-    simulation's thread never waits long: for an answer up to :data:`WAIT_S`, and once there was none, not at all until
-    the firmware answers again. Silence and death stop the rotors; a firmware that died is started again.
+    It is a :class:`~skyloop.sim.instruments.Firmware`: give it to :meth:`~skyloop.sim.simulation.Simulation.fly_by`.
+    The simulation's thread never waits long: for an answer up to :data:`WAIT_S`, and once there was none, not at all
+    until the firmware answers again. Silence and death stop the rotors; a firmware that died is started again.
 
     Attributes:
         program: Its process.
@@ -69,7 +69,7 @@ class CoupledFirmware(ABC):
         self._close()
 
     def exchange(self, readings: Readings) -> Commands | None:
-        """See :meth:`~skyloop.sim.firmware.Firmware.exchange`."""
+        """See :meth:`~skyloop.sim.instruments.Firmware.exchange`."""
         if not self.program.running:
             return STOPPED
         if self.program.starts != self._starts:

@@ -20,9 +20,8 @@ from typing import Any, ClassVar, Final
 from skyloop.errors import UsageError
 from skyloop.files import wait_readable
 from skyloop.messages.geometry import in_16_bits
-from skyloop.sim.earth import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, geodetic
-from skyloop.sim.firmware import GpsFix, Readings
-from skyloop.sim.rotor_parameters import InstrumentParameters
+from skyloop.sim.instruments import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, GpsFix, Readings, geodetic
+from skyloop.sim.parameters import InstrumentParameters
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
 from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, release_instance, reserve_instance

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from skyloop.sim.rotor_parameters import InstrumentParameters
+from skyloop.sim.parameters import InstrumentParameters
 from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
 from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
 from skyloop.vehicles.sim.firmware.program import FirmwareEvent
