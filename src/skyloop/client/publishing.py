@@ -28,8 +28,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.fields import LATEST_NS
-from skyloop.messages.relayed import MAX_LOG_TEXT
-from skyloop.messages.relayed import MAX_VALUES, pack
+from skyloop.messages.relayed import MAX_LOG_TEXT, MAX_VALUES, pack
 
 if TYPE_CHECKING:
     from skyloop.client.telemetry import ClientState
