@@ -1,4 +1,4 @@
-"""Every metric that there is, as ``docs/operations.md`` lists them, and an HTTP endpoint that serves them to Prometheus.
+"""Every metric that there is, as ``docs/operations.md`` lists them, and the HTTP endpoint that Prometheus reads.
 
 The endpoint has threads of its own: who reads it, or stops reading, delays nothing else.
 """

@@ -1,10 +1,10 @@
 """What ROS 2 wants: the names of a drone's namespace and frames (REP 105), its time, and its type of transforms.
 
-rclpy has no ``tf2_msgs/msg/TFMessage`` where no package of it is installed, so its publisher is given bytes. rclpy asks a
-message's class for a *type support*, a C structure with its name, the hash of its definition and functions
-that turn it into bytes (``rosidl_message_type_support_t`` and, of Fast DDS, ``message_type_support_callbacks_t``). A
-publisher that is given bytes uses none of the functions but the one for the largest size, which unbounded members make
-unknown. So those of another message with such members serve, under the name and the hash of this one.
+rclpy has no ``tf2_msgs/msg/TFMessage`` where no package of it is installed, so its publisher is given bytes. rclpy asks
+a message's class for a *type support*, a C structure with its name, the hash of its definition and functions that turn
+it into bytes (``rosidl_message_type_support_t`` and, of Fast DDS, ``message_type_support_callbacks_t``). A publisher
+that is given bytes uses none of the functions but the one for the largest size, which unbounded members make unknown.
+So those of another message with such members serve, under the name and the hash of this one.
 """
 
 from __future__ import annotations
