@@ -14,7 +14,7 @@ from typing import Final
 
 import skyloop
 from skyloop.errors import SkyloopError
-from skyloop.host.control import AddNamed, Remove, Status, ask
+from skyloop.host.serve import AddNamed, Remove, Status, ask
 from skyloop.host.vehicle import Condition
 from skyloop.messages import Hello, ListParameters, Ping, Request, Role, encode
 from skyloop.network.config import free_port

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import skyloop
+from skyloop.cli.process import DetectionProcessor
 from skyloop.messages import Annotation, Polyline, Text
-from skyloop.processing.detecting import DetectionProcessor
 from skyloop.vision import Detection
 from tests.cli.conftest import Run
 from tests.processes.conftest import Process

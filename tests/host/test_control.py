@@ -13,10 +13,20 @@ import pytest
 from skyloop.cli import main
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import LinkError, NameTakenError, RefusedError, UnknownNameError, UsageError
-from skyloop.host import control
-from skyloop.host.control import Add, AddNamed, Answer, ControlServer, Remove, Status, ask, chosen_host, running_hosts
+from skyloop.host import serve
 from skyloop.host.fleet import Defaults, FlightLimits, encode_handed
-from skyloop.host.serve import Answering
+from skyloop.host.serve import (
+    Add,
+    AddNamed,
+    Answer,
+    Answering,
+    ControlServer,
+    Remove,
+    Status,
+    ask,
+    chosen_host,
+    running_hosts,
+)
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from tests.host.fleet import Hosting
 
@@ -72,7 +82,7 @@ def test_errors_come_back_as_they_were_raised(served: Hosting) -> None:
 
 
 def test_garbage_and_callers_who_ask_nothing_do_no_harm(served: Hosting) -> None:
-    for packet in (b"", b"{", b"[" * 5000, b'{"type":"remove"}', b'{"type":"reboot"}', b"\0" * control.MAX_PACKET):
+    for packet in (b"", b"{", b"[" * 5000, b'{"type":"remove"}', b'{"type":"reboot"}', b"\0" * serve.MAX_PACKET):
         sock = connect(find_directory(None, HOST).socket_path("host"))
         if packet:
             sock.send(packet)
@@ -90,13 +100,13 @@ def test_a_large_answer_arrives_whole(served: Hosting) -> None:
 
 
 def test_others_may_not_use_it(served: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control, "may_connect", lambda sock, gid: False)
+    monkeypatch.setattr(serve, "may_connect", lambda sock, gid: False)
     with pytest.raises(RefusedError, match=f"pid {os.getpid()}.*may not use the host"):
         ask("host", Remove("alpha"))
 
 
 def test_a_host_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    def answering(_: control.Request) -> Answer:
+    def answering(_: serve.Request) -> Answer:
         raise RuntimeError("on purpose")
 
     server = ControlServer("host", answering)
@@ -187,14 +197,14 @@ def test_a_large_fleet_is_added_in_one_request(served: Hosting) -> None:
         for number in range(500)
     )
     assert len(encode_handed(Add(many))) > 1 << 17
-    taken: list[control.Request] = []
+    taken: list[serve.Request] = []
     server = ControlServer("large", lambda request: taken.append(request) or Answer())  # type: ignore[func-returns-value]
     server.start()
     try:
         ask("large", Add(many))
         assert taken == [Add(many)]
-        exact = AddNamed("x", "a" * (control._CHUNK - len(msgspec.json.encode(AddNamed("x", "")))))
-        assert len(msgspec.json.encode(exact)) == control._CHUNK
+        exact = AddNamed("x", "a" * (serve._CHUNK - len(msgspec.json.encode(AddNamed("x", "")))))
+        assert len(msgspec.json.encode(exact)) == serve._CHUNK
         ask("large", exact)
         assert taken[1] == exact
     finally:

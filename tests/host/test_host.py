@@ -11,7 +11,7 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import NameTakenError, RefusedError, UnknownNameError
 from skyloop.host import vehicle as vehicles
 from skyloop.host.fleet import VehicleSettings
-from skyloop.host.ticker import Ticker
+from skyloop.host.threads import Ticker
 from skyloop.messages import (
     EventKind,
     Failsafe,

@@ -8,9 +8,18 @@ from itertools import pairwise
 from typing import cast
 
 from skyloop.host.own_process import FIRST_PAUSE_S, LONGEST_PAUSE_S, pause_s
-from skyloop.host.ticker import WHOLE_ROUNDS, Ticker
-from skyloop.host.watchdog import HANG_LOOKS, LOOK_S, STALL_LOOKS, SharedLoop, Watchdog
-from skyloop.host.workers import IDLE_THREADS, MAX_THREADS, RequestWorkers
+from skyloop.host.threads import (
+    HANG_LOOKS,
+    IDLE_THREADS,
+    LOOK_S,
+    MAX_THREADS,
+    STALL_LOOKS,
+    WHOLE_ROUNDS,
+    RequestWorkers,
+    SharedLoop,
+    Ticker,
+    Watchdog,
+)
 from skyloop.proxy import Proxy
 from skyloop.transport.testing import wait_until
 from tests.proxy.fake import Bench

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.host.control import Remove, Status, ask
+from skyloop.host.serve import Remove, Status, ask
 from skyloop.host.vehicle import VehicleStatus
 from skyloop.messages import EventKind, LinkState
 from tests.processes.conftest import Process, eventually, skyloop_command

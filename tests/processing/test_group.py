@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from skyloop.processing.group import USAGE_ERROR, Group
-from skyloop.processing.status import Status
+from skyloop.processing.worker import Status
 from skyloop.transport.testing import wait_until
 
 pytestmark = pytest.mark.process

@@ -6,7 +6,7 @@ import pytest
 
 from skyloop.clock import ManualClock
 from skyloop.messages import ProcessorShare
-from skyloop.processing.status import Status, Tally, together
+from skyloop.processing.worker import Status, Tally, together
 
 SHARE = ProcessorShare("detector", "front", 1, 3, 4)
 

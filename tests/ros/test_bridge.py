@@ -18,8 +18,7 @@ from skyloop.errors import MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import EmergencyStop, FlightState, Position, Velocity
 from skyloop.proxy.proxy import Proxy
 from skyloop.ros import Bridge, Settings
-from skyloop.ros.names import Frames, namespaces_of
-from skyloop.ros.tf_type import tf_message_type
+from skyloop.ros.names import Frames, namespaces_of, tf_message_type
 from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.ros2.node import (
     DISCOVERY_VARIABLES,
@@ -100,8 +99,8 @@ def test_state_and_what_is_not_known(rig: Rig) -> None:
 def test_a_vehicle_that_knows_its_place(rig: Rig) -> None:
     from skyloop.messages import Feedback, LinkState
     from skyloop.messages.feedback import EarthOrigin
+    from skyloop.ros.names import RosTime
     from skyloop.ros.telemetry import Telemetry
-    from skyloop.ros.time import RosTime
 
     quiet = SimpleNamespace(
         on_feedback=lambda function: None,
@@ -435,7 +434,7 @@ def test_transforms_need_a_known_rclpy_or_the_package_of_their_type(
 ) -> None:
     assert tf_message_type().__name__ == "TFMessage"
     monkeypatch.setitem(__import__("sys").modules, "tf2_msgs.msg", None)
-    monkeypatch.setattr("skyloop.ros.tf_type.version", lambda package: "7.1.6")
+    monkeypatch.setattr("skyloop.ros.names.version", lambda package: "7.1.6")
     with pytest.raises(UnsupportedError, match=r"not 7\.x with rmw_fastrtps_cpp"):
         tf_message_type()
 

@@ -24,10 +24,10 @@ from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.camera_options import source_of
 from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.errors import DriverError, SkyloopError
-from skyloop.host.control import Add, Status
 from skyloop.host.fleet import encode_handed, parse_fleet
 from skyloop.host.host import Host
 from skyloop.host.own_process import OwnProcessVehicle
+from skyloop.host.serve import Add, Status
 from skyloop.messages import Capabilities, EventKind, GetParameter, LinkState, Role, Severity
 from skyloop.network.packets import Key
 from skyloop.proxy import Proxy

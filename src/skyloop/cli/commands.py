@@ -84,7 +84,7 @@ COMMANDS: Final = {
     ),
     "detect": Entry(
         Task.SEE,
-        "detect",
+        "process",
         "detect",
         "Detect with your ONNX file in a drone's frames, drawn live",
         "detect my.onnx --on alpha",

@@ -13,8 +13,8 @@ from skyloop.cli.text import columns
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
-    from skyloop.host.control import Answer, Request
     from skyloop.host.fleet import Fleet
+    from skyloop.host.serve import Answer, Request
     from skyloop.host.vehicle import VehicleStatus
 
 FleetArgument = Annotated[Path, typer.Argument(metavar="FILE", help="The vehicles; docs/host.md shows such a file")]
@@ -46,7 +46,7 @@ def status(
     group: GroupOption = None,
 ) -> None:
     """Show the vehicles of a running host: in which state they are, who flies them, and why one failed."""
-    from skyloop.host.control import Status
+    from skyloop.host.serve import Status
 
     rows = _ask(Status(), host, group).vehicles
     if json:
@@ -73,8 +73,8 @@ def add(
 
     A vehicle by its address gets the defaults of the host's file. Of a file, those that run already are left alone.
     """
-    from skyloop.host.control import Add, AddNamed
     from skyloop.host.fleet import read_fleet
+    from skyloop.host.serve import Add, AddNamed
 
     if address is None and (what.endswith(".toml") or "/" in what):
         if own_process is not None:
@@ -100,7 +100,7 @@ def remove(
 
     It is refused while the vehicle flies and somebody has the authority, unless --land is given.
     """
-    from skyloop.host.control import Remove
+    from skyloop.host.serve import Remove
 
     answer = _ask(Remove(name, land), host, group)
     typer.echo(f"removed {name}: {answer.vehicles[0].address}")
@@ -140,7 +140,7 @@ def _duration(seconds: float) -> str:
 
 
 def _ask(request: Request, host: str | None, group: str | None) -> Answer:
-    from skyloop.host.control import ask, chosen_host
+    from skyloop.host.serve import ask, chosen_host
 
     return ask(chosen_host(host, group), request, group=group)
 

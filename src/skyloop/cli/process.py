@@ -1,28 +1,37 @@
-"""``skyloop process``: runs a class of the user's on a drone's frames, and publishes what it finds."""
+"""``skyloop process`` and ``skyloop detect``: a class of the user's, or a detector, on a drone's frames."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import os
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import msgspec
 import typer
 
+from skyloop.cli.completion import drone_names
 from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
-from skyloop.errors import UsageError
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages.relayed import Polyline, Shape, Text
+from skyloop.processing.worker import Output
 
 if TYPE_CHECKING:
+    from skyloop.client import Frame
     from skyloop.processing import Settings, Status
+    from skyloop.vision.detection import Detection, ObjectDetector
 
 LINE_EVERY_S: Final = 1.0
 _LOOK_S: Final = 0.1
 _MOST_WORKERS: Final = 64
+MOST: Final = 64  #: detections of one frame that are published, the surest: a result has a limit of 32 768 bytes
 
 
 def process(
@@ -174,3 +183,101 @@ def interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001
 
 def _print(text: str) -> None:
     typer.echo(text, err=True)
+
+
+def detect(
+    file: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[FILE]",
+            help="ONNX file of a detector: YOLO, YOLOX, RT-DETR …; without: Skyloop's own, of the simulator's figures",
+            show_default=False,
+        ),
+    ] = None,
+    on: Annotated[
+        str | None, typer.Option("--on", metavar="NAME", help="Running proxy", autocompletion=drone_names)
+    ] = None,
+    camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Whose frames; the first if not given")] = None,
+    score: Annotated[float, typer.Option(metavar="S", min=0.0, max=1.0, help="Leave out what is less sure")] = 0.4,
+    classes: Annotated[
+        str | None, typer.Option(metavar="NAME,…", help="Only these classes, by name; all if not given")
+    ] = None,
+    names: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Names of the classes, one a line; else the file's own")
+    ] = None,
+    layout: Annotated[
+        str | None, typer.Option(metavar="LAYOUT", help="Of the outputs, where the file does not show it")
+    ] = None,
+    name: Annotated[str, typer.Option(metavar="NAME", help="Of the processor and its results")] = "detections",
+    max_fps: Annotated[
+        float | None, typer.Option(metavar="F", min=0.001, help="Frames a second that it takes at most")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="For programs: a JSON object each second")] = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
+) -> None:
+    """Detect people, cars or whatever a network of yours knows in a drone's frames, and draw them live. Read-only.
+
+    Without FILE it finds the simulator's people, cars and crates: person, car, box. For a real camera give a FILE.
+    The results, with the time of their frame, are those of a processor: drone.results("detections"). Run the same
+    command again for another worker that shares the frames. A line each second shows its progress.
+    """
+    from skyloop.processing import Settings
+    from skyloop.vision import OnnxDetector
+    from skyloop.vision.simulated import SIMULATED_WEIGHTS
+
+    join_network(network, keys)
+    drone = one_drone(on, None)
+    path = SIMULATED_WEIGHTS if file is None else Path(file)
+    detector = OnnxDetector(path, score=score, names=None if names is None else Path(names), layout=layout)
+    wanted = [each.strip() for each in (classes or "").split(",") if each.strip()]
+    for each in wanted:
+        if detector.names and each not in detector.names.values():
+            raise UnknownNameError(f"class in {path.name if file is None else file}", each, detector.names.values())
+    processor = DetectionProcessor(detector, wanted)
+
+    def make() -> Any:
+        return processor
+
+    digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
+    settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupt)
+    with contextlib.suppress(KeyboardInterrupt):  # how it is meant to end
+        work(make, settings, drone, seconds, show_json if json else show_text, child=False)
+
+
+class DetectionProcessor:
+    """Publishes a detector's findings: ``{"detections": [{"box": …, "score": …, "class_id": …, "class_name": …}, …]}``.
+
+    Each is drawn as a closed outline of four corners, and a text with its class and score.
+    """
+
+    def __init__(self, detector: ObjectDetector, classes: Collection[str] = ()) -> None:
+        """Keep the detector.
+
+        Args:
+            detector: Called on the worker's thread.
+            classes: Names of the classes that are published; none: all.
+        """
+        self._detector = detector
+        self._classes = frozenset(classes)
+
+    def process(self, frame: Frame) -> Output:
+        """Detect in one frame."""
+        found = [one for one in self._detector.detect(frame) if not self._classes or one.class_name in self._classes]
+        found = found[:MOST]
+        return Output({"detections": [_value(one) for one in found]}, [s for one in found for s in _shapes(one)])
+
+
+def _value(one: Detection) -> dict[str, Any]:
+    name = one.class_name[:64]
+    return {"box": list(one.box), "score": one.score, "class_id": one.class_id, "class_name": name}
+
+
+def _shapes(one: Detection) -> tuple[Shape, ...]:
+    x, y, _, _ = one.box
+    return Polyline(one.outline, closed=True), Text(f"{one.class_name[:64]} {one.score:.2f}", (x, y))

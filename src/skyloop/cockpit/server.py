@@ -21,8 +21,8 @@ from skyloop.cockpit.admission import Admission, Connection
 from skyloop.cockpit.listening import Listener, ProtocolFactory, limit_messages, places_here
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Role
-from skyloop.metrics.catalogue import Reading
-from skyloop.metrics.sources import client_readings
+from skyloop.metrics import client_readings
+from skyloop.metrics.endpoint import Reading
 
 if TYPE_CHECKING:
     import uvicorn

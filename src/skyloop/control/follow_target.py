@@ -136,7 +136,7 @@ def _box(box: Sequence[float]) -> Box:
 
 
 def detections_of(value: Any) -> list[Detection]:
-    """Return the detections in a result of :class:`skyloop.processing.detecting.DetectionProcessor`.
+    """Return the detections in a result of ``skyloop detect``.
 
     Args:
         value: The result's value; what is no detection in it is left out.

@@ -19,10 +19,8 @@ from skyloop.errors import NameTakenError, RefusedError, SkyloopError, UnknownNa
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.links import LinkThread
 from skyloop.host.own_process import OwnProcessVehicle
-from skyloop.host.ticker import Ticker
+from skyloop.host.threads import HANG_LOOKS, LOOK_S, STALL_LOOKS, RequestWorkers, SharedLoop, Ticker, Watchdog
 from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, of_proxy, reason_of
-from skyloop.host.watchdog import HANG_LOOKS, LOOK_S, STALL_LOOKS, SharedLoop, Watchdog
-from skyloop.host.workers import RequestWorkers
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
 from skyloop.proxy.serve import at_once

@@ -1,20 +1,31 @@
-"""A vehicle whose proxy has a process of its own, which is started again when it dies."""
+"""A vehicle whose proxy has a process of its own, which is started again when it dies.
+
+The process is ``python -m skyloop.host.own_process NAME``. It is handed its settings. It ends with its host, at once
+and without landing, as a proxy of the host's own process does. Each line of its standard output is a status in JSON,
+for the host.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import msgspec
 
-from skyloop.child_process import ChildProcess, RestartingChild
-from skyloop.errors import RefusedError
-from skyloop.host.fleet import VehicleSettings, encode_handed
-from skyloop.host.vehicle import Condition, HostedVehicle, VehicleStatus
+from skyloop.child_process import ChildProcess, RestartingChild, handed_over
+from skyloop.drivers.registry import make_driver
+from skyloop.errors import RefusedError, SkyloopError
+from skyloop.host.fleet import VehicleSettings, decoder_of_handed, encode_handed
+from skyloop.host.vehicle import Condition, HostedVehicle, VehicleStatus, network_of, of_proxy, reason_of
+from skyloop.proxy import Proxy
+from skyloop.proxy.serve import run
+from skyloop.transport.base import TransportServer
+from skyloop.transport.local import LocalServer
 
 STARTS_WITHIN_S: Final = 20.0
 FIRST_PAUSE_S: Final = 0.5
@@ -27,6 +38,8 @@ STEADY_S: Final = 60.0  #: a process that ran for so long is started again after
 _POLL_S: Final = 0.05
 _decoder: Final = msgspec.json.Decoder(VehicleStatus)
 _log = logging.getLogger(__name__)
+FAILED: Final = 1
+STATUS_EVERY_S: Final = 0.25
 
 
 def pause_s(deaths: int) -> float:
@@ -47,7 +60,7 @@ class OwnProcessVehicle(HostedVehicle):
         self,
         settings: VehicleSettings,
         announce: Callable[[str], None],
-        command: tuple[str, ...] = (sys.executable, "-m", "skyloop.host.child"),
+        command: tuple[str, ...] = (sys.executable, "-m", "skyloop.host.own_process"),
     ) -> None:
         super().__init__(settings)
         self._announce = announce
@@ -161,3 +174,73 @@ class OwnProcessVehicle(HostedVehicle):
         if self.condition is not Condition.FAILED:
             self.condition = Condition.STOPPED
         return True
+
+
+def serve(settings: VehicleSettings) -> None:
+    """Serve one vehicle until SIGTERM, which lands it, or the end of the host. On the main thread.
+
+    Raises:
+        SkyloopError: It can't be served.
+    """
+    network = network_of(settings)
+    driver = make_driver(settings.address)
+    end: TransportServer = LocalServer(settings.name, group=settings.group)
+    if network is not None:
+        from skyloop.network import FabricServer
+        from skyloop.transport.composite import CompositeServer
+
+        end = CompositeServer([end, FabricServer(settings.name, network, vehicle=str(driver.uri))])
+    proxy = Proxy(driver, end, name=settings.name)
+    proxy.parameters.preset(settings.presets)
+    reporter = _Reporter(settings, proxy)
+    keys = None if network is None or network.ring is None else network.ring.poll
+
+    def look() -> Sequence[str]:
+        reporter.report()
+        return () if keys is None else keys()
+
+    run([proxy], parent_fd=0, look=look, records=True)
+
+
+class _Reporter:
+    """Writes the status of a proxy to standard output, several times a second."""
+
+    def __init__(self, settings: VehicleSettings, proxy: Proxy) -> None:
+        self._settings = settings
+        self._proxy = proxy
+        self._began_s = time.monotonic()
+        self._said_s = 0.0
+
+    def report(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._said_s < STATUS_EVERY_S:
+            return
+        self._said_s = now_s
+        row = VehicleStatus(
+            self._settings.name,
+            str(self._settings.address),
+            Condition.RUNNING,
+            uptime_s=now_s - self._began_s,
+            process="own",
+            pid=os.getpid(),
+        )
+        _write(msgspec.structs.replace(row, **of_proxy(self._proxy)))
+
+
+def _write(status: VehicleStatus) -> None:
+    sys.stdout.buffer.write(msgspec.json.encode(status) + b"\n")
+    sys.stdout.buffer.flush()
+
+
+def main() -> None:
+    """Serve the vehicle of the settings that were handed over."""
+    settings = decoder_of_handed(VehicleSettings).decode(handed_over() or "")
+    try:
+        serve(settings)
+    except SkyloopError as error:
+        _write(VehicleStatus(settings.name, str(settings.address), Condition.FAILED, failed=reason_of(error)))
+        sys.exit(FAILED)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,29 +1,57 @@
-"""A host as a process: what ``skyloop host fleet.toml`` runs."""
+"""A host as a process, what ``skyloop host fleet.toml`` runs, and its socket: ``add``, ``remove`` and ``status``.
+
+One request and one answer for each connection, in JSON, cut into packets. The socket ``NAME.host`` lies beside those of
+the proxies, and who may connect to them may use it: the host's user, the superuser, and members of the group it was
+given.
+"""
 
 from __future__ import annotations
 
 import gc
+import logging
 import os
+import socket
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from typing import Final
 
+import msgspec
+
 from skyloop.clock import monotonic_ns
-from skyloop.errors import UsageError
-from skyloop.host.control import Add, AddNamed, Answer, ControlServer, Remove, Request
-from skyloop.host.fleet import Defaults, Fleet, Vehicle, settings_of
+from skyloop.errors import (
+    FileFormatError,
+    LinkError,
+    NameTakenError,
+    NoAnswerError,
+    RefusedError,
+    SkyloopError,
+    UnknownNameError,
+    UsageError,
+)
+from skyloop.host.fleet import Defaults, Fleet, Vehicle, VehicleSettings, decoder_of_handed, encode_handed, settings_of
 from skyloop.host.host import Host, check_known
-from skyloop.host.vehicle import HostedVehicle, SharedVehicle, VehicleStatus, network_of
+from skyloop.host.vehicle import HostedVehicle, SharedVehicle, VehicleStatus, network_of, reason_of
 from skyloop.messages import LinkState
 from skyloop.metrics import serve_proxies
 from skyloop.proxy.serve import LAND_WITHIN_S, LinkLines, Shutdown, on_signals
 from skyloop.toml_file import Place
+from skyloop.transport.local.directory import HOST, connect, find_directory
+from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
 
 #: The interpreter's lock is handed over after so long: a hundred drivers' threads wait for it beside the one that
 #: receives commands.
 SWITCH_INTERVAL_S: Final = 0.001
 _POLL_S: Final = 0.2
+MAX_REQUEST: Final = 1 << 22  #: bytes, in packets of ``_CHUNK``
+MAX_PACKET: Final = 1 << 16  #: bytes
+MAX_ANSWER: Final = 1 << 22  #: bytes
+ANSWERS_WITHIN_S: Final = 60.0  #: of a request that lands a vehicle first
+_CHUNK: Final = 1 << 15
+_AGAIN_S: Final = 0.1  # until a connection is accepted again that could not be
+_SLOW_S: Final = 2.0  # for the other end to take or to send a packet
+_log = logging.getLogger(__name__)
 
 
 def serve(
@@ -156,3 +184,221 @@ def announce(line: str) -> None:
     """Write a line to standard output."""
     with suppress(OSError):  # nobody reads it: the host serves all the same
         print(line, flush=True)
+
+
+class Status(msgspec.Struct, frozen=True, tag="status"):
+    """Show all vehicles."""
+
+
+class Add(msgspec.Struct, frozen=True, tag="add"):
+    """Serve these vehicles too; those that run already are left alone."""
+
+    vehicles: tuple[VehicleSettings, ...]
+
+
+class AddNamed(msgspec.Struct, frozen=True, tag="add_named"):
+    """Serve one more vehicle: one of the host's file by its name, or any other one by its address."""
+
+    name: str
+    address: str | None = None
+    own_process: bool | None = None
+
+
+class Remove(msgspec.Struct, frozen=True, tag="remove"):
+    """Land a vehicle, and serve it no longer."""
+
+    name: str
+    land: bool = False
+
+
+Request = Status | Add | AddNamed | Remove
+
+
+class Answer(msgspec.Struct, frozen=True):
+    """What the host answers."""
+
+    vehicles: tuple[VehicleStatus, ...] = ()  #: all of them, or those that the request was about
+    problems: dict[str, str] = {}  #: why some could not be added, by name
+    error: str = ""  #: why nothing was done
+    kind: str = ""  #: of the error: the name of its class
+    code: str = ""
+
+
+_requests: Final[msgspec.json.Decoder[Request]] = decoder_of_handed(Request)
+_answers: Final = msgspec.json.Decoder(Answer)
+#: Carries out a request, on a thread of its own. Raises :class:`skyloop.errors.SkyloopError`.
+Responder = Callable[[Request], Answer]
+_ERRORS: Final[dict[str, type[SkyloopError]]] = {
+    error.__name__: error for error in (UsageError, FileFormatError, NameTakenError, LinkError)
+}
+
+
+class ControlServer:
+    """Takes requests, from :meth:`start` to :meth:`stop`.
+
+    Args:
+        name: The host's name.
+        answering: Carries requests out.
+        group: Of users who may connect as well.
+    """
+
+    def __init__(self, name: str, answering: Responder, *, group: str | None = None) -> None:
+        self._name = name
+        self._answering = answering
+        self._directory = find_directory(group, HOST)
+        self._directory.socket_path(name)
+        self._listener: Socket | None = None
+        self._inode = 0
+        self._thread: threading.Thread | None = None
+        self._ended = threading.Event()
+
+    def start(self) -> None:
+        """Begin.
+
+        Raises:
+            NameTakenError: A running host has the name.
+            LinkError: The directory of sockets is not safe.
+        """
+        self._listener, self._inode = self._directory.listen(self._name)
+        self._thread = threading.Thread(
+            target=self._run, args=(self._listener,), name="skyloop-host-control", daemon=True
+        )
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End. Requests in progress go on. Idempotent."""
+        listener, self._listener = self._listener, None
+        if listener is None or self._thread is None:
+            return
+        self._ended.set()
+        listener.hang_up()
+        self._thread.join()
+        self._directory.remove(self._name, self._inode)
+
+    def _run(self, listener: Socket) -> None:
+        while self._listener is not None:
+            try:
+                accepted, _ = listener.accept()
+            except OSError:  # the end, a caller that is gone, or no descriptor is left: not asked for all the time
+                self._ended.wait(_AGAIN_S)
+                continue
+            sock = Socket(accepted.detach())
+            try:
+                threading.Thread(target=self._serve, args=(sock,), name="skyloop-host-request", daemon=True).start()
+            except RuntimeError as error:  # no thread is to be had, for a moment
+                _log.warning("a request is not answered: %s", error)
+                sock.hang_up()
+
+    def _serve(self, sock: Socket) -> None:
+        set_timeout(sock, socket.SO_RCVTIMEO, _SLOW_S)
+        set_timeout(sock, socket.SO_SNDTIMEO, _SLOW_S)
+        try:
+            answer = self._answer(sock)
+            if answer is not None:
+                _send(sock, msgspec.json.encode(answer))
+        except OSError as error:
+            _log.info("an answer was not taken: %s", error)
+        sock.hang_up()
+
+    def _answer(self, sock: Socket) -> Answer | None:
+        """Return the answer to what comes; None for one who asks nothing, as who only looks who listens here."""
+        if not may_connect(sock, self._directory.gid):
+            return Answer(error=f"{credentials(sock)} may not use the host {self._name!r}", kind="RefusedError")
+        received = bytearray()
+        while len(received) <= MAX_REQUEST and (packet := sock.recv(MAX_PACKET)):
+            received += packet
+            if len(packet) != _CHUNK:  # the last one
+                break
+            with suppress(msgspec.DecodeError, RecursionError):
+                _requests.decode(received)
+                break  # as long as one chunk by chance
+        if not received:
+            return None
+        if len(received) > MAX_REQUEST:
+            text = f"the request is longer than {MAX_REQUEST} bytes: add fewer vehicles at a time"
+            return Answer(error=text, kind="RefusedError", code="malformed")
+        try:
+            request = _requests.decode(received)
+        except (msgspec.DecodeError, RecursionError) as error:
+            return Answer(error=f"the request is not understood: {error}", kind="RefusedError", code="malformed")
+        try:
+            return self._answering(request)
+        except SkyloopError as error:
+            code = error.code if isinstance(error, RefusedError) else ""
+            return Answer(error=reason_of(error), kind=type(error).__name__, code=code)
+        except Exception as error:  # noqa: BLE001  the host goes on, and who asked gets an answer
+            _log.exception("a request failed")
+            return Answer(error=f"the host failed: {error!r}", kind="RefusedError", code="failed")
+
+
+def _send(sock: Socket, text: bytes) -> None:
+    """Send a request or an answer, in as many packets as it takes."""
+    for first in range(0, len(text), _CHUNK):
+        sock.send(text[first : first + _CHUNK], socket.MSG_NOSIGNAL)
+
+
+def running_hosts(group: str | None = None) -> list[str]:
+    """Return the names of the hosts that run on this machine and that this user may reach."""
+    return [host.name for host in find_directory(group, HOST).proxies()]
+
+
+def chosen_host(name: str | None = None, group: str | None = None) -> str:
+    """Return the host that is meant: the one of this name, or the only one that runs.
+
+    Raises:
+        UsageError: None runs, or several do and none is named.
+        UnknownNameError: None of this name runs.
+    """
+    running = running_hosts(group)
+    if name is not None:
+        if name not in running:
+            raise UnknownNameError("host", name, running)
+        return name
+    if not running:
+        raise UsageError("no host runs on this machine: start one with skyloop host fleet.toml")
+    if len(running) > 1:
+        raise UsageError(f"several hosts run on this machine: name one of them, --host {' or '.join(running)}")
+    return running[0]
+
+
+def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
+    """Ask a host.
+
+    Args:
+        name: The host's name.
+        request: What to do.
+        group: The group that shares the directory of sockets.
+
+    Raises:
+        UsageError, RefusedError: Nothing was done; says why.
+        LinkError: It can't be reached, or ended meanwhile.
+        NoAnswerError: It did not answer in time.
+    """
+    directory = find_directory(group, HOST)
+    try:
+        directory.check()
+        sock = connect(directory.socket_path(name))
+    except OSError as error:
+        raise LinkError(f"the host {name!r} can't be reached: {error.strerror}") from None
+    set_timeout(sock, socket.SO_RCVTIMEO, ANSWERS_WITHIN_S)
+    received = bytearray()
+    try:
+        with suppress(BrokenPipeError):  # who is refused is answered and hung up on before having asked
+            _send(sock, encode_handed(request))
+        while (packet := sock.recv(_CHUNK)) and len(received) < MAX_ANSWER:
+            received += packet
+    except BlockingIOError:
+        raise NoAnswerError(f"the host {name!r} has not answered within {ANSWERS_WITHIN_S:g} s") from None
+    except OSError as error:
+        raise LinkError(f"the host {name!r} ended the connection: {error.strerror}") from None
+    try:
+        answer = _answers.decode(received)
+    except msgspec.DecodeError:
+        raise LinkError(f"the host {name!r} ended before it answered") from None
+    if answer.error:
+        if answer.kind in _ERRORS:
+            raise _ERRORS[answer.kind](answer.error)
+        if answer.kind == UnknownNameError.__name__:
+            raise UsageError(answer.error)
+        raise RefusedError(answer.error, code=answer.code or "refused")
+    return answer

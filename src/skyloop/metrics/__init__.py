@@ -1,11 +1,58 @@
 """What proxies, the cockpit and routers count, for Prometheus: read when it is asked for, never on the way of a sample.
 
-Needs the extra ``metrics``.
+Any thread may read; no lock is taken that a command waits for. Needs the extra ``metrics``.
 """
 
-from skyloop.metrics.catalogue import FAMILIES, Family, Reading
-from skyloop.metrics.endpoint import Endpoint, Source, serve
-from skyloop.metrics.sources import client_readings, proxy_readings, router_readings, serve_proxies, serving_beside
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from enum import Enum
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from skyloop.clock import NS_PER_S
+from skyloop.extend import Known
+from skyloop.messages import Failsafe, FlightState, LinkState
+from skyloop.metrics.endpoint import FAMILIES, Endpoint, Family, Reading, Source, serve
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+    from skyloop.network.session import Session
+    from skyloop.proxy import Proxy
+
+#: Metrics that are one of the proxy's counters: absent ones are 0, except those of a network that is not served.
+_COUNTERS: Final = {
+    "skyloop_feedback_published_total": "feedback.published",
+    "skyloop_feedback_selected_total": "feedback.selected",
+    "skyloop_feedback_missed_total": "feedback.missed",
+    "skyloop_commands_received_total": "commands.received",
+    "skyloop_commands_applied_total": "commands.applied",
+    "skyloop_commands_clamped_total": "commands.clamped",
+    "skyloop_commands_superseded_total": "commands.superseded",
+    "skyloop_requests_total": "requests.received",
+    "skyloop_requests_refused_total": "requests.refused",
+    "skyloop_packets_malformed_total": "packets.malformed",
+    "skyloop_packets_refused_total": "packets.refused",
+    "skyloop_events_missed_total": "events.missed",
+    "skyloop_driver_errors_total": "driver.errors",
+}
+_NETWORK: Final = {
+    "skyloop_network_dropped_total": "network.dropped",
+    "skyloop_network_refused_total": "network.refused",
+    "skyloop_network_strays_total": "network.strays",
+    "skyloop_network_turned_away_total": "network.turned_away",
+}
+#: Counters with a label in their name: how they begin, and how they end.
+_LABELLED: Final = {
+    "skyloop_commands_refused_total": ("commands.refused.", ""),
+    "skyloop_events_total": ("events.of.", ""),
+    "skyloop_frames_received_total": ("frames.", ".received"),
+    "skyloop_frames_published_total": ("frames.", ".published"),
+    "skyloop_frames_missed_total": ("frames.", ".missed"),
+}
+_DELAYS: Final = {"median": "commands.delay.median_s", "p99": "commands.delay.p99_s", "max": "commands.delay.max_s"}
+
 
 __all__ = [
     "FAMILIES",
@@ -20,3 +67,125 @@ __all__ = [
     "serve_proxies",
     "serving_beside",
 ]
+
+
+def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoint:
+    """Serve the metrics of the proxies of this process.
+
+    Args:
+        proxies: Returns those that there are; called for each scrape, on the endpoint's thread.
+        where: ``[HOST:]PORT``; see :func:`serve`.
+
+    Raises:
+        UsageError: ``where`` is no address, or can't be listened on.
+        MissingExtraError: The extra ``metrics`` is not installed.
+    """
+    return serve(lambda: [partial(proxy_readings, proxy) for proxy in proxies()], where)
+
+
+def serving_beside(
+    where: str, announce: Callable[[str], None]
+) -> Callable[[Sequence[Proxy]], AbstractContextManager[object]]:
+    """Return what :func:`skyloop.proxy.serve.run` enters to serve the metrics of its proxies while it runs.
+
+    Args:
+        where: ``[HOST:]PORT``; see :func:`serve`.
+        announce: Called with a line for people: where the metrics are.
+    """
+
+    def enter(proxies: Sequence[Proxy]) -> AbstractContextManager[object]:
+        endpoint = serve_proxies(lambda: proxies, where)
+        announce(endpoint.announcement)
+        return endpoint
+
+    return enter
+
+
+def proxy_readings(proxy: Proxy) -> Iterator[Reading]:
+    """Yield all that is to be known of one proxy, its vehicle and its applications."""
+    name, now_ns, publisher, handler = proxy.name, proxy.clock(), proxy.publisher, proxy.handler
+    own = (name,)
+    yield Reading("skyloop_vehicle_info", 1.0, (name, proxy.capabilities.vehicle))
+    feedback = publisher.feedback_now
+    state = FlightState.UNKNOWN if feedback is None else feedback.state
+    yield from _states("skyloop_vehicle_state", own, state, FlightState)
+    yield from _states("skyloop_vehicle_link_state", own, publisher.link_state, LinkState)
+    yield from _states("skyloop_failsafe", own, handler.ladder.step, Failsafe)
+    if feedback is not None:
+        yield Reading("skyloop_feedback_age_seconds", (now_ns - feedback.captured_ns) / NS_PER_S, own)
+        if feedback.battery is not None:
+            yield Reading("skyloop_vehicle_battery_ratio", feedback.battery, own)
+        if feedback.battery_v is not None:
+            yield Reading("skyloop_vehicle_battery_volts", feedback.battery_v, own)
+    authority = handler.authority
+    holder = authority.holder
+    yield Reading("skyloop_authority_held", float(holder is not None), own)
+    yield Reading("skyloop_authority_waiting", float(len(authority.waiting)), own)
+    yield Reading("skyloop_authority_leases_total", float(authority.granted), own)
+    if holder is not None:
+        yield Reading("skyloop_authority_priority", float(holder.priority), own)
+        yield Reading("skyloop_command_age_seconds", (now_ns - authority.last_command_ns) / NS_PER_S, own)
+    counts = proxy.statistics()
+    yield Reading("skyloop_applications", counts["applications"], own)
+    for metric, counter in _COUNTERS.items():
+        yield Reading(metric, counts.get(counter, 0.0), own)
+    for metric, counter in _NETWORK.items():
+        if counter in counts:
+            yield Reading(metric, counts[counter], own)
+    for metric, (prefix, suffix) in _LABELLED.items():
+        for counter, count in counts.items():
+            label = counter.removeprefix(prefix).removesuffix(suffix)
+            if counter == f"{prefix}{label}{suffix}":
+                yield Reading(metric, count, (name, label))
+    for statistic, counter in _DELAYS.items():
+        if counter in counts:
+            yield Reading("skyloop_command_delay_seconds", counts[counter], (name, statistic))
+
+
+def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
+    """Yield what a client knows of its connection to one proxy. Asks the proxy for nothing.
+
+    Args:
+        name: Of the proxy.
+        drone: Connected to it.
+    """
+    yield from _states("skyloop_client_link_state", (name,), drone.link.application, LinkState)
+    for channel, stats in Known(drone).stats.items():
+        if channel != "feedback" and (not channel.startswith("video/") or "?" in channel):
+            continue  # forms of video are as many as pages ask for, and an observer sends no commands
+        labels = (name, channel)
+        yield Reading("skyloop_client_received_total", float(stats.count), labels)
+        yield Reading("skyloop_client_lost_total", float(stats.lost), labels)
+        yield Reading("skyloop_client_dropped_total", float(stats.dropped), labels)
+        yield Reading("skyloop_client_malformed_total", float(stats.malformed), labels)
+        if stats.age_s is not None:
+            yield Reading("skyloop_client_age_seconds", stats.age_s, labels)
+        if (delay := stats.delay_s) is not None:
+            for statistic, value in (("median", delay.median), ("p99", delay.p99), ("max", delay.maximum)):
+                yield Reading("skyloop_client_delay_seconds", value, (*labels, statistic))
+
+
+def router_readings(session: Callable[[], Session]) -> Source:
+    """Return the source of a router's readings.
+
+    Args:
+        session: Returns the router's present session of Zenoh.
+    """
+
+    def read() -> Iterator[Reading]:
+        current = session()
+        links = dict.fromkeys(("router", "peer", "client"), 0)
+        for transport in current.zenoh.info.transports():
+            kind = str(transport.whatami).rpartition(".")[2].lower()
+            links[kind] = links.get(kind, 0) + 1
+        for kind, count in links.items():
+            yield Reading("skyloop_router_links", float(count), (kind,))
+        yield Reading("skyloop_router_shut_out", float(len(current.shut_out())))
+
+    return read
+
+
+def _states(metric: str, labels: tuple[str, ...], current: Enum, states: type[Enum]) -> Iterator[Reading]:
+    """Yield 1 for the present state and 0 for each other one."""
+    for state in states:
+        yield Reading(metric, float(state is current), (*labels, str(state.value)))

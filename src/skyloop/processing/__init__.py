@@ -1,8 +1,6 @@
 """Processors: classes that process frames on any host and publish what they find. See docs/processors.md."""
 
 from skyloop.processing.loading import Code, load_processor
-from skyloop.processing.output import Output
-from skyloop.processing.status import Status
-from skyloop.processing.worker import Settings, Worker
+from skyloop.processing.worker import Output, Settings, Status, Worker
 
 __all__ = ["Code", "Output", "Settings", "Status", "Worker", "load_processor"]

@@ -13,7 +13,7 @@ from typing import Final, Self
 import msgspec
 
 from skyloop.child_process import GRACE_S, ChildProcess, RestartingChild, on_parent_end
-from skyloop.processing.status import Status, together
+from skyloop.processing.worker import Status, together
 
 _PAUSE_S: Final = 1.0  #: time before a worker that died is restarted
 USAGE_ERROR: Final = 2  #: exit code of a child that can't work at all; it prints why

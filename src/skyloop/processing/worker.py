@@ -6,23 +6,47 @@ import math
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Final
+from types import TracebackType
+from typing import Any, Final, Self
+
+import msgspec
 
 from skyloop.client import Drone, Frame
+from skyloop.client.channels import Mailbox
 from skyloop.client.frame import Arrival
+from skyloop.client.publishing import Membership
 from skyloop.client.results import checked_age, checked_name
+from skyloop.client.video import VideoChannel
+from skyloop.clock import NS_PER_S, Clock
 from skyloop.errors import UsageError
-from skyloop.extend import join_processor
-from skyloop.messages import Severity
-from skyloop.messages.relayed import MAX_LOG_TEXT
-from skyloop.processing.frames import Frames
-from skyloop.processing.output import Output
-from skyloop.processing.status import Status, Tally
+from skyloop.extend import join_processor, video_channel
+from skyloop.messages import ProcessorShare, Severity
+from skyloop.messages.relayed import MAX_LOG_TEXT, Shape
 
 _LOOK_S: Final = 0.1  #: how often run() checks whether to end while no frame comes
 _REPORT_EVERY_S: Final = 1.0  #: exceptions of the user's code are reported at most this often
+_KEPT: Final = 1024  #: newest results and frames that are kept for rates and ages
+#: Summed over several workers.
+_SUMS: Final = ("frames", "results", "dropped", "stale", "errors", "refused", "unsent", "frames_hz", "results_hz")
+
+
+class Output:
+    """A value, and shapes to draw over the frame for people: ``return Output(boxes, [Polyline(…)])``."""
+
+    __slots__ = ("shapes", "value")
+
+    def __init__(self, value: Any, shapes: Iterable[Shape] = ()) -> None:
+        """Combine a value with shapes.
+
+        Args:
+            value: The result; None publishes none.
+            shapes: In the frame's pixels.
+        """
+        self.value = value
+        self.shapes = tuple(shapes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,3 +209,208 @@ class Worker:
     def _emit(self, text: str) -> None:
         self._report(text)
         self._drone.log.text(text[-MAX_LOG_TEXT:], name=self.settings.name, severity=Severity.ERROR)
+
+
+class Frames:
+    """The newest frame of a worker's share that it has not taken yet. A context manager: subscribed while open.
+
+    Only frames of the share are requested, again whenever it changes, so that no others travel over a network.
+    """
+
+    def __init__(
+        self, drone: Drone, membership: Membership, came: Callable[[], None], *, max_fps: float | None = None
+    ) -> None:
+        """Prepare to subscribe.
+
+        Args:
+            drone: Where the frames come from.
+            membership: Knows the share.
+            came: Called with each frame of the share, on the receiving thread.
+            max_fps: Most frames a second; None: all.
+        """
+        self._drone = drone
+        self._membership = membership
+        self._came = came
+        self._max_fps = max_fps
+        self._usual = video_channel(drone, membership.camera)
+        self._channel: VideoChannel | None = None  # subscribed now
+        self._buffer: Mailbox[Arrival] = Mailbox()
+        self._sink = self._arrived
+        self._lock = threading.Lock()  # guards the change from one channel to another
+
+    def __enter__(self) -> Self:
+        self._membership.changed = self._follow
+        if self._membership.share is not None:
+            self._follow(self._membership.share)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._membership.changed = None
+        self._turn_to(None)
+
+    @property
+    def dropped(self) -> int:
+        """Frames of the share that newer ones replaced."""
+        return self._buffer.dropped
+
+    def wait(self, timeout_s: float) -> Arrival | None:
+        """Take the newest frame; None if none comes within ``timeout_s`` [s]."""
+        return self._buffer.wait(timeout_s)
+
+    def picture(self, arrival: Arrival) -> Frame | None:
+        """Decode the frame; None, and counted by its channel, if it can't be decoded."""
+        return (self._channel or self._usual).picture(arrival)
+
+    # On the receiving thread, except on entering --------------------------------------------------------------
+
+    def _follow(self, share: ProcessorShare) -> None:
+        part, fps = (share.part, share.parts), self._max_fps
+        self._turn_to(video_channel(self._drone, share.camera, max_fps=fps, part=part) if share.parts else None)
+
+    def _turn_to(self, channel: VideoChannel | None) -> None:
+        with self._lock:
+            before, self._channel = self._channel, channel
+            if channel is before:
+                return
+            if channel is not None:
+                already = self._buffer.dropped
+                channel.add(self._sink, lambda: self._buffer.dropped - already)
+            if before is not None:
+                before.remove(self._sink)
+
+    def _arrived(self, arrival: Arrival) -> None:
+        share = self._membership.share  # the frame may be of an earlier share
+        if share is not None and share.parts and arrival.header.seq % share.parts == share.part:
+            self._came()
+            self._buffer.put(arrival)
+
+
+class Status(msgspec.Struct, frozen=True, kw_only=True):
+    """Statistics of one worker, or of several of one processor together.
+
+    Counts are since the start; rates and ages are of the last second.
+    """
+
+    processor: str
+    camera: str
+    processes: int = 1  #: workers that these statistics cover
+    part: int = 0  #: which part of the frames it takes; 0 for several workers
+    parts: int = 0  #: of how many parts, 0: none now; for several workers: how many of them take a part
+    workers: int = 0  #: of this processor and camera that the proxy knows
+    frames: int = 0  #: frames of its part
+    results: int = 0
+    dropped: int = 0  #: frames that newer ones replaced before it was ready
+    stale: int = 0  #: frames that were too old when their turn came
+    errors: int = 0  #: calls of ``process`` that raised
+    refused: int = 0  #: results that can't be sent
+    unsent: int = 0  #: results that could not be handed to the transport
+    frames_hz: float = 0.0
+    results_hz: float = 0.0
+    age_s: float | None = None  #: median time from a frame's capture to its result
+    age_max_s: float | None = None
+    took_s: float | None = None  #: median duration of ``process``
+
+    def __str__(self) -> str:
+        share = f"part {self.part + 1} of {self.parts}" if self.parts else "no part now"
+        if self.processes > 1:
+            share = f"{self.parts} of {self.processes} processes at work"
+        age = "–" if self.age_s is None or self.age_max_s is None else f"{_ms(self.age_s)} (max {_ms(self.age_max_s)})"
+        parts = [
+            f"{self.processor} {self.camera}",
+            share,
+            f"{self.frames_hz:.1f} frames/s",
+            f"{self.results_hz:.1f} results/s",
+            f"age {age}",
+            f"dropped {self.dropped}",
+            f"too old {self.stale}",
+            f"errors {self.errors}",
+            *([f"not sendable {self.refused}"] if self.refused else []),
+            *([f"not sent {self.unsent}"] if self.unsent else []),
+        ]
+        return "  ".join(parts)
+
+
+def together(found: Iterable[Status]) -> Status | None:
+    """Combine the statistics of several workers of one processor; None for none.
+
+    Counts and rates are summed. Ages are the worst of all.
+    """
+    each = list(found)
+    if len(each) < 2:
+        return each[0] if each else None
+    ages = [one.age_s for one in each if one.age_s is not None]
+    longest = [one.age_max_s for one in each if one.age_max_s is not None]
+    sums = {name: sum(getattr(one, name) for one in each) for name in _SUMS}
+    return Status(
+        processor=each[0].processor,
+        camera=each[0].camera,
+        processes=len(each),
+        parts=sum(one.parts > 0 for one in each),
+        workers=max(one.workers for one in each),
+        age_s=max(ages, default=None),
+        age_max_s=max(longest, default=None),
+        **sums,
+    )
+
+
+class Tally:
+    """Counts what one worker does. One thread counts frames, one results; any may read."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.frames = self.results = self.stale = self.errors = self.refused = self.unsent = 0
+        self._clock = clock
+        self._came: deque[int] = deque(maxlen=_KEPT)
+        self._made: deque[tuple[int, float, float]] = deque(maxlen=_KEPT)  # when, age [s], took [s]
+
+    def came(self) -> None:
+        """Count a frame of its part; on the receiving thread."""
+        self.frames += 1
+        self._came.append(self._clock())
+
+    def made(self, age_s: float, took_s: float) -> None:
+        """Count a result that was published.
+
+        Args:
+            age_s: From the frame's capture until now [s].
+            took_s: Duration of ``process`` [s].
+        """
+        self.results += 1
+        self._made.append((self._clock(), age_s, took_s))
+
+    def status(self, processor: str, camera: str, share: ProcessorShare | None, dropped: int) -> Status:
+        """Return the present statistics.
+
+        Args:
+            processor: Name of the processor.
+            camera: Name of the camera.
+            share: Share of the frames; None while it is not known.
+            dropped: Frames that newer ones replaced.
+        """
+        since_ns = self._clock() - NS_PER_S
+        made = [one for one in self._made.copy() if one[0] > since_ns]
+        ages, took = sorted(age for _, age, _ in made), sorted(took for _, _, took in made)
+        return Status(
+            processor=processor,
+            camera=camera,
+            part=share.part if share is not None else 0,
+            parts=share.parts if share is not None else 0,
+            workers=share.workers if share is not None else 0,
+            frames=self.frames,
+            results=self.results,
+            dropped=dropped,
+            stale=self.stale,
+            errors=self.errors,
+            refused=self.refused,
+            unsent=self.unsent,
+            frames_hz=float(sum(at_ns > since_ns for at_ns in self._came.copy())),
+            results_hz=float(len(made)),
+            age_s=ages[len(ages) // 2] if ages else None,
+            age_max_s=ages[-1] if ages else None,
+            took_s=took[len(took) // 2] if took else None,
+        )
+
+
+def _ms(value: float) -> str:
+    return f"{value * 1e3:.0f} ms"

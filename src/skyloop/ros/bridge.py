@@ -14,12 +14,9 @@ from skyloop.client.warm_up import keeper
 from skyloop.errors import UsageError
 from skyloop.extend import open_unasked
 from skyloop.messages import Event, Severity
-from skyloop.ros.names import Frames, namespaces_of
-from skyloop.ros.parameters import Parameters
-from skyloop.ros.pilot import Pilot
-from skyloop.ros.telemetry import Telemetry
-from skyloop.ros.time import RosTime
-from skyloop.ros.video import CameraPublisher
+from skyloop.ros.names import Frames, RosTime, namespaces_of
+from skyloop.ros.pilot import Parameters, Pilot
+from skyloop.ros.telemetry import CameraPublisher, Telemetry
 from skyloop.vehicles.ros2.node import RosContext, require_rclpy, stay_on_this_machine
 from skyloop.warmth import PERIOD_S
 
@@ -126,7 +123,7 @@ class Bridge:
     def _add(self, context: RosContext, drone: Drone, namespace: str) -> tuple[Any, Any]:
         """Wire a drone, and return the node whose callbacks may wait, and that whose callbacks never do."""
         settings = self._settings
-        # No node shows the borrowed type of transforms as something that it is not (skyloop.ros.tf_type).
+        # No node shows the borrowed type of transforms as something that it is not (skyloop.ros.names).
         own = {"use_sim_time": settings.use_sim_time, "start_type_description_service": False}
         node = context.node("skyloop", namespace, own)
         topics = context.node("skyloop_commands", namespace, own)

@@ -1,20 +1,24 @@
-"""Publishes a drone's state: odometry, IMU, battery, place on the earth, transforms, and what it is doing."""
+"""What a drone tells ROS: odometry, IMU, battery, place on the earth, transforms, what it is doing, and its images."""
 
 from __future__ import annotations
 
 import math
+import threading
+from array import array
 from typing import Any, Final
 
-from skyloop.client import Drone
-from skyloop.errors import UnsupportedError
+from skyloop.client import Drone, Frame
+from skyloop.client.channels import Listener
+from skyloop.errors import UnsupportedError, install_command
 from skyloop.messages import CameraInfo, Feedback, LinkState
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.ros.names import Frames
-from skyloop.ros.time import RosTime
+from skyloop.ros.names import Frames, RosTime
+from skyloop.vehicles.ros2.node import ros_name
 from skyloop.vehicles.ros2.wire.conversions import (
     VARIANCE,
     Quaternion,
     body_velocity,
+    camera_model,
     covariance,
     quaternion_of,
     stamp_of,
@@ -23,6 +27,7 @@ from skyloop.vehicles.ros2.wire.tf_message import Transform, encode_transforms
 
 SLOW_NS: Final = 1_000_000_000  #: battery and place on the earth, once in so long
 _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+JPEG_QUALITY: Final = 90
 
 
 class Telemetry:
@@ -98,7 +103,7 @@ class Telemetry:
     def _open_transforms(self, cameras: tuple[CameraInfo, ...]) -> None:
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
-        from skyloop.ros.tf_type import forget_error, tf_message_type
+        from skyloop.ros.names import forget_error, tf_message_type
 
         kind = tf_message_type()
         frames = self._frames
@@ -236,3 +241,102 @@ def _turn(orientation: Any, rotation: Quaternion) -> None:
 
 def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
+
+
+class CameraPublisher:
+    """Publishes one camera, while somebody subscribes to it: until then its frames are not asked for.
+
+    Args:
+        node: Of rclpy, in the drone's namespace.
+        drone: Connected.
+        camera: Of the drone.
+        time: Stamps of captures.
+        frames: Names of the drone's frames.
+    """
+
+    def __init__(self, node: Any, drone: Drone, camera: CameraInfo, time: RosTime, frames: Frames) -> None:
+        from rclpy.qos import qos_profile_sensor_data
+        from sensor_msgs.msg import CameraInfo as CameraInfoMessage
+        from sensor_msgs.msg import CompressedImage, Image
+
+        topic = ros_name(camera.name)
+        self._drone = drone
+        self._camera = camera
+        self._time = time
+        self._frame_id = frames.optical(camera.name)
+        self._image = node.create_publisher(Image, f"{topic}/image_raw", qos_profile_sensor_data)
+        self._info = node.create_publisher(CameraInfoMessage, f"{topic}/camera_info", qos_profile_sensor_data)
+        self._compressed: Any = None
+        try:
+            import cv2  # noqa: F401
+        except ImportError:
+            node.get_logger().warning(f"no {topic}/image_raw/compressed: {install_command('vision')} for JPEG")
+        else:
+            self._compressed = node.create_publisher(
+                CompressedImage, f"{topic}/image_raw/compressed", qos_profile_sensor_data
+            )
+        self._lock = threading.Lock()
+        self._listener: Listener[Any] | None = None
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody subscribes to one of the topics."""
+        publishers = (self._image, self._info, self._compressed)
+        return any(each is not None and each.get_subscription_count() for each in publishers)
+
+    def update(self) -> None:
+        """Ask for frames, or no longer: called a few times a second, from one thread."""
+        watched = self.watched
+        if watched and self._listener is None:
+            self._listener = self._drone.on_frame(self.publish, self._camera.name)
+        elif not watched and self._listener is not None:
+            self._listener.cancel()
+            self._listener = None
+
+    def publish(self, frame: Frame) -> None:
+        """Publish one frame. On a thread of the drone's own."""
+        stamp_ns = self._time.stamp_ns(frame.captured_ns)
+        if stamp_ns is None:
+            return
+        if self._image.get_subscription_count():
+            self._image.publish(self._raw(frame, stamp_ns))
+        if self._compressed is not None and self._compressed.get_subscription_count():
+            self._compressed.publish(self._jpeg(frame, stamp_ns))
+        if self._info.get_subscription_count():
+            self._info.publish(self._intrinsics(frame, stamp_ns))
+
+    def _raw(self, frame: Frame, stamp_ns: int) -> Any:
+        from sensor_msgs.msg import Image
+
+        message = self._head(Image(), stamp_ns)
+        message.height, message.width = frame.shape[:2]
+        message.encoding = "bgr8"
+        message.step = 3 * message.width
+        pixels = array("B")  # the type that rclpy takes as it is; bytes are converted one by one
+        pixels.frombytes(frame.data.cast("B"))
+        message.data = pixels
+        return message
+
+    def _jpeg(self, frame: Frame, stamp_ns: int) -> Any:
+        import cv2
+        from sensor_msgs.msg import CompressedImage
+
+        message = self._head(CompressedImage(), stamp_ns)
+        message.format = "bgr8; jpeg compressed bgr8"  # as image_transport's compressed publisher words it
+        _, encoded = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        message.data = array("B", encoded.tobytes())
+        return message
+
+    def _intrinsics(self, frame: Frame, stamp_ns: int) -> Any:
+        from sensor_msgs.msg import CameraInfo as CameraInfoMessage
+
+        message = self._head(CameraInfoMessage(), stamp_ns)
+        message.height, message.width = frame.shape[:2]
+        model = camera_model(frame.intrinsics)
+        message.distortion_model, message.d, message.k, message.r, message.p = model
+        return message
+
+    def _head(self, message: Any, stamp_ns: int) -> Any:
+        message.header.frame_id = self._frame_id
+        message.header.stamp.sec, message.header.stamp.nanosec = stamp_of(stamp_ns)
+        return message
