@@ -232,16 +232,6 @@ def learning(seconds: Seconds = None, minutes: Minutes = None, output: Output = 
     finish("learning", results, as_rich([learning.table(results)], str(results.machine)), output)
 
 
-def warmth(seconds: Seconds = None, minutes: Minutes = None, output: Output = None) -> None:
-    """Measure what keeping code warm saves and costs, by how often it is run."""
-    from benchmarks import warmth
-
-    wanted_s = duration_s(seconds, minutes)
-    with measuring("warmth", output) as progress:
-        results = warmth.measure(wanted_s, progress=progress)
-    finish("warmth", results, as_rich([warmth.table(results)], str(results.machine)), output)
-
-
 def ros(
     ros_python: Annotated[
         str | None,
@@ -311,7 +301,6 @@ BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
         scale,
         fleet,
         learning,
-        warmth,
         ros,
         recordings,
         video_path,

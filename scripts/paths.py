@@ -56,7 +56,7 @@ WAIT_S: Final = 20.0
 QUIET_S: Final = 0.05  #: a path is over when its threads have called nothing for so long
 ADDRESS: Final = "sim://?rate=1&cameras=front&width=64&height=48&fps=3"
 PILOT: Final = f"""import time, skyloop
-drone = skyloop.connect("gauge", rate_hz=1, warm_s=0, network=False, timeout_s={WAIT_S})
+drone = skyloop.connect("gauge", rate_hz=1, network=False, timeout_s={WAIT_S})
 drone.feedback().state.airborne or drone.takeoff()
 print(drone.hover(), flush=True)
 time.sleep({WAIT_S})
@@ -193,7 +193,7 @@ def trace() -> dict[str, list[list[Call]]]:
         os.environ["SKYLOOP_RUNTIME_DIR"] = around.enter_context(tempfile.TemporaryDirectory(prefix="skyloop-"))
         around.enter_context(Proxy(make_driver(ADDRESS), LocalServer("gauge"), name="gauge"))
         with skyloop.connect(
-            "gauge", network=False, on_exit="hover", rate_hz=1.0, warm_s=0.0, timeout_s=WAIT_S, stall_s=math.inf
+            "gauge", network=False, on_exit="hover", rate_hz=1.0, timeout_s=WAIT_S, stall_s=math.inf
         ) as drone:
             for name in PATIENT:
                 drone.config[name] = 10.0

@@ -49,7 +49,6 @@ from skyloop.messages import (
 )
 from skyloop.messages.feedback import typical_feedback
 from skyloop.proxy import Proxy
-from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
 
@@ -253,7 +252,6 @@ class Vehicle:
         name, server = self._server(folder)
         self._vehicle = BenchVehicle(received, self.camera)
         self._proxy = Proxy(self._vehicle, server, name=name)
-        keep_warm(self._proxy)
         self._proxy.start()
 
     def _server(self, folder: str) -> tuple[str, TransportServer]:

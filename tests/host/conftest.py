@@ -16,8 +16,6 @@ def runtime_dir(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", f"{directory}/run")
         monkeypatch.setenv("XDG_STATE_HOME", f"{directory}/state")
         monkeypatch.delenv("SKYLOOP_GROUP", raising=False)
-        # What is kept warm stays for as long as the process, with a frame slot that tests of those would find.
-        monkeypatch.setattr("skyloop.host.host.FEW", 0)
         yield Path(directory) / "run"
 
 

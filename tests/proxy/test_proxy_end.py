@@ -194,7 +194,7 @@ def broken(*_: object) -> None:
 
 @pytest.mark.parametrize(
     "step",
-    ["keep_warm", "handler.leave_hovering", "overview.end", "_requests.stop", "publisher.streams.end", "server.stop"],
+    ["handler.leave_hovering", "overview.end", "_requests.stop", "publisher.streams.end", "server.stop"],
 )
 def test_a_step_of_the_end_that_fails_keeps_no_other_one_from_being_taken(
     monkeypatch: pytest.MonkeyPatch, step: str
@@ -237,7 +237,7 @@ def test_what_fails_where_a_proxy_is_given_up_goes_to_the_log(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An exception in one of its threads ended in the interpreter's hook, or kept the rest from being given back."""
-    monkeypatch.setattr(bench.proxy, "keep_warm", broken)
+    monkeypatch.setattr(bench.proxy._requests, "stop", broken)
     monkeypatch.setattr(bench.server, "stop", broken)
     bench.proxy.end(reason="its driver hangs", hangs=True)
     assert bench.driver.closed

@@ -1124,7 +1124,6 @@ def connect(
     on_exit: OnExit = "land",
     authority: Authority | None = None,
     network: NetworkChoice = None,
-    warm_s: float = 0.005,
 ) -> Opening[Drone]:
     """Connect to a drone.
 
@@ -1148,8 +1147,6 @@ def connect(
             ``Authority()``.
         network: True, an address, or a :class:`Network` with keys; False stays on this host. None: as the variable
             ``SKYLOOP_NETWORK`` says, without which nothing leaves this host.
-        warm_s: How often the code of commands, feedback and frames is run on a dummy while this application flies [s],
-            so that it stays in the processor's caches and delays are shorter; 0: never.
 
     Raises:
         UnknownNameError: If no proxy of this name runs; carries suggestions.

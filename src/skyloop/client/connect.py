@@ -21,11 +21,9 @@ from skyloop.client.authority import Authority, check_seconds
 from skyloop.client.connection import Scheduler
 from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
-from skyloop.client.warm_up import keeper
 from skyloop.errors import Hint, LinkError, MissingExtraError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.files import wait_readable
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
-from skyloop.warmth import PERIOD_S
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: for a private proxy and its vehicle
@@ -97,7 +95,6 @@ class ConnectOptions(TypedDict, total=False):
     on_exit: OnExit
     authority: Authority | None
     network: NetworkChoice
-    warm_s: float
 
 
 def explains_moved_options(function: Callable[P, R]) -> Callable[P, R]:
@@ -125,7 +122,6 @@ def connect(
     on_exit: OnExit = "land",
     authority: Authority | None = None,
     network: NetworkChoice = None,
-    warm_s: float = PERIOD_S,
 ) -> Drone:
     """Connect to a drone.
 
@@ -147,8 +143,6 @@ def connect(
             ``Authority()``.
         network: True, an address, or a :class:`Network` with keys; False stays on this host. None: as the variable
             ``SKYLOOP_NETWORK`` says, without which nothing leaves this host.
-        warm_s: How often the code of commands, feedback and frames is run on a dummy while this application flies [s],
-            so that it stays in the processor's caches and delays are shorter; 0: never.
 
     Raises:
         UnknownNameError: If no proxy of this name runs; carries suggestions.
@@ -170,7 +164,6 @@ def connect(
         stall_s=stall_s,
         on_exit=on_exit,
         network=network,
-        warm_s=warm_s,
     )
     core.open(timeout_s=deadline - time.monotonic(), authority=authority)
     return Drone(core)
@@ -186,7 +179,6 @@ def prepare(
     stall_s: float = 1.0,
     on_exit: OnExit = "land",
     network: NetworkChoice = None,
-    warm_s: float = PERIOD_S,
 ) -> tuple[DroneCore, float]:
     """Return a drone that is not connected yet, and until when that may take, on ``time.monotonic``.
 
@@ -196,7 +188,6 @@ def prepare(
         raise UsageError(f"{target!r} is neither the name of a proxy nor a vehicle's address such as sim://")
     if timeout_s is not None:
         check_seconds("timeout_s", timeout_s)
-    keep_warm = keeper(warm_s)
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" in target:
@@ -217,7 +208,6 @@ def prepare(
             scheduler=scheduler,
             on_close=end,
             reach=reach,
-            keep_warm=None if scheduler is not None and scheduler.in_step else keep_warm,
         )
     except BaseException:
         if end is not None:

@@ -95,7 +95,6 @@ class DroneOptions(TypedDict, total=False):
     scheduler: Scheduler | None
     on_close: Callable[[], None] | None
     reach: str | None
-    keep_warm: Callable[[bool], None] | None
 
 
 class StreamOptions(TypedDict, total=False):
@@ -137,7 +136,6 @@ class DroneCore:
         scheduler: Scheduler | None = None,
         on_close: Callable[[], None] | None = None,
         reach: str | None = None,
-        keep_warm: Callable[[bool], None] | None = None,
     ) -> None:
         """Prepare a drone without connecting; :meth:`open` connects.
 
@@ -152,8 +150,6 @@ class DroneCore:
             scheduler: Source of the time and of waiting; None: real time.
             on_close: Called at the end of :meth:`close`, on the closing thread.
             reach: Name or address under which another process reaches the same vehicle; None if none can.
-            keep_warm: Called with whether this application flies the vehicle now, some twenty times a second, on the
-                supervisor's thread; see :mod:`skyloop.warmth`.
 
         Raises:
             UsageError: If ``access``, ``on_exit``, ``app``, ``rate_hz`` or ``stall_s`` is out of range.
@@ -195,7 +191,7 @@ class DroneCore:
         )
         self.supervisor = ConnectionSupervisor(
             connection,
-            Receiver(state, connection, self.commands, restorer, keep_warm or _let_be),
+            Receiver(state, connection, self.commands, restorer),
             dial,
             Hello(app, self.role),
             policy=policy,
@@ -676,7 +672,3 @@ def _check_knows(capabilities: Capabilities, action: AnyAction) -> None:
 def _returns(feedback: Feedback) -> bool:
     """Whether a failsafe flies the vehicle back to its start."""
     return feedback.failsafe is Failsafe.LAND and feedback.return_phase is not ReturnPhase.NONE
-
-
-def _let_be(flies: bool) -> None:
-    """Keep nothing warm."""

@@ -290,9 +290,7 @@ class Receiver:
         connection: ProxyConnection,
         commands: CommandSender,
         restorer: Restorer,
-        keep_warm: Callable[[bool], None],
     ) -> None:
-        self._keep_warm = keep_warm
         self._state = state
         self._connection = connection
         self._commands = commands
@@ -318,7 +316,6 @@ class Receiver:
     def disconnected(self, reason: str) -> None:  # noqa: ARG002  (link_changed publishes it)
         """Drop the authority and the set-point; ``reason`` is published by :meth:`link_changed`."""
         self._commands.disconnected()
-        self._keep_warm(False)
 
     def link_changed(self, state: LinkState, reason: str) -> None:
         """Publish the state of the hop to the proxy, and an event."""
@@ -340,8 +337,6 @@ class Receiver:
         for channel in tuple(self._state.variants.values()):
             if channel.watch.stalled(flows, now_ns):
                 self._connection.resubscribe(channel.request.topic)
-        newest = self._state.newest
-        self._keep_warm(newest is not None and newest.state.airborne and self._commands.status.state == "held")
         return self._commands.tick(now_ns)
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from skyloop.network import FabricSettings
 
 LAND_WITHIN_S: Final = 20.0
-FEW: Final = 8  #: vehicles of which one that is flown alone leaves the code of commands cold
 _AT_ONCE: Final = 8  # vehicles that start at the same time
 _STALL_S: Final = STALL_LOOKS * LOOK_S
 _HANG_S: Final = HANG_LOOKS * LOOK_S
@@ -113,15 +112,12 @@ class Host:
             return OwnProcessVehicle(settings, self.announce)
         lane = self._workers.lane()
         return SharedVehicle(
-            settings, self._reactor, lane, network, self._make_driver, self._few, self._overview, self._serve_link
+            settings, self._reactor, lane, network, self._make_driver, self._overview, self._serve_link
         )
 
     def _serve_link(self, vehicle: SharedVehicle, link: ServedLink) -> None:
         with self._lock:
             self._links.add(link, vehicle)
-
-    def _few(self) -> bool:
-        return len(self.vehicles) <= FEW
 
     def add_all(self, several: Sequence[VehicleSettings]) -> dict[str, str]:
         """Serve several vehicles, some at a time; return by name why some could not be served."""

@@ -25,7 +25,6 @@ from skyloop.proxy.flight_record import FlightRecord, record_path
 from skyloop.proxy.requests import JobQueue
 from skyloop.proxy.serve import keep_trail
 from skyloop.proxy.topics import OverviewRegistry
-from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
@@ -127,7 +126,6 @@ class SharedVehicle(HostedVehicle):
         jobs: Answers its requests that may wait.
         network: How its proxy joins the network; None for this host only.
         make: Makes the driver of an address.
-        few: Whether this process has few vehicles: the code of many is warm by itself.
         overview: The rows of all vehicles of this process; None: each shows its own alone.
         serve_link: Takes a link of its driver to a thread that serves those of several; None: it has its own thread.
     """
@@ -139,14 +137,12 @@ class SharedVehicle(HostedVehicle):
         jobs: JobQueue,
         network: FabricSettings | None,
         make: Callable[[VehicleUri], Driver] = make_driver,
-        few: Callable[[], bool] = lambda: True,
         overview: OverviewRegistry | None = None,
         serve_link: Callable[[SharedVehicle, ServedLink], None] | None = None,
     ) -> None:
         super().__init__(settings)
         self._serve_link = serve_link
         self._overview = overview
-        self._few = few
         self._make = make
         self.server = SharedLocalServer(settings.name, reactor, group=settings.group)
         self.proxy: Proxy | None = None
@@ -169,7 +165,6 @@ class SharedVehicle(HostedVehicle):
             driver.serve_link = partial(self._serve_link, self)
         proxy = Proxy(driver, self._end(str(driver.uri)), name=settings.name, ticker=False, jobs=self._jobs)
         proxy.parameters.preset(settings.presets)
-        keep_warm(proxy, unless=lambda: not self._few())
         if self._overview is not None:
             proxy.overview.share(self._overview)
         keep_trail(proxy, None)

@@ -244,7 +244,7 @@ class OverviewPages:
 
 
 def typical_feedback(captured_ns: int, state: FlightState = FlightState.FLYING) -> Feedback:
-    """Return feedback with as many values as a real vehicle's, for what measures the code or keeps it warm.
+    """Return feedback with as many values as a real vehicle's, for what measures the code.
 
     Args:
         captured_ns: When it was captured [ns].

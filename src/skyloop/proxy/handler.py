@@ -135,7 +135,6 @@ class CommandHandler:
         self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
         if executor.autopilot is not None:
             executor.autopilot.guard = self._guard_step
-        self.warm_s = 0.0  #: how often the code is to be run on a dummy while the vehicle is piloted [s]; 0: never
         self._lock = threading.RLock()
         self._executor = executor
         self._vehicle = publisher
@@ -179,7 +178,6 @@ class CommandHandler:
             self.authority.timeout_ns = settings.authority_timeout_ns
             self.authority.ask_ns = settings.authority_ask_ns
             self.ladder.settings = settings.failsafe
-            self.warm_s = settings.warm_s
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
 
@@ -351,11 +349,6 @@ class CommandHandler:
             and self._vehicle.link_breaks == self._breaks_seen
             and not self._executor.airborne
         )
-
-    @property
-    def piloted(self) -> bool:
-        """Whether somebody in command flies the vehicle now. Takes no lock."""
-        return self.authority.holder is not None and self._executor.airborne
 
     # Commands: all below is called under the lock ----------------------------------------------------------------
 

@@ -24,7 +24,6 @@ from skyloop.proxy.core.autopilot import AutopilotSettings
 from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.core.limits import Limits
 from skyloop.proxy.core.returning import ReturnSettings
-from skyloop.warmth import PERIOD_S, SHORTEST_S
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
 
 MAX_TEXT: Final = 1024  #: characters of a text value
@@ -125,14 +124,6 @@ OWN: Final[tuple[Parameter, ...]] = (
         description="Walls of the room as a box, where the vehicle knows them: a simulated one does",
     ),
     Parameter(ZONES, ParameterType.TEXT, "", default="", description="No-fly zones: boxes and cylinders"),
-    _own(
-        "warm.period_s",
-        PERIOD_S,
-        "s",
-        0.0,
-        1.0,
-        "Interval at which the code of commands is run on a dummy in a flight, which keeps it fast; 0: never",
-    ),
 )
 
 
@@ -221,7 +212,6 @@ class FlightSettings:
     max_age_ns: int = 0  #: of a command
     authority_timeout_ns: int = 0
     authority_ask_ns: int = 0
-    warm_s: float = 0.0  #: how often the code is run on a dummy while the vehicle is flown; 0: never
 
 
 class Parameters:
@@ -357,9 +347,6 @@ class Parameters:
             if "authority" in changed:
                 new["authority_timeout_ns"] = nanoseconds(value["authority.timeout_s"])
                 new["authority_ask_ns"] = nanoseconds(value["authority.ask_s"])
-            if "warm" in changed:
-                warm_s = value["warm.period_s"]
-                new["warm_s"] = max(warm_s, SHORTEST_S) if warm_s else 0.0
             if new:
                 self._settings = replace(before, **new)
             self._changed = set()

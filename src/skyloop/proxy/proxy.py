@@ -174,8 +174,6 @@ class Proxy:
         )
         self.overview = OverviewPublisher(server_end, self._overview_row)
         self._ticker = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True) if ticker else None
-        #: Called 50 times a second with how often the code is to be run on a dummy [s]; 0: not now. See ``warm_up``.
-        self.keep_warm: Callable[[float], None] = _let_be
         self._stopping = threading.Event()
         self._life_lock = threading.Lock()
         self._started = False
@@ -307,7 +305,6 @@ class Proxy:
             steps.callback(self.publisher.streams.end)
             steps.callback(self.driver.close)
             steps.callback(self._requests.stop)
-            steps.callback(self.keep_warm, 0.0)
 
     def forked(self) -> None:
         """Leave the vehicle and the clients to the parent process; in a child made by ``os.fork``."""
@@ -319,7 +316,6 @@ class Proxy:
             self.server.stop,
             self.driver.close,
             self._requests.stop,
-            partial(self.keep_warm, 0.0),
         )
         threads = [
             threading.Thread(target=self._give_back, args=(part,), name="skyloop-abandoned", daemon=True)
@@ -461,8 +457,6 @@ class Proxy:
             return
         self.handler.tick(now_ns)
         self.publisher.keep_alive(now_ns)
-        flown = self.handler.piloted and not self._stopping.is_set()  # it may come back after the end, from a hang
-        self.keep_warm(self.handler.warm_s if flown else 0.0)
 
     @property
     def at_rest(self) -> bool:
@@ -553,10 +547,6 @@ class Proxy:
 
 def _never() -> int:
     return 0
-
-
-def _let_be(period_s: float) -> None:
-    """Keep nothing warm."""
 
 
 def _silent(session: Session, why: str) -> EventDraft:

@@ -23,7 +23,6 @@ from skyloop.proxy.audit import AuditTrail, audit_path
 from skyloop.proxy.flight_record import FlightRecord, record_path
 from skyloop.proxy.proxy import Proxy
 from skyloop.proxy.topics import OverviewRegistry
-from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: how long a signalled proxy waits for its vehicle to land
@@ -150,8 +149,6 @@ def run(
     before they start, and left when they have ended.
     """
     shutdown = Shutdown()
-    for proxy in proxies:
-        keep_warm(proxy)
     records = parent_fd is None if records is None else records
     if audit is not None or records:
         for proxy in proxies:

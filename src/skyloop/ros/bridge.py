@@ -10,7 +10,6 @@ from typing import Any, Final, Self
 
 from skyloop.client import Drone
 from skyloop.client.connect import NAME_TIMEOUT_S, dial_by_name
-from skyloop.client.warm_up import keeper
 from skyloop.errors import UsageError
 from skyloop.extend import open_unasked
 from skyloop.messages import Event, Severity
@@ -18,7 +17,6 @@ from skyloop.ros.names import Frames, RosTime, namespaces_of
 from skyloop.ros.pilot import Parameters, Pilot
 from skyloop.ros.telemetry import CameraPublisher, Telemetry
 from skyloop.vehicles.ros2.node import RosContext, require_rclpy, stay_on_this_machine
-from skyloop.warmth import PERIOD_S
 
 PURPOSE: Final = "the bridge to ROS 2"
 MESSAGES: Final = ("sensor_msgs.msg", "geometry_msgs.msg", "nav_msgs.srv", "std_srvs.srv", "std_msgs.msg")
@@ -141,8 +139,7 @@ class Bridge:
 
 def _connect(name: str, timeout_s: float) -> Drone:
     """Connect as a pilot that does not ask for the authority yet."""
-    dial, warm = dial_by_name(name), keeper(PERIOD_S)
-    return open_unasked(Drone, dial, app="skyloop ros", timeout_s=NAME_TIMEOUT_S, stall_s=timeout_s, keep_warm=warm)
+    return open_unasked(Drone, dial_by_name(name), app="skyloop ros", timeout_s=NAME_TIMEOUT_S, stall_s=timeout_s)
 
 
 def _log(node: Any, event: Event) -> None:
