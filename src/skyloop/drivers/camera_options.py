@@ -1,8 +1,8 @@
 """A camera in the options of a vehicle's address: where its video comes from, and its intrinsics.
 
 Video comes from the address of a stream or from a device, as FFmpeg opens them. Of the intrinsics, ``calibration``
-names the file of a calibration; or ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion`` (k1, k2, p1, p2[, k3[, k4, k5,
-k6]]) give the numbers.
+names the file of a calibration; or ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion`` (k1, k2, p1, p2[, k3[, k4,
+k5, k6]]) give the numbers.
 """
 
 from __future__ import annotations
