@@ -18,7 +18,7 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from skyloop.transport.backlog import MOST_BYTES, MOST_PACKETS, Backlog, Lane
+from skyloop.transport.priority import MOST_BYTES, MOST_PACKETS, Backlog, Lane
 
 FLY, GO, IDLE, LAND = Velocity(forward=1.0), Position(1.0, 2.0, 3.0), Idle(), Land()
 ASK = encode(Request(1, Ping(1)))

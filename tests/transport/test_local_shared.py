@@ -9,7 +9,6 @@ from functools import partial
 
 import pytest
 
-from skyloop.transport.backlog import Lane
 from skyloop.transport.base import FEEDBACK, Dialer, Peer, TransportServer
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.conformance import TransportSuite
@@ -17,6 +16,7 @@ from skyloop.transport.local import dial, packets
 from skyloop.transport.local.client import LocalClient
 from skyloop.transport.local.reactor import Reactor, Source
 from skyloop.transport.local.shared_server import SharedLocalServer
+from skyloop.transport.priority import Lane
 from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
 
 _names = (f"shared-{number}" for number in itertools.count())

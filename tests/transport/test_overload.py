@@ -10,12 +10,12 @@ from functools import partial
 import pytest
 
 from skyloop.messages import AnyAction, Command, EmergencyStop, Land, Ping, Request, Takeoff, Velocity, encode
-from skyloop.transport.backlog import SUPERSEDED, Backlog
 from skyloop.transport.base import Dialer, Peer, TransportServer
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.local import LocalServer, dial
 from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
+from skyloop.transport.priority import SUPERSEDED, Backlog
 from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
 from tests.proxy.fake import Bench
 

@@ -16,8 +16,8 @@ from typing import Final
 from skyloop.network import packets
 from skyloop.network.admission import Admission
 from skyloop.network.delivery import DEPTH, MAX_BYTES, Outgoing, Pace, Receiver
-from skyloop.transport.backlog import Backlog
 from skyloop.transport.base import Peer
+from skyloop.transport.priority import Backlog
 
 #: Packets of one application that wait for the handler, and as many commands. Further packets are not acknowledged, so
 #: that they are sent again; further commands are dropped, as newer ones follow. Set-points count once.

@@ -6,10 +6,10 @@ import array
 import select
 import socket
 
-from skyloop.transport.backlog import MOST_PACKETS, Backlog
 from skyloop.transport.base import MAX_PACKET, Peer
 from skyloop.transport.local import packets
 from skyloop.transport.local.sockets import RECEIVE_FLAGS, SEND_FLAGS, Credentials, Socket, set_timeout
+from skyloop.transport.priority import MOST_PACKETS, Backlog
 
 
 class ServerConnection:

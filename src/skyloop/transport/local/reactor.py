@@ -22,9 +22,9 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final, Protocol
 
-from skyloop.transport.backlog import MOST_PACKETS, Lane
 from skyloop.transport.local.connection import ServerConnection
 from skyloop.transport.local.sockets import Socket
+from skyloop.transport.priority import MOST_PACKETS, Lane
 
 CHECK_S: Final = 0.5  #: how often silent connections, and listeners that could not accept, are looked at
 _AFTER_FAILURE_S: Final = 0.01

@@ -15,7 +15,6 @@ from typing import Final
 
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import FrameHeader
-from skyloop.transport.backlog import SUPERSEDED, Lane
 from skyloop.transport.base import (
     MAX_PACKET,
     MAX_SUBSCRIPTIONS,
@@ -36,6 +35,7 @@ from skyloop.transport.local.frame_exchange import FrameExchange
 from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.slot_memory import check_support
 from skyloop.transport.local.sockets import Credentials, Socket, credentials, may_connect, user_name
+from skyloop.transport.priority import SUPERSEDED, Lane
 from skyloop.transport.priority_lock import PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128

@@ -6,13 +6,13 @@ import logging
 import threading
 from typing import Final
 
-from skyloop.transport.backlog import Lane
 from skyloop.transport.base import MAX_PACKET, ServerHandler
 from skyloop.transport.local import packets
 from skyloop.transport.local.connection import ServerConnection
 from skyloop.transport.local.reactor import Reactor, Source, receiving
 from skyloop.transport.local.server import HELLO_S, LocalServer
 from skyloop.transport.local.sockets import RECEIVE_FLAGS, Socket
+from skyloop.transport.priority import Lane
 from skyloop.transport.priority_lock import is_command
 
 _LOOK_S: Final = 0.1  # how often a wait for connections looks whether their thread has ended
