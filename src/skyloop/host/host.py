@@ -27,8 +27,7 @@ from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
 from skyloop.proxy.overview import OverviewRegistry
 from skyloop.proxy.serve import at_once
-from skyloop.transport.local.reactor import Reactor
-from skyloop.transport.local.shared_server import SharedLocalServer
+from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings

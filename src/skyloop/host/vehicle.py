@@ -27,8 +27,7 @@ from skyloop.proxy.requests import JobQueue
 from skyloop.proxy.serve import keep_trail
 from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
-from skyloop.transport.local.reactor import Reactor
-from skyloop.transport.local.shared_server import SharedLocalServer
+from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
