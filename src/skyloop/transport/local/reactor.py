@@ -291,9 +291,8 @@ class SharedLocalServer(LocalServer):
         self._directory.remove(self._name, self._inode)
         for connection in list(self._connections):
             connection.hang_up("the proxy stopped")
-        if not isinstance(
-            threading.current_thread(), _Thread
-        ):  # a handler that stops its own server does not wait for itself
+        # A handler that stops its own server does not wait for itself.
+        if not isinstance(threading.current_thread(), _Thread):
             with self._left:
                 while self._served and not self.reactor.over:
                     self._left.wait(_LOOK_S)
