@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop import spare
-from skyloop.spare import (
+from skyloop.warmth import (
     AGAIN_CORES,
     FIRST_WAIT_S,
     LEAST_CORES,
@@ -153,4 +152,4 @@ def test_a_computer_that_does_not_say_is_no_error(monkeypatch: pytest.MonkeyPatc
         raise PermissionError("not for you")
 
     monkeypatch.setattr(Path, "open", refused)
-    assert spare.read_idleness() is None
+    assert read_idleness() is None

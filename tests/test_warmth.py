@@ -8,9 +8,8 @@ import threading
 
 import pytest
 
-from skyloop.spare import LOOK_S
 from skyloop.transport.testing import wait_until
-from skyloop.warmth import Pieces, Warmer
+from skyloop.warmth import LOOK_S, Pieces, Warmer
 
 
 class Pace:
