@@ -9,7 +9,8 @@ import msgspec
 from skyloop.clock import Clock
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, FeedbackRequest, encode
-from skyloop.messages.subscription import TOPIC, RateLimiter
+from skyloop.messages.subscription import FEEDBACK as TOPIC
+from skyloop.messages.subscription import RateLimiter
 from skyloop.proxy.events import Counters
 from skyloop.proxy.forms import Forms
 from skyloop.transport.base import TransportServer
