@@ -3,7 +3,7 @@
 A command comes every 31 ms. Meanwhile others use the caches, so that the same instructions, which take 8 µs when they
 have just run, take 110 µs: most of the delay of a channel. It is run only while the computer has a processor to spare,
 so that it takes nothing from work: that is decided by how long the processors were idle, from ``/proc/stat``.
-``docs/delays.md`` has the measurements, and what else was tried.
+``docs/delays.md`` has the measurements and the alternatives.
 """
 
 from __future__ import annotations

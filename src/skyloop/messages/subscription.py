@@ -1,6 +1,6 @@
-"""What a subscriber asks for: how much of the feedback, and which camera in which form. Pure.
+"""Requests of subscribers: the rate of feedback, and the camera, form and rate of video. Pure.
 
-Each request has one topic, by which it is subscribed to and encoded once for all who ask for the same.
+Each request has one topic, so that equal requests are encoded once for all their subscribers.
 """
 
 from __future__ import annotations

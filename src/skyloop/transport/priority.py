@@ -1,4 +1,4 @@
-"""What the proxy handles first: commands, and of the set-points of one connection only the newest.
+"""Commands first: the order in which the packets of connections, and the threads that bring them, get to the proxy.
 
 A command is the full desired state, and the library sends it again 32 times a second. Where a proxy is late, each
 set-point that waits behind a newer one costs time and is refused for its age in the end, which makes the proxy later
