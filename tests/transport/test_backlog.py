@@ -18,7 +18,7 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from skyloop.transport.backlog import MOST_BYTES, MOST_PACKETS, Backlog, Lane
+from skyloop.transport.priority import MOST_BYTES, MOST_PACKETS, Lane, PacketBacklog
 
 FLY, GO, IDLE, LAND = Velocity(forward=1.0), Position(1.0, 2.0, 3.0), Idle(), Land()
 ASK = encode(Request(1, Ping(1)))
@@ -28,7 +28,7 @@ def command(seq: int, action: AnyAction, intent: int | None = None) -> bytes:
     return encode(Command(seq, 1, seq if intent is None else intent, seq, action))
 
 
-def left(backlog: Backlog) -> list[bytes]:
+def left(backlog: PacketBacklog) -> list[bytes]:
     found = []
     while backlog:
         found.append(backlog.get())
@@ -51,7 +51,7 @@ def left(backlog: Backlog) -> list[bytes]:
     ],
 )
 def test_what_is_left(came: list[AnyAction], kept: list[int]) -> None:
-    backlog = Backlog()
+    backlog = PacketBacklog()
     packets = [command(seq, action) for seq, action in enumerate(came, 1)]
     superseded = sum(backlog.put(packet) for packet in packets)
     assert superseded == len(came) - len(kept)
@@ -60,7 +60,7 @@ def test_what_is_left(came: list[AnyAction], kept: list[int]) -> None:
 
 
 def test_repeats_are_joined_to_the_newest_of_them() -> None:
-    backlog = Backlog()
+    backlog = PacketBacklog()
     for seq in range(1, 6):
         backlog.put(command(seq, LAND, intent=7))
     backlog.put(command(6, FLY, intent=8))
@@ -69,14 +69,14 @@ def test_repeats_are_joined_to_the_newest_of_them() -> None:
 
 
 def test_one_that_came_in_another_order_takes_no_newer_ones_place() -> None:
-    backlog = Backlog()
+    backlog = PacketBacklog()
     backlog.put(command(5, FLY))
     assert backlog.put(command(4, GO)) == 0
     assert len(left(backlog)) == 2
 
 
 def test_one_that_was_taken_out_is_not_superseded() -> None:
-    backlog = Backlog()
+    backlog = PacketBacklog()
     backlog.put(command(1, FLY))
     backlog.get()
     assert backlog.put(command(2, FLY)) == 0
@@ -84,7 +84,7 @@ def test_one_that_was_taken_out_is_not_superseded() -> None:
 
 
 def test_a_damaged_command_supersedes_nothing_and_is_left_to_the_handler() -> None:
-    backlog = Backlog()
+    backlog = PacketBacklog()
     backlog.put(command(1, FLY))
     damaged = command(2, FLY)[:-1]
     assert backlog.put(damaged) == 0
@@ -92,13 +92,13 @@ def test_a_damaged_command_supersedes_nothing_and_is_left_to_the_handler() -> No
 
 
 def test_the_lane_is_that_of_the_commands_in_front() -> None:
-    backlog = Backlog()
+    backlog = PacketBacklog()
     lanes = []
     for packet in (command(1, FLY), command(2, LAND)):
         backlog.put(packet)
         lanes.append(backlog.lane)
     assert lanes == [Lane.STEERING, Lane.URGENT]
-    late = Backlog()
+    late = PacketBacklog()
     late.put(command(1, FLY))
     late.put(ASK)
     late.put(command(2, LAND))
@@ -110,12 +110,12 @@ def test_the_lane_is_that_of_the_commands_in_front() -> None:
 
 
 def test_it_is_bounded() -> None:
-    backlog = Backlog()
+    backlog = PacketBacklog()
     for _ in range(MOST_PACKETS):
         assert not backlog.full
         backlog.put(ASK)
     assert backlog.full
-    large = Backlog()
+    large = PacketBacklog()
     large.put(bytes(MOST_BYTES))
     assert large.full
     large.get()

@@ -9,14 +9,13 @@ from functools import partial
 
 import pytest
 
-from skyloop.transport.backlog import Lane
 from skyloop.transport.base import FEEDBACK, Dialer, Peer, TransportServer
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.conformance import TransportSuite
 from skyloop.transport.local import dial, packets
 from skyloop.transport.local.client import LocalClient
-from skyloop.transport.local.reactor import Reactor, Source
-from skyloop.transport.local.shared_server import SharedLocalServer
+from skyloop.transport.local.reactor import Reactor, SharedLocalServer, Source
+from skyloop.transport.priority import Lane
 from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
 
 _names = (f"shared-{number}" for number in itertools.count())
@@ -158,10 +157,9 @@ def test_a_reactor_that_is_split_while_packets_flow_loses_none(reactor: Reactor)
 
 
 def test_one_that_sends_no_hello_is_sent_away(reactor: Reactor, monkeypatch: pytest.MonkeyPatch) -> None:
-    from skyloop.transport.local import shared_server
     from skyloop.transport.local.directory import connect, find_directory
 
-    monkeypatch.setattr(shared_server, "HELLO_S", 0.05)
+    monkeypatch.setattr("skyloop.transport.local.reactor.HELLO_S", 0.05)
     server = Served(reactor)
     silent = connect(find_directory().socket_path(server.name))
     assert b"no Hello" in silent.recv(1000)

@@ -10,12 +10,11 @@ from functools import partial
 import pytest
 
 from skyloop.messages import AnyAction, Command, EmergencyStop, Land, Ping, Request, Takeoff, Velocity, encode
-from skyloop.transport.backlog import SUPERSEDED, Backlog
 from skyloop.transport.base import Dialer, Peer, TransportServer
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.local import LocalServer, dial
-from skyloop.transport.local.reactor import Reactor
-from skyloop.transport.local.shared_server import SharedLocalServer
+from skyloop.transport.local.reactor import Reactor, SharedLocalServer
+from skyloop.transport.priority import SUPERSEDED, PacketBacklog
 from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
 from tests.proxy.fake import Bench
 
@@ -62,7 +61,7 @@ class Late:
     def packets(self) -> list[bytes]:
         return [packet for _, packet in self.log.packets if packet != BLOCK]
 
-    def took(self, commands: Backlog, count: int) -> bool:
+    def took(self, commands: PacketBacklog, count: int) -> bool:
         return self.server.counters[SUPERSEDED] + len(commands) == count
 
     def close(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 
 from skyloop.messages import Command, Hover, Ping, Request, encode
-from skyloop.transport.priority_lock import PriorityLock, is_command
+from skyloop.transport.priority import PriorityLock, is_command
 from skyloop.transport.testing import wait_until
 
 

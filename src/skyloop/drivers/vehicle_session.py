@@ -1,6 +1,6 @@
-"""What the sessions of all vehicles share: the state of the vehicle link, why it is so, and pending events.
+"""Shared parts of the vehicles' sessions: the state of the vehicle link, the reasons for it, and pending events.
 
-Pure, but for a look at the device of a serial port that failed.
+Pure, but for :func:`serial_trouble`, which looks at the port's device.
 """
 
 from __future__ import annotations

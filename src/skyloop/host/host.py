@@ -25,8 +25,7 @@ from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
 from skyloop.proxy.serve import at_once
 from skyloop.proxy.topics import OverviewRegistry
-from skyloop.transport.local.reactor import Reactor
-from skyloop.transport.local.shared_server import SharedLocalServer
+from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings

@@ -26,8 +26,7 @@ from skyloop.proxy.requests import JobQueue
 from skyloop.proxy.serve import keep_trail
 from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import TransportServer
-from skyloop.transport.local.reactor import Reactor
-from skyloop.transport.local.shared_server import SharedLocalServer
+from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings

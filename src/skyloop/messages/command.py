@@ -1,4 +1,4 @@
-"""What an application tells the vehicle, and what became of it: commands, their outcome, and poses from outside.
+"""From an application to the vehicle: commands, their outcome, and poses measured from outside.
 
 A command is the full desired state each time; the newest wins. Axes are the body's (ROS REP 103): x forward, y left, z
 up; yaw is counter-clockwise seen from above.

@@ -1,6 +1,6 @@
-"""What a proxy reports: the vehicle's state, time-stamped, events, and an overview of many vehicles.
+"""Reports of a proxy: the vehicle's state, time-stamped, events, and an overview of many vehicles.
 
-What is not known is ``None``, never zero.
+Unknown values are ``None``, never zero.
 """
 
 from __future__ import annotations

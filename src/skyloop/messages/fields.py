@@ -1,4 +1,4 @@
-"""What the fields of samples are made of: ranges of numbers, and closed vocabularies.
+"""Types of the samples' fields: ranges of numbers, and closed vocabularies.
 
 A sample may come from anybody who may connect, and many programs use what is in it: as a size, an index, a time or
 the bound of a loop. So its numbers are bounded here once, where it comes in, and not at each place of use. Each member

@@ -1,6 +1,6 @@
-"""What applications publish through the proxy: annotations of frames, log entries, results of processors.
+"""Samples that applications publish through the proxy: annotations of frames, log entries, results of processors.
 
-The proxy relays it on the topics ``annotations``, ``logs``, ``results`` (of all processors) and ``results/NAME``.
+The proxy relays them on the topics ``annotations``, ``logs``, ``results`` (of all processors) and ``results/NAME``.
 """
 
 from __future__ import annotations

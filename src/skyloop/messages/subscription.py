@@ -1,6 +1,6 @@
-"""What a subscriber asks for: how much of the feedback, and which camera in which form. Pure.
+"""Requests of subscribers: the rate of feedback, and the camera, form and rate of video. Pure.
 
-Each request has one topic, by which it is subscribed to and encoded once for all who ask for the same.
+Each request has one topic, so that equal requests are encoded once for all their subscribers.
 """
 
 from __future__ import annotations
@@ -15,10 +15,22 @@ from skyloop.clock import NS_PER_S
 from skyloop.errors import UsageError
 from skyloop.messages.relayed import MAX_PARTS
 
-TOPIC: Final = "feedback"
+FEEDBACK: Final = "feedback"
 MIN_HZ: Final = 0.001  #: a sample in a quarter of an hour; the time between two of much less has no end
 MAX_HZ: Final = 1000.0
-_RATE: Final = f"{TOPIC}?max_hz="
+_FEEDBACK_RATE: Final = f"{FEEDBACK}?max_hz="
+TOLERANCE: Final = 0.1  #: of a period: a sample that comes so much too early is in time
+
+VideoEncoding = Literal["raw", "jpeg", "h264"]
+DEFAULT_QUALITY: Final = 80
+MIN_KBIT_S: Final = 30  #: of an encoded stream
+MAX_KBIT_S: Final = 50_000
+MAX_SUBSCRIBER: Final = 32  #: characters
+MIN_FPS: Final = 0.001  #: a frame in a quarter of an hour; the time between two of much less has no end
+_ENCODINGS: Final = get_args(VideoEncoding)
+_PREFIX: Final = "video/"
+_STREAM_PREFIX: Final = "stream/"
+_FIELDS: Final = ("encoding", "kbit_s", "max_fps", "part", "quality", "scale", "subscriber")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +62,7 @@ class FeedbackRequest:
     @property
     def topic(self) -> str:
         """The topic to subscribe to: ``feedback``, or for example ``feedback?max_hz=5``."""
-        return TOPIC if self.max_hz is None else f"{_RATE}{self.max_hz:g}"
+        return FEEDBACK if self.max_hz is None else f"{_FEEDBACK_RATE}{self.max_hz:g}"
 
     @property
     def period_s(self) -> float:
@@ -66,12 +78,12 @@ class FeedbackRequest:
         Raises:
             UsageError: It is not a topic of feedback, or not written that way.
         """
-        if topic == TOPIC:
+        if topic == FEEDBACK:
             return cls()
         try:
-            if not topic.startswith(_RATE):
-                raise ValueError(f"it is {TOPIC}, or {_RATE} and a number")
-            request = cls(float(topic.removeprefix(_RATE)))
+            if not topic.startswith(_FEEDBACK_RATE):
+                raise ValueError(f"it is {FEEDBACK}, or {_FEEDBACK_RATE} and a number")
+            request = cls(float(topic.removeprefix(_FEEDBACK_RATE)))
         except (ValueError, UsageError) as error:
             raise UsageError(f"{topic[:100]!r} is no request for feedback: {error}") from None
         if request.topic != topic:
@@ -86,18 +98,6 @@ class FeedbackRequest:
 
 
 PLAIN: Final = FeedbackRequest()
-
-
-VideoEncoding = Literal["raw", "jpeg", "h264"]
-DEFAULT_QUALITY: Final = 80
-MIN_KBIT_S: Final = 30  #: of an encoded stream
-MAX_KBIT_S: Final = 50_000
-MAX_SUBSCRIBER: Final = 32  #: characters
-MIN_FPS: Final = 0.001  #: a frame in a quarter of an hour; the time between two of much less has no end
-_ENCODINGS: Final = get_args(VideoEncoding)
-_PREFIX: Final = "video/"
-_STREAM_PREFIX: Final = "stream/"
-_FIELDS: Final = ("encoding", "kbit_s", "max_fps", "part", "quality", "scale", "subscriber")
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,40 +241,6 @@ class FrameFilter:
         return self._rate.in_time(captured_ns)
 
 
-def _with(request: VideoRequest, field: str, text: str) -> VideoRequest:
-    """The request with one more field, given as text. Raises ``ValueError``."""
-    if field == "encoding" and text in _ENCODINGS and request.encoding != "h264":
-        return replace(request, encoding=text)  # type: ignore[arg-type]
-    if field in ("quality", "kbit_s"):
-        return replace(request, **{field: int(text)})  # type: ignore[arg-type]
-    if field == "subscriber":
-        return replace(request, subscriber=text)
-    if field in ("max_fps", "scale"):
-        return replace(request, **{field: float(text)})  # type: ignore[arg-type]
-    if field == "part":
-        k, _, n = text.partition("/")
-        return replace(request, part=(int(k), int(n)))
-    raise ValueError(f"{field}={text[:40]} is unknown; known are {', '.join(_FIELDS)}")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _is_part(part: object) -> bool:
-    if not (isinstance(part, tuple) and len(part) == 2 and all(_is_whole(number) for number in part)):
-        return False
-    k, n = part
-    return bool(0 <= k < n <= MAX_PARTS)
-
-
-TOLERANCE: Final = 0.1  #: of a period: a sample that comes so much too early is in time
-
-
 class RateLimiter:
     """Selects samples of one series so that on average no more than so many a second are left.
 
@@ -316,3 +282,34 @@ class RateLimiter:
             return False
         self._due_ns = due_ns + period_ns
         return True
+
+
+def _with(request: VideoRequest, field: str, text: str) -> VideoRequest:
+    """The request with one more field, given as text. Raises ``ValueError``."""
+    if field == "encoding" and text in _ENCODINGS and request.encoding != "h264":
+        return replace(request, encoding=text)  # type: ignore[arg-type]
+    if field in ("quality", "kbit_s"):
+        return replace(request, **{field: int(text)})  # type: ignore[arg-type]
+    if field == "subscriber":
+        return replace(request, subscriber=text)
+    if field in ("max_fps", "scale"):
+        return replace(request, **{field: float(text)})  # type: ignore[arg-type]
+    if field == "part":
+        k, _, n = text.partition("/")
+        return replace(request, part=(int(k), int(n)))
+    raise ValueError(f"{field}={text[:40]} is unknown; known are {', '.join(_FIELDS)}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _is_part(part: object) -> bool:
+    if not (isinstance(part, tuple) and len(part) == 2 and all(_is_whole(number) for number in part)):
+        return False
+    k, n = part
+    return bool(0 <= k < n <= MAX_PARTS)

@@ -16,8 +16,8 @@ from typing import Final
 from skyloop.network import packets
 from skyloop.network.admission import Admission
 from skyloop.network.delivery import DEPTH, MAX_BYTES, Outgoing, Pace, Receiver
-from skyloop.transport.backlog import Backlog
 from skyloop.transport.base import Peer
+from skyloop.transport.priority import PacketBacklog
 
 #: Packets of one application that wait for the handler, and as many commands. Further packets are not acknowledged, so
 #: that they are sent again; further commands are dropped, as newer ones follow. Set-points count once.
@@ -65,7 +65,7 @@ class ServerConnection:
         self.id = connection
         self.admission = admission
         self.joined_s = joined_s  #: when it asked to be let in
-        self.commands = Backlog(MAX_WAITING)  #: that wait for the handler; the server guards it
+        self.commands = PacketBacklog(MAX_WAITING)  #: that wait for the handler; the server guards it
         self.announced = False  #: the handler knows of it
         self.confirmed = False  #: its token was seen, so that Zenoh will report its end
         self.ended = False  #: what still comes is not wanted any more

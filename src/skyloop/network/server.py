@@ -25,9 +25,8 @@ from skyloop.network.registry import ConnectionRegistry, Item
 from skyloop.network.sealing import PLAIN, TopicSeal, contents
 from skyloop.network.session import Session, acquire, host_name, load, release, undeclare
 from skyloop.network.settings import FabricSettings
-from skyloop.transport.backlog import SUPERSEDED
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_frame, check_name, check_packet
-from skyloop.transport.priority_lock import is_command
+from skyloop.transport.priority import SUPERSEDED, is_command
 
 if TYPE_CHECKING:
     import zenoh

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from skyloop.errors import UsageError
 from skyloop.messages import FrameHeader
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_packet
-from skyloop.transport.priority_lock import PriorityLock, is_command
+from skyloop.transport.priority import PriorityLock, is_command
 
 
 class _Member(NamedTuple):

@@ -11,10 +11,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from skyloop.errors import Hint, UnsupportedError
-from skyloop.transport.base import Dialer
+from skyloop.errors import Hint, LinkError, UnknownNameError, UnsupportedError
+from skyloop.transport.base import ClientHandler, Dialer
 
 if TYPE_CHECKING:
+    from skyloop.transport.local.client import LocalClient
     from skyloop.transport.local.directory import Proxy
     from skyloop.transport.local.server import LocalServer
 
@@ -36,9 +37,27 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
         UnsupportedError: This is not Linux.
     """
     _check_platform()
-    from skyloop.transport.local.client import make_dialer
+    from skyloop.transport.local.client import LocalClient
+    from skyloop.transport.local.directory import connect, find_directory
 
-    return make_dialer(name, group)
+    directory = find_directory(group)
+    path = directory.socket_path(name)
+
+    def dialer(handler: ClientHandler) -> LocalClient:
+        try:
+            directory.check()
+            sock = connect(path)
+        except FileNotFoundError:
+            raise UnknownNameError("proxy", name, [proxy.name for proxy in directory.proxies()]) from None
+        except ConnectionRefusedError:
+            raise LinkError(f"the proxy {name!r} is not running: it was killed and left its socket {path}") from None
+        except BlockingIOError:
+            raise LinkError(f"the proxy {name!r} does not accept connections: it is stopped or overloaded") from None
+        except OSError as error:
+            raise LinkError(f"cannot connect to the proxy {name!r} at {path}: {error.strerror}") from None
+        return LocalClient(sock, name, handler)
+
+    return dialer
 
 
 def list_names(*, group: str | None = None) -> list[Proxy]:

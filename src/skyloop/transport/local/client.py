@@ -1,25 +1,27 @@
-"""An application's end of the local transport."""
+"""An application's end of the local transport, and its read-only view of the server's frame slots."""
 
 from __future__ import annotations
 
 import array
+import fcntl
 import logging
+import mmap
 import os
 import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from skyloop.child_process import leave_to_parent
-from skyloop.errors import DecodeError, LinkError, UnknownNameError
+from skyloop.errors import DecodeError, LinkError
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
-from skyloop.transport.base import MAX_PACKET, ClientHandler, Dialer, TransportClient, check_packet, check_topic
+from skyloop.transport.base import MAX_PACKET, ClientHandler, Pixels, TransportClient, check_packet, check_topic
 from skyloop.transport.local import packets
-from skyloop.transport.local.directory import connect, find_directory
 from skyloop.transport.local.packets import OWN
-from skyloop.transport.local.slot_memory import Leases
 from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set_timeout
 
 _MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet has a few bytes more than its header's
@@ -27,29 +29,8 @@ _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
 _RETRY_S: Final = 0.25  # for what did not fit into a full socket
 _LOOK_S: Final = 0.05  # how often a thread that leads looks whether its wait is over, while nothing comes
 _STAND_BY_S: Final = 0.002  # how long nobody receives after the thread that led went away with what it waited for
+_MAX_CAPACITY: Final = 1 << 31  # what a client lets a server make it map
 _log = logging.getLogger(__name__)
-
-
-def make_dialer(name: str, group: str | None) -> Dialer:
-    """Return the dialer of a proxy; see :func:`skyloop.transport.local.dial`."""
-    directory = find_directory(group)
-    path = directory.socket_path(name)
-
-    def dialer(handler: ClientHandler) -> LocalClient:
-        try:
-            directory.check()
-            sock = connect(path)
-        except FileNotFoundError:
-            raise UnknownNameError("proxy", name, [proxy.name for proxy in directory.proxies()]) from None
-        except ConnectionRefusedError:
-            raise LinkError(f"the proxy {name!r} is not running: it was killed and left its socket {path}") from None
-        except BlockingIOError:
-            raise LinkError(f"the proxy {name!r} does not accept connections: it is stopped or overloaded") from None
-        except OSError as error:
-            raise LinkError(f"cannot connect to the proxy {name!r} at {path}: {error.strerror}") from None
-        return LocalClient(sock, name, handler)
-
-    return dialer
 
 
 class LocalClient(TransportClient):
@@ -307,3 +288,146 @@ def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
         if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
             descriptors.frombytes(data[: len(data) - len(data) % descriptors.itemsize])
     return descriptors.tolist()
+
+
+class SlotView:
+    """One slot at a client, mapped once, for reading only."""
+
+    __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
+
+    def __init__(self, number: int, camera: int, capacity: int, fd: int, held: set[int]) -> None:
+        """Map the memory.
+
+        Args:
+            number: The slot's number on the wire.
+            camera: The camera's.
+            capacity: The slot's size [bytes].
+            fd: Its descriptor, which stays the caller's.
+            held: The numbers of all slots of this camera that the application has; shared with the camera's other
+                slots.
+
+        Raises:
+            LinkError: The memory could be cut off while it is read, or is smaller than announced.
+            OSError: It can't be mapped.
+        """
+        self.number = number
+        self.camera = camera
+        self.capacity = capacity
+        self.held = held  #: numbers of all slots of this camera that the application has
+        try:
+            seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)
+        except OSError:
+            seals = 0
+        if not seals & fcntl.F_SEAL_SHRINK:
+            raise LinkError("the proxy offered shared memory that is not sealed against shrinking")
+        size = os.fstat(fd).st_size
+        if not 0 < capacity <= min(size, _MAX_CAPACITY):
+            raise LinkError(f"the proxy offered a slot of {capacity} bytes in {size} bytes of shared memory")
+        view = mmap.mmap(fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE, mmap.PROT_READ)
+        self.pixels: Pixels = np.frombuffer(view, np.uint8)
+        self._interface = self._describe(capacity)
+
+    def interface(self, size: int) -> dict[str, Any]:
+        """Return NumPy's description of the first ``size`` bytes; it is made again only when their number changes."""
+        if self._interface["shape"][0] != size:
+            self._interface = self._describe(size)
+        return self._interface
+
+    def _describe(self, size: int) -> dict[str, Any]:
+        return {"data": (self.pixels.ctypes.data, True), "shape": (size,), "typestr": "|u1", "version": 3}
+
+
+class Lease:
+    """The owner of a frame's pixels: while any array over it lives, the server does not reuse the slot."""
+
+    __slots__ = ("__array_interface__", "_leases", "_slot")
+
+    def __init__(self, slot: SlotView, size: int, leases: Leases) -> None:
+        self._slot = slot
+        self._leases = leases
+        self.__array_interface__ = slot.interface(size)
+
+    def __del__(self) -> None:
+        self._leases.released(self._slot)
+
+
+class Leases:
+    """A client's slots.
+
+    :meth:`released` is called by the garbage collector, on any thread and at any point of it.
+
+    Args:
+        send_release: Gives a slot back to the server by its number; must not acquire a lock.
+    """
+
+    #: Frames of one camera that an application may have in place. It gets copies of further ones, so that one that
+    #: collects frames does not use up the server's limit and starve.
+    IN_PLACE: Final = 3
+
+    def __init__(self, send_release: Callable[[int], None]) -> None:
+        self._send_release = send_release
+        self._slots: dict[int, SlotView] = {}
+        self._held: dict[int, set[int]] = {}
+
+    def add(self, number: int, camera: int, capacity: int, fd: int) -> None:
+        """Map a slot that the server announced.
+
+        Args:
+            number: The slot's.
+            camera: The camera's number.
+            capacity: The slot's size [bytes].
+            fd: Its descriptor, which stays the caller's.
+
+        Raises:
+            LinkError: The memory is not usable.
+            OSError: It can't be mapped.
+        """
+        self._slots[number] = SlotView(number, camera, capacity, fd, self._held.setdefault(camera, set()))
+
+    def retire(self, camera: int, before: int) -> None:
+        """Forget the slots of a camera below the number ``before``."""
+        for slot in list(self._slots.values()):
+            if slot.camera == camera and slot.number < before:
+                del self._slots[slot.number]
+
+    def end(self) -> None:
+        """Forget all slots, as the connection has ended; frames that the application still has stay valid.
+
+        Those frames refer to this object, and the collector does not search arrays for cycles. A reference from here to
+        the client, its handler and the frames that the handler keeps would keep all of them for ever.
+        """
+        self._slots.clear()
+        self._send_release = _to_nobody
+
+    def pixels(self, number: int, size: int) -> Pixels:
+        """Return the frame in a slot: in place, or as a copy if the application has :attr:`IN_PLACE` frames already.
+
+        Args:
+            number: The slot's.
+            size: The frame's size [bytes].
+
+        Returns:
+            Shape (size,), dtype uint8, not writeable.
+
+        Raises:
+            LinkError: The server has not announced such a slot.
+        """
+        slot = self._slots.get(number)
+        if slot is None or not 0 <= size <= slot.capacity:
+            raise LinkError(f"the proxy sent a frame of {size} bytes in slot {number}, which it has not announced")
+        if len(slot.held) >= self.IN_PLACE:
+            copy = slot.pixels[:size].copy()
+            copy.flags.writeable = False
+            self._send_release(number)
+            return copy
+        slot.held.add(number)
+        return np.asarray(Lease(slot, size, self))
+
+    def released(self, slot: SlotView) -> None:
+        """Give a slot back to the server; the application has no array over it any more."""
+        slot.held.discard(slot.number)
+        self._send_release(slot.number)
+
+
+def _to_nobody(_: int) -> None:
+    """Drop a release, as the connection has ended."""

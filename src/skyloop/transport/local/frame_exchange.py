@@ -8,19 +8,80 @@ sent the newest frame. There are always slots enough, as each viewer can hold on
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import itertools
+import mmap
+import os
 import threading
 from collections.abc import Iterator
 from typing import Final, Protocol
 
 import numpy as np
 
+from skyloop.errors import LinkError, UnsupportedError
 from skyloop.messages import FrameHeader, encode
 from skyloop.transport.base import Pixels
 from skyloop.transport.local import packets
-from skyloop.transport.local.slot_memory import SlotMemory
 
 MAX_LEASES: Final = 4  #: frames of one camera that one client may have: on the way, or in use
+F_SEAL_FUTURE_WRITE: Final = 0x10  # Linux 5.1; missing from Python's fcntl module
+# After mapping it the server keeps its own writeable view; nobody can make another, nor change the size. Were a slot to
+# shrink while a reader has it mapped, reading it would kill the reader (SIGBUS).
+_SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | F_SEAL_FUTURE_WRITE | fcntl.F_SEAL_SEAL
+
+
+class SlotMemory:
+    """One slot at the server: memory for a frame, and how many hold it."""
+
+    __slots__ = ("array", "capacity", "fd", "generation", "holders", "number")
+
+    def __init__(self, number: int, generation: int, capacity: int) -> None:
+        """Reserve the memory.
+
+        Args:
+            number: The slot's number on the wire.
+            generation: Which set of its camera's slots it belongs to.
+            capacity: Its size [bytes].
+
+        Raises:
+            OSError: No memory or descriptor is left.
+        """
+        self.fd = -1
+        self.number = number
+        self.generation = generation
+        self.capacity = capacity
+        self.holders = (
+            0  #: clients that have it, and the server while it writes to it or keeps it for a viewer that waits
+        )
+        self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        os.posix_fallocate(self.fd, 0, capacity)  # fails here where memory is short, and not while copying
+        view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
+        self.array: Pixels = np.frombuffer(view, np.uint8)
+        fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, _SEALS)
+
+    def __del__(self) -> None:
+        if self.fd >= 0:
+            os.close(self.fd)
+
+
+def check_support() -> None:
+    """Check that the kernel has what the transport needs.
+
+    Raises:
+        UnsupportedError: It has no sealed shared memory.
+        LinkError: No memory or descriptor is left.
+    """
+    try:
+        SlotMemory(0, 0, mmap.PAGESIZE)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EPERM):
+            raise LinkError(f"cannot make shared memory for frames: {error.strerror}") from None
+        raise UnsupportedError(
+            f"this kernel has no sealed shared memory ({error.strerror}): the local transport needs Linux 5.1 or later"
+        ) from None
+
+
 _Newest = tuple[SlotMemory, bytes]
 
 

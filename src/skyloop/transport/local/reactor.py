@@ -20,11 +20,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable
-from typing import Final, Protocol
+from typing import Final
 
-from skyloop.transport.backlog import MOST_PACKETS, Lane
-from skyloop.transport.local.connection import ServerConnection
-from skyloop.transport.local.sockets import Socket
+from skyloop.transport.base import MAX_PACKET, ServerHandler
+from skyloop.transport.local import packets
+from skyloop.transport.local.server import HELLO_S, LocalServer
+from skyloop.transport.local.sockets import RECEIVE_FLAGS, ServerConnection, Socket
+from skyloop.transport.priority import MOST_PACKETS, Lane, is_command
 
 CHECK_S: Final = 0.5  #: how often silent connections, and listeners that could not accept, are looked at
 _AFTER_FAILURE_S: Final = 0.01
@@ -38,22 +40,8 @@ _ORDERS: Final = (
     _FIRST_COME,
     (Lane.OTHERS, Lane.URGENT, Lane.STEERING),
 )
+_LOOK_S: Final = 0.1  # how often a wait for connections looks whether their thread has ended
 _log = logging.getLogger(__name__)
-
-
-class Receiver(Protocol):
-    """A transport server, as its reactor sees it. All but :attr:`reactor` is for the reactor's thread."""
-
-    reactor: Reactor  #: which receives for it now
-
-    def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
-        """Take one packet; return whether it now waits for :meth:`deliver`, and more may follow in the socket."""
-
-    def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
-        """Handle one packet of a source that waited in a lane; return the lane in which it waits again."""
-
-    def end_silent(self, reactor: Reactor, source: Source, now_s: float) -> None:
-        """End a connection that takes too long to send its first packet."""
 
 
 class Source:
@@ -68,7 +56,7 @@ class Source:
     __slots__ = ("connection", "ended", "fileno", "lane", "muted", "server", "since_s", "sock")
 
     def __init__(
-        self, server: Receiver, sock: Socket | None = None, connection: ServerConnection | None = None
+        self, server: SharedLocalServer, sock: Socket | None = None, connection: ServerConnection | None = None
     ) -> None:
         self.server = server
         self.sock = sock
@@ -84,16 +72,11 @@ class _Thread(threading.Thread):
     """A reactor's thread."""
 
 
-def receiving() -> bool:
-    """Return whether the calling thread is one of a reactor."""
-    return isinstance(threading.current_thread(), _Thread)
-
-
 class Reactor:
     """Receives for transport servers on one thread, from its construction to :meth:`close`."""
 
     def __init__(self) -> None:
-        self.inside: Receiver | None = None  #: whose handler is being called, or may be
+        self.inside: SharedLocalServer | None = None  #: whose handler is being called, or may be
         self.entries = 0  #: how often :attr:`inside` was set
         self._lock = threading.Lock()  # guards the table
         self._sources: dict[int, Source] = {}  # by file descriptor
@@ -128,7 +111,7 @@ class Reactor:
         """Whether its thread has ended, so that nobody receives for its servers any more."""
         return not self._thread.is_alive()
 
-    def left_of(self, server: Receiver) -> list[Source]:
+    def left_of(self, server: SharedLocalServer) -> list[Source]:
         """Return the sockets of a server that were left when the thread ended; none while it runs. Any thread."""
         with self._lock:
             return [source for source in self._sources.values() if source.server is server] if self.over else []
@@ -138,7 +121,7 @@ class Reactor:
         """Whether it waits for no socket."""
         return not self._sources
 
-    def split(self, stuck: Receiver) -> Reactor:
+    def split(self, stuck: SharedLocalServer) -> Reactor:
         """Leave this reactor to one server, and return a new one that receives for all others. Any thread.
 
         No packet is lost, none is delivered twice, and the packets of each connection keep their order.
@@ -245,7 +228,7 @@ class Reactor:
                 self.line_up(source, source.server.deliver(self, source, lane))
                 return
 
-    def _enter(self, server: Receiver) -> None:
+    def _enter(self, server: SharedLocalServer) -> None:
         self.inside = server
         self.entries += 1
 
@@ -268,3 +251,187 @@ class Reactor:
             elif source.connection is not None and not source.connection.joined:
                 self._enter(source.server)
                 source.server.end_silent(self, source, now_s)
+
+
+class SharedLocalServer(LocalServer):
+    """A :class:`LocalServer` that shares its receiving thread with others.
+
+    Its handler has to return quickly as ever: what it delays is delayed for all of them, until somebody calls
+    :meth:`Reactor.split`.
+
+    Args:
+        name: The proxy's name.
+        reactor: Receives for it, until it is split.
+        group: A group of users whose members may connect as well (default: the variable ``SKYLOOP_GROUP``).
+
+    Raises:
+        UsageError: The name or the group is not valid, or the socket's path would be too long.
+    """
+
+    def __init__(self, name: str, reactor: Reactor, *, group: str | None = None) -> None:
+        super().__init__(name, group=group)
+        self.reactor = reactor  #: which receives for it now
+        self._handler: ServerHandler | None = None
+        self._listening: Source | None = None
+        self._inode = 0
+        self._served: set[ServerConnection] = set()
+        self._left = threading.Condition()  # guards the set, and is notified when a connection has gone
+
+    def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
+        listener.setblocking(False)
+        self._handler = handler
+        self._inode = inode
+        self._listening = Source(self, sock=listener)
+        self.reactor.add(self._listening)
+
+    def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the source has it)
+        source, self._listening = self._listening, None
+        if source is not None:
+            self._drop(source)
+        self._directory.remove(self._name, self._inode)
+        for connection in list(self._connections):
+            connection.hang_up("the proxy stopped")
+        # A handler that stops its own server does not wait for itself.
+        if not isinstance(threading.current_thread(), _Thread):
+            with self._left:
+                while self._served and not self.reactor.over:
+                    self._left.wait(_LOOK_S)
+            with self._lock:
+                for left in self.reactor.left_of(self):  # its thread ended first: nobody else gives them back
+                    assert left.connection is not None
+                    self._finish_connection(left, left.connection, "the proxy stopped")
+
+    def _drop(self, source: Source) -> None:
+        """Let no reactor wait for a socket any more."""
+        source.ended = True
+        self.reactor.remove(source)  # one that is on its way to another reactor is dropped there, at first sight
+
+    # --- the reactor's thread ---
+
+    def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
+        """Take in a caller, or a packet of a connection.
+
+        Args:
+            reactor: Whose thread it is.
+            source: Is readable.
+            at_once: Whether nothing else waits for the thread, so that a command is handled here.
+
+        Returns:
+            Whether the packet waits for :meth:`deliver`, and more may wait behind it.
+        """
+        with self._lock:  # from receiving to handling, so that after a split nothing overtakes what this thread has
+            if not self._is_mine(reactor, source):
+                return False
+            connection = source.connection
+            if connection is None:
+                self._accept_shared(reactor, source)
+                return False
+            backlog = connection.backlog
+            if backlog.full or (backlog and not connection.pilot):
+                return False
+            try:
+                packet = connection.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
+            except (BlockingIOError, ConnectionResetError):
+                return False  # after a reset, what was sent before it still comes, and then the end
+            except OSError as error:
+                self._finish_connection(source, connection, f"receiving failed: {error}")
+                return False
+            if packet == packets.WAKE and connection.joined:
+                return False
+            if at_once and not backlog and is_command(packet) and not connection.more():
+                self._handle(source, connection, packet)
+                return False
+            self._superseded += backlog.put(packet)
+            reactor.line_up(source, self._lane(source, connection))
+            return connection.pilot and bool(packet)
+
+    def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
+        """Handle the first packet that waits in a source.
+
+        Args:
+            reactor: Whose thread it is.
+            source: Was in this lane.
+            lane: The lane.
+
+        Returns:
+            The lane that the source is to be put in again; None: in none.
+        """
+        with self._lock:
+            if not self._is_mine(reactor, source) or source.lane is not lane:
+                return None  # else it has become more urgent, and was in that lane
+            source.lane = None
+            connection = source.connection
+            if connection is None or not connection.backlog:
+                return None
+            self._handle(source, connection, connection.backlog.get())
+            return None if source.ended else self._lane(source, connection)
+
+    def _lane(self, source: Source, connection: ServerConnection) -> Lane | None:
+        """Return the lane that a source is to be put in; None: nothing waits, or it is in that lane already."""
+        lane = connection.backlog.lane
+        if lane is Lane.URGENT and not connection.pilot:
+            lane = Lane.STEERING  # it will be refused
+        if lane is None or (source.lane is not None and source.lane <= lane):
+            return None
+        source.lane = lane
+        return lane
+
+    def end_silent(self, reactor: Reactor, source: Source, now_s: float) -> None:
+        """End a connection that takes too long to send its first packet."""
+        with self._lock:
+            connection = source.connection
+            if connection is None or now_s - source.since_s <= HELLO_S or not self._is_mine(reactor, source):
+                return
+            self._finish_connection(source, connection, f"it sent no Hello within {HELLO_S:g} s")
+
+    def _is_mine(self, reactor: Reactor, source: Source) -> bool:
+        """Return whether this reactor still receives from it; pass it on or drop it if not."""
+        if source.ended:
+            reactor.remove(source)
+            return False
+        if self.reactor is not reactor:
+            reactor.hand_over(source, self.reactor)
+            if source.lane is not None:
+                self.reactor.resume((source,))
+            return False
+        return True
+
+    def _accept_shared(self, reactor: Reactor, source: Source) -> None:
+        assert source.sock is not None
+        try:
+            accepted, _ = source.sock.accept()
+        except BlockingIOError:
+            return
+        except OSError as error:
+            if not self._stopping.is_set() and not isinstance(error, ConnectionError):
+                _log.warning("%s cannot accept: %s", self.address, error)  # out of descriptors or memory
+                reactor.mute(source)
+            return
+        connection = self._let_in(Socket(accepted.detach()))
+        if connection is not None:
+            with self._left:
+                self._served.add(connection)
+            reactor.add(Source(self, connection=connection))
+            if self._stopping.is_set():  # it came while the others were sent away
+                connection.hang_up("the proxy stopped")
+
+    def _handle(self, source: Source, connection: ServerConnection, packet: bytes) -> None:
+        """Handle one packet, whatever the handler raises."""
+        handler = self._handler
+        assert handler is not None
+        try:
+            reason = self._take(handler, connection, packet)
+        except Exception as error:  # noqa: BLE001  (a handler may raise anything)
+            _log.exception("the handler of %s failed; %s is disconnected", self.address, connection.peer.address)
+            reason = f"the proxy's handler failed: {error!r}"
+        if reason:
+            self._finish_connection(source, connection, reason)
+
+    def _finish_connection(self, source: Source, connection: ServerConnection, reason: str) -> None:
+        handler = self._handler
+        assert handler is not None
+        self._drop(source)
+        self._end(handler, connection, reason)
+        with self._left:
+            self._served.discard(connection)
+            self._left.notify_all()

@@ -15,7 +15,6 @@ from typing import Final
 
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import FrameHeader
-from skyloop.transport.backlog import SUPERSEDED, Lane
 from skyloop.transport.base import (
     MAX_PACKET,
     MAX_SUBSCRIPTIONS,
@@ -30,13 +29,11 @@ from skyloop.transport.base import (
     video,
 )
 from skyloop.transport.local import packets
-from skyloop.transport.local.connection import ServerConnection
 from skyloop.transport.local.directory import find_directory
-from skyloop.transport.local.frame_exchange import FrameExchange
+from skyloop.transport.local.frame_exchange import FrameExchange, check_support
 from skyloop.transport.local.packets import OWN
-from skyloop.transport.local.slot_memory import check_support
-from skyloop.transport.local.sockets import Credentials, Socket, credentials, may_connect, user_name
-from skyloop.transport.priority_lock import PriorityLock, is_command
+from skyloop.transport.local.sockets import Credentials, ServerConnection, Socket, credentials, may_connect, user_name
+from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128
 #: Of them, so that no program alone can take all: a page of the cockpit that flies has a connection of its own.
