@@ -56,7 +56,7 @@ from skyloop.messages import (
     decode,
 )
 from skyloop.messages.overview import MAX_ADDRESS, MAX_EVENT_TEXT
-from skyloop.proxy.audit import AuditTrail
+from skyloop.proxy.records import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
 from skyloop.proxy.core.flight import Flight
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
