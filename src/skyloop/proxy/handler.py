@@ -78,10 +78,9 @@ from skyloop.proxy.events import (
     taken_event,
     thin_zones_event,
 )
-from skyloop.proxy.executor import ActionExecutor
+from skyloop.proxy.executor import ActionExecutor, ReturnSupervisor
 from skyloop.proxy.parameters import FlightSettings
 from skyloop.proxy.publisher import VehiclePublisher
-from skyloop.proxy.returning import ReturnSupervisor
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
