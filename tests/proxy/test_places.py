@@ -25,7 +25,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.proxy.core.airspace import Airspace, AirspaceSettings, Verdict
-from skyloop.proxy.core.limits import Limits
+from skyloop.proxy.core.settings import Limits
 from skyloop.zones import Box, Cylinder, Space
 from tests.proxy.fake import ALL, App, Bench
 

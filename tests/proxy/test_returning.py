@@ -29,8 +29,8 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.proxy.core.airspace import Airspace, AirspaceSettings
-from skyloop.proxy.core.limits import Limits
 from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, ReturnSettings, StartPoint
+from skyloop.proxy.core.settings import Limits
 from skyloop.zones import Box, Cylinder, Space
 from tests.proxy.fake import ALL, App, Bench
 

@@ -28,7 +28,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.proxy.core.airspace import MARGIN_M, Airspace, AirspaceSettings, Verdict
-from skyloop.proxy.core.limits import Limits
+from skyloop.proxy.core.settings import Limits
 from skyloop.stepping.rehearsal import Radio, rehearse
 from skyloop.zones import BOX, ROOM, ZONES, Box, Cylinder, Space, Zone, check_written, parse_zones, space_of
 from tests.proxy.fake import ALL, Bench

@@ -19,7 +19,7 @@ from skyloop.messages import Command, Event, EventKind, Failsafe, Refusal, Sever
 from skyloop.proxy.core import authority
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
 from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
-from skyloop.proxy.core.limits import Clamp
+from skyloop.proxy.core.settings import Clamp
 from skyloop.transport.base import EVENTS
 from skyloop.zones import THINNEST_M, ZONES, Space
 

@@ -56,7 +56,7 @@ from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, Fai
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import BELIEF_NS, Whose
 from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
-from skyloop.proxy.core.limits import Clamp
+from skyloop.proxy.core.settings import Clamp
 from skyloop.proxy.events import (
     UNHEARD,
     Counters,

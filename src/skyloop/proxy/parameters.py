@@ -22,8 +22,8 @@ from skyloop.messages.codec import MAX_BODY
 from skyloop.proxy.core.airspace import AirspaceSettings
 from skyloop.proxy.core.autopilot import AutopilotSettings
 from skyloop.proxy.core.failsafe import FailsafeSettings
-from skyloop.proxy.core.limits import Limits
 from skyloop.proxy.core.returning import ReturnSettings
+from skyloop.proxy.core.settings import Limits
 from skyloop.warmth import PERIOD_S, SHORTEST_S
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
 

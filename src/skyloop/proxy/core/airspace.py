@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 from skyloop.clock import NS_PER_S, seconds
 from skyloop.messages import AnyAction, Attitude, Feedback, Hover, Position, Refusal, Takeoff, Velocity
 from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
-from skyloop.proxy.core.limits import ALTITUDE_GAIN, SLACK_M, Clamp, Limits
+from skyloop.proxy.core.settings import ALTITUDE_GAIN, SLACK_M, Clamp, Limits
 from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665

@@ -15,7 +15,7 @@ from skyloop.clock import NS_PER_S, seconds
 from skyloop.messages import Feedback, FlightState, Land, Position, Refusal, ReturnPhase, ReturnToStart
 from skyloop.proxy.core.airspace import STALE_NS, Airspace
 from skyloop.proxy.core.flight import STANDING_NS
-from skyloop.proxy.core.limits import Clamp
+from skyloop.proxy.core.settings import Clamp
 from skyloop.zones import Space, Vec3
 
 NEAR_M: Final = 0.3  #: so near, and at rest, it is there
