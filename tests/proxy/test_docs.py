@@ -6,7 +6,7 @@ from pathlib import Path
 
 from skyloop.messages import Fate, FlightState, Refusal
 from skyloop.messages.intent import ENDINGS
-from skyloop.proxy import publisher, relay, requests, serve, sessions
+from skyloop.proxy import publisher, relay, requests, serve
 from skyloop.proxy.core import command_checks, failsafe, intents
 from skyloop.proxy.parameters import MAX_PARAMETER, OWN
 
@@ -75,7 +75,7 @@ def test_every_reason_for_refusing_a_command_is_named() -> None:
 def test_the_numbers_that_are_no_parameters_are_those_of_the_code() -> None:
     for sentence in (
         f"at most {intents.MAX_AHEAD_NS / 1e9:g} s in the future",
-        f"than {sessions.MAX_MALFORMED} malformed packets within a second",
+        f"than {requests.MAX_MALFORMED} malformed packets within a second",
         f"At most {requests.MAX_PENDING}\nrequests",
         f"more than {MAX_PARAMETER} bytes",
         f"up to {relay.MAX_ANNOTATION} bytes",

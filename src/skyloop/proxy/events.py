@@ -90,7 +90,8 @@ class EventPublisher:
         data: dict[str, Value] | None = None,
     ) -> None:
         """Publish one event now."""
-        self.publish_drafts(EventDraft(kind, text, severity, app, data or {}))
+        with self._lock:
+            self._number(EventDraft(kind, text, severity, app, data or {}), text)
 
     def publish_drafts(self, *drafts: EventDraft) -> None:
         """Publish these events now, in this order."""

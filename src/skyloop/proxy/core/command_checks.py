@@ -37,8 +37,8 @@ from skyloop.proxy.core.authority import Authority
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.flight import Flight, Whose
 from skyloop.proxy.core.intents import MAX_AHEAD_NS, Intent, Intents
-from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, ReturnSettings, StartPoint
-from skyloop.proxy.core.settings import Clamp
+from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, StartPoint
+from skyloop.proxy.core.settings import Clamp, ReturnSettings
 
 _HOVER_ACTION: Final = Hover()
 _ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
