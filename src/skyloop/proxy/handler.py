@@ -51,11 +51,10 @@ from skyloop.messages.command import SET_POINTS
 from skyloop.messages.numbers import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
-from skyloop.proxy.core.command_checks import CommandChecks
+from skyloop.proxy.core.command_checks import TAKEOFF_NS, CommandChecks, Intent
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import BELIEF_NS, Whose
-from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
 from skyloop.proxy.core.settings import Clamp, FlightSettings
 from skyloop.proxy.events import (
     UNHEARD,

@@ -33,7 +33,7 @@ from skyloop.messages import (
     SetParameter,
     encode,
 )
-from skyloop.proxy.core.intents import Intents
+from skyloop.proxy.core.command_checks import Intents
 from skyloop.proxy.events import Counters, Episodes
 from skyloop.transport.base import Peer, TransportServer
 
