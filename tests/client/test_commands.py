@@ -46,7 +46,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.config import MAX_REASON
 from skyloop.messages.feedback import WAKING_UP
-from skyloop.proxy.core.intents import TAKEOFF_NS
+from skyloop.proxy.core.command_checks import TAKEOFF_NS
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
 
 

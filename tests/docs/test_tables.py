@@ -14,8 +14,7 @@ from skyloop.messages import Action, FlightState, Hover, Land, ResetEmergency, T
 from skyloop.proxy.core.command_checks import STATE_POLICIES, StatePolicy
 from skyloop.proxy.parameters import OWN
 from skyloop.proxy.relay import MAX_ANNOTATION
-from skyloop.proxy.requests import MAX_PENDING
-from skyloop.proxy.sessions import MAX_MALFORMED
+from skyloop.proxy.requests import MAX_MALFORMED, MAX_PENDING
 from skyloop.sim.world_file import shipped_worlds
 from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS
 from skyloop.transport.local.frame_exchange import MAX_LEASES

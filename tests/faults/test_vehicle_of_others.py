@@ -23,10 +23,10 @@ from skyloop.control.route_law import RouteState
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import NoAnswerError, RefusedError, SwarmError
 from skyloop.messages import EventKind, Feedback
-from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.core.flight import Whose
-from skyloop.proxy.flight_record import FlightRecord
+from skyloop.proxy.core.settings import FailsafeSettings
 from skyloop.proxy.proxy import Proxy
+from skyloop.proxy.records import FlightRecord
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer

@@ -12,7 +12,7 @@ import pytest
 from skyloop.errors import NameTakenError, UsageError
 from skyloop.messages import Event, EventKind, FlightState, Land, ReleaseAuthority, RequestAuthority, Takeoff, Value
 from skyloop.proxy import Proxy
-from skyloop.proxy.audit import AuditTrail, Entry, Tenure, audit_path, entry_of, read, tenures
+from skyloop.proxy.records import AuditTrail, Entry, Tenure, audit_path, entry_of, read, tenures
 from skyloop.proxy.serve import keep_trail
 from skyloop.transport.local import LocalServer
 from tests.proxy.fake import Bench, FakeDriver

@@ -26,8 +26,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.proxy.core.command_checks import STATE_POLICIES, StatePolicy, explain, explain_state
-from skyloop.proxy.core.intents import Intents
+from skyloop.proxy.core.command_checks import STATE_POLICIES, Intents, StatePolicy, explain, explain_state
 
 NOW = 100 * NS_PER_S
 MAX_AGE = NS_PER_S // 4

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from skyloop.messages import Fate, FlightState, Refusal
 from skyloop.messages.command import ENDINGS
-from skyloop.proxy import publisher, relay, requests, serve, sessions
-from skyloop.proxy.core import command_checks, failsafe, intents
+from skyloop.proxy import publisher, relay, requests, serve
+from skyloop.proxy.core import command_checks, failsafe
 from skyloop.proxy.parameters import MAX_PARAMETER, OWN
 
 PAGE = (Path(__file__).parents[2] / "docs" / "proxy.md").read_text(encoding="utf-8")
@@ -53,7 +53,7 @@ def test_the_table_of_flight_states_is_the_one_in_force() -> None:
 
 def test_the_list_of_what_ends_an_intent_is_the_one_of_the_code() -> None:
     assert rows("fate") == [[f"`{fate.value}`", words] for fate, words in ENDINGS.items()]
-    assert f"within {intents.TAKEOFF_NS / 1e9:g} s" in ENDINGS[Fate.TIMED_OUT]
+    assert f"within {command_checks.TAKEOFF_NS / 1e9:g} s" in ENDINGS[Fate.TIMED_OUT]
 
 
 def test_every_reason_for_refusing_a_command_is_named() -> None:
@@ -74,8 +74,8 @@ def test_every_reason_for_refusing_a_command_is_named() -> None:
 
 def test_the_numbers_that_are_no_parameters_are_those_of_the_code() -> None:
     for sentence in (
-        f"at most {intents.MAX_AHEAD_NS / 1e9:g} s in the future",
-        f"than {sessions.MAX_MALFORMED} malformed packets within a second",
+        f"at most {command_checks.MAX_AHEAD_NS / 1e9:g} s in the future",
+        f"than {requests.MAX_MALFORMED} malformed packets within a second",
         f"At most {requests.MAX_PENDING}\nrequests",
         f"more than {MAX_PARAMETER} bytes",
         f"up to {relay.MAX_ANNOTATION} bytes",

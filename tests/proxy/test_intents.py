@@ -31,7 +31,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.command import ENDINGS
-from skyloop.proxy.core.intents import SETTLED_NS, TAKEOFF_NS, Intent, Intents
+from skyloop.proxy.core.command_checks import SETTLED_NS, TAKEOFF_NS, Intent, Intents
 from tests.proxy.fake import ALL, App, Bench
 
 NOW = 100 * NS_PER_S

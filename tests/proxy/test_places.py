@@ -24,8 +24,8 @@ from skyloop.messages import (
     Severity,
     Velocity,
 )
-from skyloop.proxy.core.airspace import Airspace, AirspaceSettings, Verdict
-from skyloop.proxy.core.limits import Limits
+from skyloop.proxy.core.airspace import Airspace, Verdict
+from skyloop.proxy.core.settings import AirspaceSettings, Limits
 from skyloop.zones import Box, Cylinder, Space
 from tests.proxy.fake import ALL, App, Bench
 

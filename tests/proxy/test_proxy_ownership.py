@@ -23,7 +23,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.proxy.flight_record import LIFE_S, FlightRecord
+from skyloop.proxy.records import LIFE_S, FlightRecord
 from skyloop.transport.testing import wait_until
 from tests.proxy.fake import Bench
 from tests.proxy.test_proxy_ladder import messages, steps

@@ -33,8 +33,7 @@ from skyloop.messages import (
     Velocity,
     Welcome,
 )
-from skyloop.proxy.requests import MAX_PENDING
-from skyloop.proxy.sessions import MAX_KEPT
+from skyloop.proxy.requests import MAX_KEPT, MAX_PENDING
 from tests.proxy.fake import WAIT_S, App, Bench
 
 FPS = Parameter("camera.fps", ParameterType.INT, 15, "1/s", 1, 30, 15)

@@ -28,9 +28,9 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
-from skyloop.proxy.core.airspace import Airspace, AirspaceSettings
-from skyloop.proxy.core.limits import Limits
-from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, ReturnSettings, StartPoint
+from skyloop.proxy.core.airspace import Airspace
+from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, StartPoint
+from skyloop.proxy.core.settings import AirspaceSettings, Limits, ReturnSettings
 from skyloop.zones import Box, Cylinder, Space
 from tests.proxy.fake import ALL, App, Bench
 

@@ -27,8 +27,8 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
-from skyloop.proxy.core.airspace import MARGIN_M, Airspace, AirspaceSettings, Verdict
-from skyloop.proxy.core.limits import Limits
+from skyloop.proxy.core.airspace import MARGIN_M, Airspace, Verdict
+from skyloop.proxy.core.settings import AirspaceSettings, Limits
 from skyloop.stepping.rehearsal import Radio, rehearse
 from skyloop.zones import BOX, ROOM, ZONES, Box, Cylinder, Space, Zone, check_written, parse_zones, space_of
 from tests.proxy.fake import ALL, Bench

@@ -16,7 +16,7 @@ import pytest
 
 from skyloop.errors import LinkError
 from skyloop.messages import EventKind, Hello, Refusal, Refused, Role, Welcome
-from skyloop.proxy.sessions import HELLO_NS
+from skyloop.proxy.requests import HELLO_NS
 from skyloop.transport.local import LocalServer, dial, list_names
 from skyloop.transport.local.directory import connect, find_directory
 from skyloop.transport.local.packets import Bye, hello, parse

@@ -24,7 +24,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.relayed import pack
 from skyloop.network.frames import MAX_FORMS, MAX_FORMS_EACH, FramePublisher
-from skyloop.proxy.sessions import MAX_MALFORMED
+from skyloop.proxy.requests import MAX_MALFORMED
 from skyloop.proxy.topics import PLAIN, topic_problem
 from skyloop.transport.base import ANNOTATIONS, MAX_SUBSCRIPTIONS, RESULTS
 from skyloop.transport.testing import header, picture, wait_until

@@ -31,7 +31,7 @@ from skyloop.host.serve import Add, Status
 from skyloop.messages import Capabilities, EventKind, GetParameter, LinkState, Role, Severity
 from skyloop.network.packets import Key
 from skyloop.proxy import Proxy
-from skyloop.proxy.audit import AuditTrail
+from skyloop.proxy.records import AuditTrail
 from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.mavlink.options import options_of as mavlink_options
 from skyloop.vehicles.replay.options import options_of as replay_options

@@ -17,7 +17,7 @@ from skyloop.errors import UnknownNameError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from skyloop.proxy.audit import Tenure
+    from skyloop.proxy.records import Tenure
 
 HEAD = ("DRONE", "WHO", "IDENTITY", "PRIORITY", "FROM", "TO", "TAKE-OFFS", "HOW IT ENDED")
 
@@ -34,7 +34,7 @@ def audit(
     json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
 ) -> None:
     """Show who held the authority over a drone, from when to when, and how it ended. The times are local."""
-    from skyloop.proxy.audit import read, tenures
+    from skyloop.proxy.records import read, tenures
 
     name = one_drone(name, drone) if name is not None or drone is not None else None
     entries, bad = [], 0
@@ -82,7 +82,7 @@ def _local(at: datetime) -> str:
 
 
 def _files(name: str | None, file: Path | None) -> list[Path]:
-    from skyloop.proxy.audit import SUFFIX, audit_folder, audit_path
+    from skyloop.proxy.records import SUFFIX, audit_folder, audit_path
 
     if file is not None:
         return [file]

@@ -21,7 +21,7 @@ from skyloop.files import expand
 from skyloop.host.fleet import VehicleSettings
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
-from skyloop.proxy.flight_record import FlightRecord, record_path
+from skyloop.proxy.records import FlightRecord, record_path
 from skyloop.proxy.requests import JobQueue
 from skyloop.proxy.serve import keep_trail
 from skyloop.proxy.topics import OverviewRegistry

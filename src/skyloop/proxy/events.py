@@ -19,7 +19,7 @@ from skyloop.messages import Command, Event, EventKind, Failsafe, Refusal, Sever
 from skyloop.proxy.core import authority
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
 from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
-from skyloop.proxy.core.limits import Clamp
+from skyloop.proxy.core.settings import Clamp
 from skyloop.transport.base import EVENTS
 from skyloop.zones import THINNEST_M, ZONES, Space
 
@@ -90,7 +90,8 @@ class EventPublisher:
         data: dict[str, Value] | None = None,
     ) -> None:
         """Publish one event now."""
-        self.publish_drafts(EventDraft(kind, text, severity, app, data or {}))
+        with self._lock:
+            self._number(EventDraft(kind, text, severity, app, data or {}), text)
 
     def publish_drafts(self, *drafts: EventDraft) -> None:
         """Publish these events now, in this order."""

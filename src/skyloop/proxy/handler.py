@@ -51,12 +51,11 @@ from skyloop.messages.command import SET_POINTS
 from skyloop.messages.fields import LATEST_NS
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
-from skyloop.proxy.core.command_checks import CommandChecks
+from skyloop.proxy.core.command_checks import TAKEOFF_NS, CommandChecks, Intent
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import BELIEF_NS, Whose
-from skyloop.proxy.core.intents import TAKEOFF_NS, Intent
-from skyloop.proxy.core.limits import Clamp
+from skyloop.proxy.core.settings import Clamp, FlightSettings
 from skyloop.proxy.events import (
     UNHEARD,
     Counters,
@@ -78,11 +77,9 @@ from skyloop.proxy.events import (
     taken_event,
     thin_zones_event,
 )
-from skyloop.proxy.executor import ActionExecutor
-from skyloop.proxy.parameters import FlightSettings
+from skyloop.proxy.executor import ActionExecutor, ReturnSupervisor
 from skyloop.proxy.publisher import VehiclePublisher
-from skyloop.proxy.returning import ReturnSupervisor
-from skyloop.proxy.sessions import Session
+from skyloop.proxy.requests import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
@@ -749,9 +746,9 @@ class CommandHandler:
             self._events.publish_drafts(*news)
             return
         self._observe_flight(now_ns)
-        feedback = self._vehicle.feedback_now
-        state = self._executor.state
-        landing = None if self._vehicle.link_up else self._landing
+        vehicle, state = self._vehicle, self._executor.state
+        feedback, link_up = vehicle.feedback_now, vehicle.link_up
+        landing = None if link_up else self._landing
         if landing is not None and landing.begun:
             self.ladder.land_on(now_ns)  # no hover takes its pilot's landing back
         inputs = FailsafeInputs(
@@ -759,11 +756,11 @@ class CommandHandler:
             airborne=self.flight.flies(state),
             last_command_ns=self.authority.last_command_ns,
             pilot=self._pilot,
-            link_up=self._vehicle.link_up,
+            link_up=link_up,
             battery=feedback.battery if feedback is not None else None,
             ours=self.flight.ours,
             return_problem=self._back.why_not(now_ns),
-            shown=self._vehicle.link_up or Land not in self._executor.native,
+            shown=link_up or Land not in self._executor.native,
         )
         effects = self.ladder.update(now_ns, inputs)
         if effects or news:

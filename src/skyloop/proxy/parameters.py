@@ -1,4 +1,4 @@
-"""The parameters of a proxy and of its driver as one typed store.
+"""The parameters of a proxy and of its driver as one typed store, and the answers to requests about them.
 
 Checking is pure (:func:`check`). Where the driver has a parameter of the same name as the proxy, the driver's is the
 one that is shown and written, and the proxy obeys its value: ``limits.tilt`` of a vehicle with a limit of its own.
@@ -9,29 +9,43 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import NS_PER_S, Clock, seconds
+from skyloop.drivers.base import Driver
 from skyloop.errors import DriverError, ParameterError, UnknownNameError
-from skyloop.messages import Parameter, ParameterPage, ParameterType, Refusal, Value
+from skyloop.messages import (
+    AnyReply,
+    EventKind,
+    GetParameter,
+    ListParameters,
+    Parameter,
+    ParameterPage,
+    ParameterType,
+    ParameterValue,
+    Refusal,
+    Refused,
+    Role,
+    SetParameter,
+    Severity,
+    Value,
+)
 from skyloop.messages.codec import MAX_BODY
 from skyloop.messages.parameter import CHECKUP, encode_checkup
-from skyloop.proxy.core.airspace import AirspaceSettings
-from skyloop.proxy.core.autopilot import AutopilotSettings
-from skyloop.proxy.core.failsafe import FailsafeSettings
-from skyloop.proxy.core.limits import Limits
-from skyloop.proxy.core.returning import ReturnSettings
-from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
+from skyloop.proxy.core.settings import FlightSettings
+from skyloop.proxy.events import EventPublisher
+from skyloop.proxy.handler import CommandHandler
+from skyloop.proxy.publisher import VehiclePublisher
+from skyloop.proxy.requests import Session
+from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written
 
 MAX_TEXT: Final = 1024  #: characters of a text value
 MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
 PAGE_BYTES: Final = MAX_BODY - 256  #: of encoded parameters in one reply
-
-if TYPE_CHECKING:
-    from skyloop.drivers.base import Driver
+#: A momentary parameter, such as a flip, is written within this time or never: its writer waits no longer.
+MOMENT_NS: Final = 2 * NS_PER_S
 
 _KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
 _encoded = msgspec.msgpack.Encoder().encode
@@ -201,19 +215,6 @@ def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
     return checked
 
 
-@dataclass(frozen=True, slots=True)
-class FlightSettings:
-    """What the parameters ask of the flight."""
-
-    airspace: AirspaceSettings = field(default_factory=AirspaceSettings)
-    failsafe: FailsafeSettings = field(default_factory=FailsafeSettings)
-    autopilot: AutopilotSettings = field(default_factory=AutopilotSettings)
-    returns: ReturnSettings = field(default_factory=ReturnSettings)
-    max_age_ns: int = 0  #: of a command
-    authority_timeout_ns: int = 0
-    authority_ask_ns: int = 0
-
-
 class Parameters:
     """The store. Any thread; driver calls happen on the caller's thread, outside of the store's lock."""
 
@@ -298,57 +299,13 @@ class Parameters:
                 self._changed.add(name.partition(".")[0])
 
     def flight_settings(self) -> FlightSettings:
-        """Return what the values in force ask of the flight; made anew is only what those that changed concern.
+        """Return what the values in force ask of the flight.
 
         Raises:
             ParameterError: The driver has no-fly zones that can't be read.
         """
         with self._lock:
-            changed, value, before = self._changed, self._in_force, self._settings
-            new: dict[str, Any] = {}
-            limits, space = before.airspace.limits, before.airspace.space
-            if "limits" in changed:
-                limits = Limits(
-                    tilt=value["limits.tilt"],
-                    climb=value["limits.climb"],
-                    yaw_rate=value["limits.yaw_rate"],
-                    speed=value["limits.speed"],
-                    altitude=value["limits.altitude"],
-                )
-            if "safety" in changed:
-                space = space_of(value.__getitem__, value.__getitem__)
-            if changed & {"limits", "safety"}:
-                new["airspace"] = AirspaceSettings(
-                    limits, space, value["safety.deceleration"], value["safety.reaction_s"]
-                )
-            if changed & {"limits", "autopilot"}:
-                new["autopilot"] = AutopilotSettings(
-                    takeoff_altitude=min(value["autopilot.takeoff_altitude"], limits.altitude),
-                    climb=min(value["autopilot.climb"], limits.climb),
-                    descent=min(value["autopilot.descent"], limits.climb),
-                    velocity_p=value["autopilot.velocity_p"],
-                    velocity_i=value["autopilot.velocity_i"],
-                    tilt=limits.tilt,
-                )
-            if changed & {"failsafe", "battery"}:
-                new["failsafe"] = FailsafeSettings(
-                    hover_after_s=value["failsafe.hover_after_s"],
-                    land_after_s=value["failsafe.land_after_s"],
-                    retry_s=value["failsafe.retry_s"],
-                    battery_warn=value["battery.warn"],
-                    battery_land=value["battery.land"],
-                    battery_return=value["battery.return"],
-                    returns=value["failsafe.return"],
-                )
-            if "return" in changed:
-                new["returns"] = ReturnSettings(value["return.height"], value["return.speed"], value["return.land"])
-            if "command" in changed:
-                new["max_age_ns"] = nanoseconds(value["command.max_age_s"])
-            if "authority" in changed:
-                new["authority_timeout_ns"] = nanoseconds(value["authority.timeout_s"])
-                new["authority_ask_ns"] = nanoseconds(value["authority.ask_s"])
-            if new:
-                self._settings = replace(before, **new)
+            self._settings = self._settings.updated(self._in_force, self._changed)
             self._changed = set()
             return self._settings
 
@@ -384,3 +341,85 @@ class Parameters:
                 break
             chosen.append(parameter)
         return ParameterPage(len(everything), first, tuple(chosen))
+
+
+class ParameterRequests:
+    """Answers what applications ask about parameters, and lets their values take effect. May wait for the vehicle.
+
+    Args:
+        parameters: The store.
+        handler: Knows who holds the authority, and gets new settings.
+        publisher: Reports a driver that fails.
+        events: Where changes are published.
+        clock: The proxy's clock [ns].
+        free: Parameters that any pilot may write without the authority. They change by themselves: each is read anew,
+            and a change is no event.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        handler: CommandHandler,
+        publisher: VehiclePublisher,
+        events: EventPublisher,
+        clock: Clock,
+        free: frozenset[str] = frozenset(),
+    ) -> None:
+        self._free = free
+        self._parameters = parameters
+        self._handler = handler
+        self._publisher = publisher
+        self._events = events
+        self._clock = clock
+
+    def read_driver(self) -> None:
+        """Read the driver's parameters; a driver that raises keeps those it had."""
+        try:
+            self._parameters.refresh()
+        except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
+            self._publisher.driver_failed("parameters", error)
+        if self._parameters.left_out:
+            names = ", ".join(self._parameters.left_out)[:200]
+            text = f"parameters too large to be sent: {names}"
+            self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING)
+        for name, why in self._parameters.write_presets():
+            if self._publisher.link_up:  # before, it has nobody to write to: it is tried again when the link is there
+                text = f"{name} could not be set as this proxy was asked to: {why}"
+                self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING, where="preset")
+        self._handler.configure(self._parameters.flight_settings())
+
+    def get(self, _session: Session, request: GetParameter, _now_ns: int) -> AnyReply:
+        """Answer with one parameter as last known. Raises :class:`UnknownNameError`."""
+        if request.name in self._free:
+            self.read_driver()
+        return ParameterValue(self._parameters.get(request.name))
+
+    def page(self, _session: Session, request: ListParameters, _now_ns: int) -> AnyReply:
+        """Read the driver's parameters again and answer with a page of all."""
+        self.read_driver()
+        return self._parameters.page(request.first)
+
+    def set(self, session: Session, request: SetParameter, now_ns: int) -> AnyReply:
+        """Write one for the holder of the authority. Raises what :meth:`Parameters.set` raises."""
+        waited_ns, momentary = self._clock() - now_ns, self._parameters.get(request.name).momentary
+        if momentary and waited_ns > MOMENT_NS:
+            why = f"{request.name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
+            return Refused(Refusal.STALE, why)
+        if request.name in self._free and session.role is Role.PILOT:
+            return ParameterValue(self._parameters.set(request.name, request.value))
+        if not self._handler.holds(session, request.lease):
+            code = Refusal.FOREIGN_LEASE if request.lease else Refusal.NO_AUTHORITY
+            return Refused(code, "writing a parameter needs the authority: request it, and name its lease")
+        if momentary and (problem := self._handler.problem_with_moment()):
+            return Refused(Refusal.WRONG_STATE, f"{request.name} is not done now: {problem}")
+        if request.name == "limits.altitude" and isinstance(request.value, int | float):
+            problem = self._handler.problem_with_ceiling(float(request.value))
+            if problem:
+                return Refused(Refusal.OUT_OF_RANGE, f"{request.name} can't be {request.value:g} m now: {problem}")
+        parameter = self._parameters.set(request.name, request.value)
+        self._handler.configure(self._parameters.flight_settings())
+        unit = f" {parameter.unit}" if parameter.unit else ""
+        text = f"{session.name} set {parameter.name} to {parameter.value!r}{unit}"
+        data: dict[str, Value] = {"name": parameter.name, "value": parameter.value, "app_id": session.app_id}
+        self._events.publish(EventKind.PARAMETER_CHANGED, text, app=session.name, data=data)
+        return ParameterValue(parameter)

@@ -56,18 +56,16 @@ from skyloop.messages import (
     decode,
 )
 from skyloop.messages.feedback import MAX_ADDRESS, MAX_EVENT_TEXT
-from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
 from skyloop.proxy.core.flight import Flight
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
-from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.handler import CommandHandler
-from skyloop.proxy.parameters import Parameters, described
+from skyloop.proxy.parameters import ParameterRequests, Parameters, described
 from skyloop.proxy.publisher import VehiclePublisher
+from skyloop.proxy.records import AuditTrail, FlightRecord
 from skyloop.proxy.relay import ProcessorWorkers, Relay
-from skyloop.proxy.requests import JobQueue, ParameterRequests, RequestDispatcher
-from skyloop.proxy.sessions import HELLO_NS, MAX_MALFORMED, Session
+from skyloop.proxy.requests import HELLO_NS, MAX_MALFORMED, JobQueue, RequestDispatcher, Session
 from skyloop.proxy.topics import OverviewPublisher
 from skyloop.transport.base import Peer, TransportServer
 

@@ -34,7 +34,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.feedback import MAX_LINK_TEXT
 from skyloop.messages.frame import H264, MAX_ENCODED
-from skyloop.proxy.core.intents import NO_INTENT, Intent
+from skyloop.proxy.core.command_checks import NO_INTENT, Intent
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.streams import Streams
 from skyloop.proxy.topics import PREFIX, STREAM_TOPIC, FeedbackVariants, topic_problem

@@ -35,7 +35,7 @@ from skyloop.messages import (
 )
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.publisher import VehiclePublisher
-from skyloop.proxy.sessions import Session
+from skyloop.proxy.requests import Session
 from skyloop.proxy.topics import camera_problem
 from skyloop.transport.base import ANNOTATIONS, LOGS, RESULTS, TransportServer, results
 

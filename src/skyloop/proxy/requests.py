@@ -1,4 +1,4 @@
-"""Requests: each is carried out once and answered as often as it is asked.
+"""Connections and their requests: each is carried out once and answered as often as it is asked.
 
 A client repeats a request until its answer arrives, with the same number. A repeat of one that is being answered joins
 it; a repeat of one that changed something gets the kept answer. What concerns only the proxy's own state (Hello,
@@ -9,22 +9,20 @@ What may ask the driver is answered on a thread of its own.
 from __future__ import annotations
 
 import logging
+import math
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from queue import SimpleQueue
 from typing import Any, Final, Protocol
 
-from skyloop.clock import NS_PER_S, Clock, seconds
+from skyloop.clock import NS_PER_S
 from skyloop.errors import ParameterError, UnknownNameError, shortened
 from skyloop.messages import (
     AnswerTakeover,
     AnyReply,
-    EventKind,
-    GetParameter,
     Hello,
     JoinProcessor,
-    ListParameters,
-    ParameterValue,
     Refusal,
     Refused,
     ReleaseAuthority,
@@ -33,30 +31,102 @@ from skyloop.messages import (
     RequestAuthority,
     Role,
     SetParameter,
-    Severity,
-    Value,
     encode,
 )
-from skyloop.proxy.events import Counters, EventPublisher
-from skyloop.proxy.handler import CommandHandler
-from skyloop.proxy.parameters import Parameters
-from skyloop.proxy.publisher import VehiclePublisher
-from skyloop.proxy.sessions import Session
-from skyloop.transport.base import TransportServer
+from skyloop.proxy.core.command_checks import Intents
+from skyloop.proxy.events import Counters, Episodes
+from skyloop.transport.base import Peer, TransportServer
 
 MAX_PENDING: Final = 16  #: requests of one application that wait for their thread; further ones are refused
+#: More malformed packets than this within a second restart the channel: its two ends no longer speak the same.
+MAX_MALFORMED: Final = 50
+#: How long a connection may be there without its Hello, which a client sends at once.
+HELLO_NS: Final = 5 * NS_PER_S
+
+MAX_KEPT: Final = 32  #: answers kept for repeats, per connection: a client repeats a request for seconds at most
 MAX_MESSAGE: Final = 1000  #: characters of a refusal
-#: A momentary parameter, such as a flip, is written within this time or never: its writer waits no longer.
-MOMENT_NS: Final = 2 * NS_PER_S
 
 _AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
 #: Requests that change something. The others may be answered again, with what is true then.
 _CHANGING: Final = (*_AUTHORITY, AnswerTakeover, SetParameter, JoinProcessor)
 
-#: Answers one type of request: of this connection, with this body, received at this time [ns].
-Answer = Callable[[Session, Any, int], AnyReply]
-
 _log = logging.getLogger(__name__)
+
+
+class Session:
+    """One application's connection, from joining to leaving. ``role`` is None until its Hello."""
+
+    __slots__ = (
+        "_malformed_ns",
+        "answers",
+        "app_id",
+        "authority_request",
+        "ended",
+        "episodes",
+        "intents",
+        "joined_ns",
+        "name",
+        "peer",
+        "role",
+    )
+
+    def __init__(self, peer: Peer, joined_ns: int) -> None:
+        self.peer = peer
+        self.joined_ns = joined_ns
+        self.app_id = peer.id
+        self.name = f"application {peer.id}"  #: until Hello has it
+        self.role: Role | None = None
+        self.intents = Intents()
+        self.episodes = Episodes()
+        self.answers = Answers()
+        self.authority_request = 0  #: number of the newest request for the authority, or of its release
+        self.ended = False  #: disconnected by the proxy: nothing more is taken from it
+        self._malformed_ns: deque[int] = deque(maxlen=MAX_MALFORMED)
+
+    def malformed(self, now_ns: int) -> bool:
+        """Count a malformed packet; returns whether that is one too many within a second."""
+        recent = self._malformed_ns
+        too_many = len(recent) == MAX_MALFORMED and now_ns - recent[0] < NS_PER_S
+        recent.append(now_ns)
+        return too_many
+
+
+class Answers:
+    """Which requests of one connection are being answered, and the answers kept for repeats. Not thread-safe."""
+
+    __slots__ = ("_forgotten", "_pending", "kept")
+
+    def __init__(self) -> None:
+        self.kept: dict[int, bytes] = {}  #: by the number of the request
+        self._pending: set[int] = set()
+        self._forgotten = 0  # the highest number whose answer was kept and dropped again
+
+    def begin(self, number: int, most: float) -> tuple[bool, bool]:
+        """Note that a request is being answered, unless it must not be.
+
+        Args:
+            number: The request's.
+            most: As many may be answered at a time.
+
+        Returns:
+            Whether it was carried out, or is being, and must not be again; and whether as many as may be are.
+        """
+        repeated = number in self._pending or number in self.kept or number <= self._forgotten
+        full = not repeated and len(self._pending) >= most
+        if not (repeated or full):
+            self._pending.add(number)
+        return repeated, full
+
+    def end(self, number: int, answer: bytes | None) -> None:
+        """Note that this request is answered; ``answer`` is kept for repeats. None: it may be carried out again."""
+        self._pending.discard(number)
+        if answer is None:
+            return
+        self.kept[number] = answer
+        if len(self.kept) > MAX_KEPT:
+            oldest = next(iter(self.kept))
+            del self.kept[oldest]
+            self._forgotten = max(self._forgotten, oldest)
 
 
 class JobQueue(Protocol):
@@ -98,6 +168,10 @@ class JobThread:
                 job()
             except Exception:  # noqa: BLE001  the next ones still get their answers
                 _log.exception("a request could not be answered")
+
+
+#: Answers one type of request: of this connection, with this body, received at this time [ns].
+Answer = Callable[[Session, Any, int], AnyReply]
 
 
 class RequestDispatcher:
@@ -151,11 +225,9 @@ class RequestDispatcher:
             self._reply(session, request, Refused(Refusal.PROTOCOL, "the first request on a connection is Hello"))
             return
         with self._pending_lock:
-            repeated = session.answers.repeats(request.id)
-            kept = session.answers.kept(request.id)
-            full = not repeated and kind in self._deferred and session.answers.pending >= MAX_PENDING
-            if not (repeated or full):
-                session.answers.begin(request.id)
+            most = MAX_PENDING if kind in self._deferred else math.inf
+            repeated, full = session.answers.begin(request.id, most)
+            kept = session.answers.kept.get(request.id)
         if repeated:
             self._counts["requests.repeated"] += 1
             if kept is not None:
@@ -217,85 +289,3 @@ def _refusal(code: str) -> Refusal:
         return Refusal(code)
     except ValueError:
         return Refusal.DRIVER_FAILED  # a driver's own refusal, with a code that is not ours
-
-
-class ParameterRequests:
-    """Answers what applications ask about parameters, and lets their values take effect. May wait for the vehicle.
-
-    Args:
-        parameters: The store.
-        handler: Knows who holds the authority, and gets new settings.
-        publisher: Reports a driver that fails.
-        events: Where changes are published.
-        clock: The proxy's clock [ns].
-        free: Parameters that any pilot may write without the authority. They change by themselves: each is read anew,
-            and a change is no event.
-    """
-
-    def __init__(
-        self,
-        parameters: Parameters,
-        handler: CommandHandler,
-        publisher: VehiclePublisher,
-        events: EventPublisher,
-        clock: Clock,
-        free: frozenset[str] = frozenset(),
-    ) -> None:
-        self._free = free
-        self._parameters = parameters
-        self._handler = handler
-        self._publisher = publisher
-        self._events = events
-        self._clock = clock
-
-    def read_driver(self) -> None:
-        """Read the driver's parameters; a driver that raises keeps those it had."""
-        try:
-            self._parameters.refresh()
-        except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
-            self._publisher.driver_failed("parameters", error)
-        if self._parameters.left_out:
-            names = ", ".join(self._parameters.left_out)[:200]
-            text = f"parameters too large to be sent: {names}"
-            self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING)
-        for name, why in self._parameters.write_presets():
-            if self._publisher.link_up:  # before, it has nobody to write to: it is tried again when the link is there
-                text = f"{name} could not be set as this proxy was asked to: {why}"
-                self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING, where="preset")
-        self._handler.configure(self._parameters.flight_settings())
-
-    def get(self, _session: Session, request: GetParameter, _now_ns: int) -> AnyReply:
-        """Answer with one parameter as last known. Raises :class:`UnknownNameError`."""
-        if request.name in self._free:
-            self.read_driver()
-        return ParameterValue(self._parameters.get(request.name))
-
-    def page(self, _session: Session, request: ListParameters, _now_ns: int) -> AnyReply:
-        """Read the driver's parameters again and answer with a page of all."""
-        self.read_driver()
-        return self._parameters.page(request.first)
-
-    def set(self, session: Session, request: SetParameter, now_ns: int) -> AnyReply:
-        """Write one for the holder of the authority. Raises what :meth:`Parameters.set` raises."""
-        waited_ns, momentary = self._clock() - now_ns, self._parameters.get(request.name).momentary
-        if momentary and waited_ns > MOMENT_NS:
-            why = f"{request.name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
-            return Refused(Refusal.STALE, why)
-        if request.name in self._free and session.role is Role.PILOT:
-            return ParameterValue(self._parameters.set(request.name, request.value))
-        if not self._handler.holds(session, request.lease):
-            code = Refusal.FOREIGN_LEASE if request.lease else Refusal.NO_AUTHORITY
-            return Refused(code, "writing a parameter needs the authority: request it, and name its lease")
-        if momentary and (problem := self._handler.problem_with_moment()):
-            return Refused(Refusal.WRONG_STATE, f"{request.name} is not done now: {problem}")
-        if request.name == "limits.altitude" and isinstance(request.value, int | float):
-            problem = self._handler.problem_with_ceiling(float(request.value))
-            if problem:
-                return Refused(Refusal.OUT_OF_RANGE, f"{request.name} can't be {request.value:g} m now: {problem}")
-        parameter = self._parameters.set(request.name, request.value)
-        self._handler.configure(self._parameters.flight_settings())
-        unit = f" {parameter.unit}" if parameter.unit else ""
-        text = f"{session.name} set {parameter.name} to {parameter.value!r}{unit}"
-        data: dict[str, Value] = {"name": parameter.name, "value": parameter.value, "app_id": session.app_id}
-        self._events.publish(EventKind.PARAMETER_CHANGED, text, app=session.name, data=data)
-        return ParameterValue(parameter)

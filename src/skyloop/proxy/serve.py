@@ -19,9 +19,8 @@ from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind, LinkState, Severity
-from skyloop.proxy.audit import AuditTrail, audit_path
-from skyloop.proxy.flight_record import FlightRecord, record_path
 from skyloop.proxy.proxy import Proxy
+from skyloop.proxy.records import AuditTrail, FlightRecord, audit_path, record_path
 from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import TransportServer
 

@@ -16,7 +16,7 @@ from skyloop.clock import Clock, nanoseconds
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Feedback, FeedbackRequest, Overview, VehicleOverview, VideoRequest, encode
 from skyloop.messages.relayed import PROCESSOR_NAME
-from skyloop.messages.subscription import TOPIC, RateLimiter
+from skyloop.messages.subscription import RateLimiter
 from skyloop.proxy.events import Counters
 from skyloop.transport.base import (
     ANNOTATIONS,
@@ -34,7 +34,7 @@ from skyloop.transport.base import (
 #: The topics without a name in them.
 PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
 STREAM_TOPIC: Final = stream("")  #: how the topic of each stream begins
-PREFIX: Final = f"{TOPIC}?"  #: and that of each form of feedback
+PREFIX: Final = f"{FEEDBACK}?"  #: and that of each form of feedback
 _VIDEO_TOPIC: Final = video("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
 
@@ -159,7 +159,7 @@ class FeedbackVariants(Forms[_Variant]):
             return ""
         return (
             f"this proxy sends feedback in {MAX_VARIANTS} forms at most at a time, and all are in use: "
-            f"subscribe to {TOPIC}, or to one of {', '.join(one.topic for one in self.known[:4])} …"
+            f"subscribe to {FEEDBACK}, or to one of {', '.join(one.topic for one in self.known[:4])} …"
         )
 
     def publish(self, sample: Feedback, now_ns: int) -> None:

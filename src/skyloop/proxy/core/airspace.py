@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from skyloop.clock import NS_PER_S, seconds
 from skyloop.messages import AnyAction, Attitude, Feedback, Hover, Position, Refusal, Takeoff, Velocity
 from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
-from skyloop.proxy.core.limits import ALTITUDE_GAIN, SLACK_M, Clamp, Limits
+from skyloop.proxy.core.settings import ALTITUDE_GAIN, SLACK_M, AirspaceSettings, Clamp, Limits
 from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665
@@ -53,16 +52,6 @@ class Verdict(NamedTuple):
     refusal: Refusal | None = None  #: None without an action: it goes on as soon as a young position comes
     why: str = ""  #: of the refusal, for a person
     enforced: bool | None = None  #: whether the safety box and zones could be; None: there are none
-
-
-@dataclass(frozen=True, slots=True)
-class AirspaceSettings:
-    """What the parameters say about where it may fly, and how fast."""
-
-    limits: Limits = field(default_factory=Limits)
-    space: Space = field(default_factory=Space)
-    deceleration: float = 1.0  #: at which the vehicle can be relied on to stop [m/s²]
-    reaction_s: float = 0.3  #: until it begins to
 
 
 class Airspace:
@@ -100,7 +89,7 @@ class Airspace:
             return self._place(action, feedback, now_ns, planned)
         self._way = None
         if isinstance(action, Velocity | Attitude):
-            return self.step(action, feedback, now_ns)
+            return self._set_point(action, feedback, now_ns)
         self._moves = False
         if isinstance(action, Hover):
             return self._hover(feedback, now_ns)
@@ -111,6 +100,9 @@ class Airspace:
     def step(self, action: Velocity | Attitude, feedback: Feedback | None, now_ns: int) -> Verdict:
         """Shorten a set-point, or one step on the way to a place, to what limits and walls allow."""
         self.observe(feedback)
+        return self._set_point(action, feedback, now_ns)
+
+    def _set_point(self, action: Velocity | Attitude, feedback: Feedback | None, now_ns: int) -> Verdict:
         allowed, clamps = self.settings.limits.clamp(action, feedback.altitude_m if feedback is not None else None)
         enforced = None
         if self.settings.space.walled:
@@ -335,7 +327,7 @@ class Airspace:
             self._blocked = False
             return Verdict(Hover())
         up = -min(limits.climb, max(SINK_M_S, above * ALTITUDE_GAIN))
-        sink, walls, _, _, enforced = self.step(Velocity(up=up), feedback, now_ns)
+        sink, walls, _, _, enforced = self._set_point(Velocity(up=up), feedback, now_ns)
         assert isinstance(sink, Velocity)
         self._blocked = bool(walls) and -sink.up < (2 * SINK_M_S if self._blocked else SINK_M_S)
         clamps = (Clamp("limits.altitude", 0.0, up), *walls)

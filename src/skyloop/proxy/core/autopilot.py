@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final
 
@@ -20,6 +19,7 @@ from skyloop.clock import seconds
 from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
 from skyloop.messages.geometry import clamped, wrap_angle
 from skyloop.proxy.core.flight import STALE_NS, Flight
+from skyloop.proxy.core.settings import AutopilotSettings
 
 PERIOD_S: Final = 0.02  #: the pace that it is made for
 ALTITUDE_GAIN: Final = 1.0  #: climb per metre of altitude error [1/s]
@@ -43,18 +43,6 @@ def software_actions(native: frozenset[str]) -> frozenset[str]:
     if not native & {"attitude", "velocity"}:
         return frozenset()
     return SOFTWARE - native
-
-
-@dataclass(frozen=True, slots=True)
-class AutopilotSettings:
-    """Tuning. Altitude [m], speeds [m/s], ``tilt`` [rad], gains [rad per m/s] and [rad per m]."""
-
-    takeoff_altitude: float = 1.0
-    climb: float = 0.5
-    descent: float = 0.4
-    velocity_p: float = 0.15
-    velocity_i: float = 0.05
-    tilt: float = 0.35
 
 
 class Mode(Enum):

@@ -12,6 +12,7 @@ from typing import Final
 
 from skyloop.clock import nanoseconds
 from skyloop.messages import Failsafe, FlightState, Hover, Land, ReturnToStart
+from skyloop.proxy.core.settings import FailsafeSettings
 
 #: A battery must rise so far above a level before falling below it counts again.
 BATTERY_REARM: Final = 0.05
@@ -42,19 +43,6 @@ _CONTRADICTIONS: Final = {
 
 
 FailsafeTask = Hover | Land | ReturnToStart
-
-
-@dataclass(frozen=True, slots=True)
-class FailsafeSettings:
-    """When each step is taken. Times in s, battery as charge from 0 to 1."""
-
-    hover_after_s: float = 0.5
-    land_after_s: float = 5.0
-    retry_s: float = 0.25
-    battery_warn: float = 0.2
-    battery_land: float = 0.1  #: 0: never
-    battery_return: float = 0.0  #: 0: never
-    returns: bool = False  #: where nobody is in command, it lands at the start
 
 
 @dataclass(frozen=True, slots=True)

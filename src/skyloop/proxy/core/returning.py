@@ -8,14 +8,13 @@ up to a safe height, straight over the start, and there a landing or a hover. Th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from skyloop.clock import NS_PER_S, seconds
 from skyloop.messages import Feedback, FlightState, Land, Position, Refusal, ReturnPhase, ReturnToStart
 from skyloop.proxy.core.airspace import STALE_NS, Airspace
 from skyloop.proxy.core.flight import STANDING_NS
-from skyloop.proxy.core.limits import Clamp
+from skyloop.proxy.core.settings import Clamp, ReturnSettings
 from skyloop.zones import Space, Vec3
 
 NEAR_M: Final = 0.3  #: so near, and at rest, it is there
@@ -27,15 +26,6 @@ STALL_NS: Final = 10 * NS_PER_S  #: ... within this time leads nowhere
 PATIENCE_NS: Final = NS_PER_S
 CLEARANCE_M: Final = 0.3  #: kept to the ceiling of the room and to the upper wall of the safety box
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
-
-
-@dataclass(frozen=True, slots=True)
-class ReturnSettings:
-    """How a vehicle returns."""
-
-    height: float = 2.0  #: above the start, at least, on the way [m]
-    speed: float = 1.0  #: greatest on the way [m/s]
-    land: bool = True  #: at the end, or hover there
 
 
 class StartPoint:

@@ -1,0 +1,182 @@
+"""What the parameters ask of the flight: limits, which set-points are shortened to, and other settings. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+from skyloop.clock import nanoseconds
+from skyloop.messages import AnyAction, Attitude, Velocity
+from skyloop.zones import Space, space_of
+
+#: Climb allowed per metre that is left below ``limits.altitude`` [1/s]: the vehicle slows down before it is there, and
+#: sinks at this rate per metre that it is above.
+ALTITUDE_GAIN: Final = 1.0
+#: So little above ``limits.altitude`` is the altimeter's noise [m].
+SLACK_M: Final = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Clamp:
+    """A limit that was in the way of a set-point. For tilt and speed the two numbers are lengths of the vector."""
+
+    limit: str  #: name of the parameter
+    asked: float
+    applied: float
+    zone: str = ""  #: name of the no-fly zone, if it has one
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The limits in force."""
+
+    tilt: float = 0.35  #: greatest tilt from the vertical by roll and pitch together [rad]
+    climb: float = 1.0  #: greatest speed up or down [m/s]
+    yaw_rate: float = 1.75  #: [rad/s]
+    speed: float = 2.0  #: greatest horizontal speed [m/s]
+    altitude: float = 5.0  #: highest height above ground [m]
+
+    def clamp(self, action: Attitude | Velocity, altitude: float | None) -> tuple[AnyAction, tuple[Clamp, ...]]:
+        """Return the nearest set-point within the limits, and what was in the way of it.
+
+        Tilt and horizontal speed are shortened with their direction kept. ``altitude`` [m] of the vehicle, if known.
+        """
+        if type(action) is Velocity:
+            x, y, up, yaw_rate, longest = action.forward, action.left, action.up, action.yaw_rate, self.speed
+        else:
+            assert isinstance(action, Attitude)
+            x, y, up, yaw_rate, longest = action.roll, action.pitch, action.climb, action.yaw_rate, self.tilt
+        highest = self.climb
+        if altitude is not None:  # above the limit it is negative: the vehicle comes down
+            room = self.altitude - altitude
+            highest = max(-self.climb, min(highest, room * ALTITUDE_GAIN)) if not -SLACK_M <= room <= 0.0 else 0.0
+        if (
+            x * x + y * y <= longest * longest
+            and -self.climb <= up <= highest
+            and -self.yaw_rate <= yaw_rate <= self.yaw_rate
+        ):
+            return action, ()
+        clamps: list[Clamp] = []
+        length = math.hypot(x, y)
+        if length > longest:
+            clamps.append(Clamp("limits.speed" if type(action) is Velocity else "limits.tilt", length, longest))
+            x, y = x / length * longest, y / length * longest
+        allowed_up = max(-self.climb, min(highest, up))
+        if allowed_up != up:
+            near_the_top = up > highest and highest < self.climb
+            clamps.append(Clamp("limits.altitude" if near_the_top else "limits.climb", up, allowed_up))
+        allowed_yaw_rate = max(-self.yaw_rate, min(self.yaw_rate, yaw_rate))
+        if allowed_yaw_rate != yaw_rate:
+            clamps.append(Clamp("limits.yaw_rate", yaw_rate, allowed_yaw_rate))
+        return type(action)(x, y, allowed_up, allowed_yaw_rate), tuple(clamps)
+
+
+@dataclass(frozen=True, slots=True)
+class AirspaceSettings:
+    """What the parameters say about where it may fly, and how fast."""
+
+    limits: Limits = field(default_factory=Limits)
+    space: Space = field(default_factory=Space)
+    deceleration: float = 1.0  #: at which the vehicle can be relied on to stop [m/s²]
+    reaction_s: float = 0.3  #: until it begins to
+
+
+@dataclass(frozen=True, slots=True)
+class FailsafeSettings:
+    """When each step is taken. Times in s, battery as charge from 0 to 1."""
+
+    hover_after_s: float = 0.5
+    land_after_s: float = 5.0
+    retry_s: float = 0.25
+    battery_warn: float = 0.2
+    battery_land: float = 0.1  #: 0: never
+    battery_return: float = 0.0  #: 0: never
+    returns: bool = False  #: where nobody is in command, it lands at the start
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotSettings:
+    """Tuning. Altitude [m], speeds [m/s], ``tilt`` [rad], gains [rad per m/s] and [rad per m]."""
+
+    takeoff_altitude: float = 1.0
+    climb: float = 0.5
+    descent: float = 0.4
+    velocity_p: float = 0.15
+    velocity_i: float = 0.05
+    tilt: float = 0.35
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnSettings:
+    """How a vehicle returns."""
+
+    height: float = 2.0  #: above the start, at least, on the way [m]
+    speed: float = 1.0  #: greatest on the way [m/s]
+    land: bool = True  #: at the end, or hover there
+
+
+@dataclass(frozen=True, slots=True)
+class FlightSettings:
+    """What the parameters ask of the flight."""
+
+    airspace: AirspaceSettings = field(default_factory=AirspaceSettings)
+    failsafe: FailsafeSettings = field(default_factory=FailsafeSettings)
+    autopilot: AutopilotSettings = field(default_factory=AutopilotSettings)
+    returns: ReturnSettings = field(default_factory=ReturnSettings)
+    max_age_ns: int = 0  #: of a command
+    authority_timeout_ns: int = 0
+    authority_ask_ns: int = 0
+
+    def updated(self, value: Mapping[str, Any], changed: Collection[str]) -> FlightSettings:
+        """Return them with new values; made anew is only what those that changed concern, all else is the same object.
+
+        Args:
+            value: The values in force, by the parameter's name.
+            changed: How the names of those that changed begin: ``limits`` for ``limits.tilt``.
+
+        Raises:
+            ParameterError: The no-fly zones can't be read.
+        """
+        new: dict[str, Any] = {}
+        limits, space = self.airspace.limits, self.airspace.space
+        if "limits" in changed:
+            limits = Limits(
+                tilt=value["limits.tilt"],
+                climb=value["limits.climb"],
+                yaw_rate=value["limits.yaw_rate"],
+                speed=value["limits.speed"],
+                altitude=value["limits.altitude"],
+            )
+        if "safety" in changed:
+            space = space_of(value.__getitem__, value.__getitem__)
+        if not {"limits", "safety"}.isdisjoint(changed):
+            new["airspace"] = AirspaceSettings(limits, space, value["safety.deceleration"], value["safety.reaction_s"])
+        if not {"limits", "autopilot"}.isdisjoint(changed):
+            new["autopilot"] = AutopilotSettings(
+                takeoff_altitude=min(value["autopilot.takeoff_altitude"], limits.altitude),
+                climb=min(value["autopilot.climb"], limits.climb),
+                descent=min(value["autopilot.descent"], limits.climb),
+                velocity_p=value["autopilot.velocity_p"],
+                velocity_i=value["autopilot.velocity_i"],
+                tilt=limits.tilt,
+            )
+        if not {"failsafe", "battery"}.isdisjoint(changed):
+            new["failsafe"] = FailsafeSettings(
+                hover_after_s=value["failsafe.hover_after_s"],
+                land_after_s=value["failsafe.land_after_s"],
+                retry_s=value["failsafe.retry_s"],
+                battery_warn=value["battery.warn"],
+                battery_land=value["battery.land"],
+                battery_return=value["battery.return"],
+                returns=value["failsafe.return"],
+            )
+        if "return" in changed:
+            new["returns"] = ReturnSettings(value["return.height"], value["return.speed"], value["return.land"])
+        if "command" in changed:
+            new["max_age_ns"] = nanoseconds(value["command.max_age_s"])
+        if "authority" in changed:
+            new["authority_timeout_ns"] = nanoseconds(value["authority.timeout_s"])
+            new["authority_ask_ns"] = nanoseconds(value["authority.ask_s"])
+        return replace(self, **new) if new else self
