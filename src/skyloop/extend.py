@@ -89,7 +89,7 @@ def commands(drone: Drone) -> Commands:
 
 def ask(drone: Drone, action: AnyAction) -> int:
     """Command ``action``, whose numbers were checked, as :meth:`skyloop.Drone.command`; return the intent's number."""
-    return drone._core.ask(action)
+    return drone._core.commands.ask(action)
 
 
 def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:

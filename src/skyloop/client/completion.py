@@ -83,31 +83,28 @@ class ActionWait:
         self,
         action: AnyAction,
         is_done: Callable[[Feedback], bool],
-        ask: Callable[[AnyAction, bool], int],
-        closed: Callable[[], bool],
         commands: CommandSender,
         state: ClientState,
         connection: ProxyConnection,
+        *,
+        automatic: bool = False,
     ) -> None:
         """Send the action.
 
         Args:
             action: The action.
             is_done: Whether feedback that is newer than the action shows it.
-            ask: Sends it, now and where it is commanded again, under a new number, which it returns. Its second
-                argument: whether the library asks by itself, which takes no vehicle from others.
-            closed: Whether the drone was closed.
-            commands: Tells what became of an intent.
+            commands: Sends it, now and where it is commanded again, under a new number, and tells what became of it.
             state: Newest feedback.
             connection: State of the link.
+            automatic: The library asks by itself, which takes no vehicle from others, also at the end of the flight.
 
         Raises:
-            AuthorityError: As ``ask`` does.
+            SkyloopError: As :meth:`CommandSender.ask`.
         """
         self._action = action
         self._is_done = is_done
-        self._ask = ask
-        self._closed = closed
+        self._automatic = automatic
         self._commands = commands
         self._state = state
         self._connection = connection
@@ -119,7 +116,7 @@ class ActionWait:
         self._asked_ns = state.scheduler.clock()
         # The call may take the vehicle from the pilot who has it now, or when it can first be sent.
         self._others, self._may_be_sent = self._others_now, commands.may_ask
-        self._intent = ask(action, False)
+        self._intent = commands.ask(action, automatic=automatic)
 
     @property
     def outdone(self) -> bool:
@@ -174,7 +171,7 @@ class ActionWait:
     def _why_not(self) -> Exception | None:
         """Why waiting longer can't help; None if it can. Asks again for what may be possible then."""
         name = self._action.name
-        if self._closed():
+        if self._commands.why_closed or (self._commands.barred and not self._automatic):
             return ClosedError(f"this drone was closed while {name} was under way")
         if cancelled.get()():
             return GivenUpError()
@@ -236,7 +233,7 @@ class ActionWait:
 
     def _again(self, *, automatic: bool = True) -> None:
         self._asked_ns = self._state.scheduler.clock()
-        self._intent = self._ask(self._action, automatic)
+        self._intent = self._commands.ask(self._action, automatic=automatic or self._automatic)
 
     @property
     def _others_now(self) -> str | None:

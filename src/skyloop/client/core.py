@@ -35,8 +35,6 @@ from skyloop.errors import (
 )
 from skyloop.messages import (
     AnyAction,
-    Capabilities,
-    EmergencyStop,
     EventKind,
     Failsafe,
     Feedback,
@@ -46,9 +44,7 @@ from skyloop.messages import (
     Idle,
     Land,
     LinkState,
-    Position,
     ReturnPhase,
-    ReturnToStart,
     Role,
     Severity,
     Takeoff,
@@ -60,7 +56,6 @@ from skyloop.transport.base import EVENTS, Dialer
 
 Access = Literal["pilot", "observe"]
 OnExit = Literal["land", "hover"]
-LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 STOP_S: Final = 2.0  #: how long closing waits for an emergency stop to show
 DOWN: Final = frozenset({FlightState.LANDED})
@@ -167,8 +162,6 @@ class DroneCore:
         scheduler = scheduler or Scheduler()
         self.app = app
         self.role = Role.PILOT if access == "pilot" else Role.OBSERVER
-        self.closed = False
-        self._why_closed = "this drone was closed: connect again"
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
         self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
@@ -262,8 +255,7 @@ class DroneCore:
         if self.closed:
             return
         self._finish_stop()
-        self.closed = True
-        self.commands.close()
+        self.commands.close("this drone was closed: connect again")
         try:
             if self.connection.connected:
                 self.commands.release(wait=not self.connection.receiving)
@@ -284,6 +276,11 @@ class DroneCore:
                 self._on_close()
 
     @property
+    def closed(self) -> bool:
+        """Whether :meth:`close` was called, or the drone belongs to the parent process."""
+        return self.commands.why_closed != ""
+
+    @property
     def ending(self) -> bool:
         """Whether the end of the flight has begun, or it is closed."""
         return self.closed or self.commands.barred
@@ -291,8 +288,7 @@ class DroneCore:
     def forked(self) -> None:
         """Leave the vehicle and the connection to the parent process; in a child made by ``os.fork``."""
         if not self.closed:
-            self.closed = True
-            self._why_closed = (
+            self.commands.why_closed = (
                 f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect here as well"
             )
             self.connection.forked()
@@ -316,7 +312,7 @@ class DroneCore:
             if commands.status.state != "held":
                 commands.drop()
                 return False
-            sent = commands.command(action, automatic=True)
+            sent = commands.send(action, automatic=True)
         except SkyloopError:
             return False
         if type(action) is not Idle:
@@ -390,7 +386,7 @@ class DroneCore:
     def check_open(self) -> None:
         """Raise :class:`ClosedError` after :meth:`close`."""
         if self.closed:
-            raise ClosedError(self._why_closed)
+            raise ClosedError(self.commands.why_closed)
 
     def check_may_wait(self) -> None:
         """Raise :class:`UsageError` on the receiving thread."""
@@ -449,40 +445,6 @@ class DroneCore:
 
     # Commands ----------------------------------------------------------------------------------------------------
 
-    def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
-        """Make ``action``, whose numbers were checked, the newest set-point; see :class:`Drone`.
-
-        Args:
-            action: The action.
-            now: See :meth:`CommandSender.ask`.
-            automatic: See :meth:`CommandSender.ask`; it passes when the end of the flight has begun, too.
-
-        Raises:
-            ClosedError: After :meth:`close`, and from the beginning of :meth:`end_flight` on.
-        """
-        self._check_can_do(action)
-        return self.commands.command(action, now=now, automatic=automatic)
-
-    def ask(self, action: AnyAction, *, automatic: bool = False) -> int:
-        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
-
-        ``commands.outcome`` tells what became of it.
-        """
-        self._check_can_do(action)
-        return self.commands.ask(action, automatic=automatic)[0]
-
-    def _check_can_do(self, action: AnyAction) -> None:
-        if self.closed:
-            self.check_open()
-        welcome = self.state.welcome
-        if welcome is not None and not welcome.capabilities.actions:
-            why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
-            raise UnsupportedError(f"{action.name} is not possible: {why_not}")
-        if type(action) is EmergencyStop and welcome is not None and action.name not in welcome.capabilities.actions:
-            raise UnsupportedError("emergency_stop is not possible: the vehicle cannot stop its motors")
-        if welcome is not None and type(action) in LATER_ACTIONS:
-            _check_knows(welcome.capabilities, action)
-
     def complete(
         self,
         action: AnyAction,
@@ -498,7 +460,7 @@ class DroneCore:
         but for a landing.
         """
         if not wait:
-            self.command(action, now=True)
+            self.commands.command(action, now=True)
             return
         if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
             self.check_may_wait()
@@ -508,11 +470,10 @@ class DroneCore:
             waiting = ActionWait(
                 action,
                 is_done,
-                lambda asked, by_itself: self.ask(asked, automatic=automatic or by_itself),
-                lambda: self.closed or (self.ending and not automatic),
                 self.commands,
                 self.state,
                 self.connection,
+                automatic=automatic,
             )
             self.check_may_wait()
             waiting.wait(timeout_s, deadline_s)
@@ -662,15 +623,6 @@ class DroneCore:
             self.commands.bar()
             # No daemon: the interpreter waits for the landing.
             threading.Thread(target=self.end_flight, name="skyloop-end").start()
-
-
-def _check_knows(capabilities: Capabilities, action: AnyAction) -> None:
-    """Raise if the proxy does not know the action, which proxies of earlier versions would not even decode."""
-    if action.name not in capabilities.actions | capabilities.software:
-        raise UnsupportedError(
-            f"{action.name} is not possible: neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a "
-            "place; a proxy of an earlier version must be updated"
-        )
 
 
 def _returns(feedback: Feedback) -> bool:

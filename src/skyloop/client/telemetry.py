@@ -312,7 +312,7 @@ class Receiver:
         state.channels = {one.name: state.channels.get(one.name) or state.video(one) for one in cameras}
         state.results.restart()
         self._restorer.connected(welcome.run_id)
-        self._commands.connected(welcome.app_id, welcome.run_id)
+        self._commands.connected(welcome.app_id, welcome.run_id, welcome.capabilities)
         state.on_welcome.publish(welcome)
 
     def disconnected(self, reason: str) -> None:  # noqa: ARG002  (link_changed publishes it)
