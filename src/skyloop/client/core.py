@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -13,24 +12,22 @@ from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 
 from skyloop.child_process import leave_to_parent
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
-from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, Notifier
+from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, checked_age
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
 from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.parameters import Config, Restorer
 from skyloop.client.publishing import Logbook, Membership
-from skyloop.client.results import ResultChannel, checked_age, checked_name
+from skyloop.client.results import ResultChannel, checked_name
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
-from skyloop.client.video import StreamChannel, VideoChannel
+from skyloop.client.video import StreamChannel, StreamOptions, VideoChannel, VideoOptions
 from skyloop.errors import (
     ClosedError,
     LinkError,
     NoAnswerError,
     RefusedError,
     SkyloopError,
-    UnknownNameError,
-    UnsupportedError,
     UsageError,
 )
 from skyloop.messages import (
@@ -50,8 +47,6 @@ from skyloop.messages import (
     Takeoff,
 )
 from skyloop.messages.result import MAX_CODE
-from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
-from skyloop.pyav import require_pyav
 from skyloop.transport.base import EVENTS, Dialer
 
 Access = Literal["pilot", "observe"]
@@ -91,15 +86,6 @@ class DroneOptions(TypedDict, total=False):
     on_close: Callable[[], None] | None
     reach: str | None
     keep_warm: Callable[[bool], None] | None
-
-
-class StreamOptions(TypedDict, total=False):
-    """How H.264 is wanted; with none of these, as the vehicle itself encoded it."""
-
-    kbit_s: int | None  #: encoded by the proxy at this rate, once for all who ask for the same [kbit/s]
-    max_fps: float | None  #: most pictures a second; None: all
-    scale: float  #: factor for width and height, above 0 and up to 1
-    subscriber: str  #: encoded by the proxy for this subscriber alone, at the rate that the path to it carries
 
 
 class InboxOptions(TypedDict, total=False):
@@ -164,7 +150,6 @@ class DroneCore:
         self.role = Role.PILOT if access == "pilot" else Role.OBSERVER
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
-        self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
         self._end = threading.Lock()  # one end of the flight, whoever asks for it
         self._on_exit = on_exit
         self._on_close = on_close
@@ -370,10 +355,6 @@ class DroneCore:
             return error
         return None
 
-    def sample_notifier(self) -> Notifier:
-        """Return a notifier for a thread that waits for nothing but samples of this drone."""
-        return self.state.scheduler.sample_notifier(self.connection)
-
     @contextmanager
     def closing(self, mailbox: Closable) -> Iterator[None]:
         """Close ``mailbox``, which wakes its consumer, if the drone is closed within the block."""
@@ -489,68 +470,23 @@ class DroneCore:
 
     # Consumers -----------------------------------------------------------------------------------------------------
 
-    def channel(
-        self,
-        camera: str | None = None,
-        *,
-        encoding: VideoEncoding | None = None,
-        quality: int | None = None,
-        max_fps: float | None = None,
-        scale: float = 1.0,
-        part: tuple[int, int] | None = None,
-        kbit_s: int | None = None,
-        max_age_s: float | None = None,
-    ) -> VideoChannel:
-        """Return the channel of a camera whose frames come as requested; see :meth:`Drone.frames` for the options.
-
-        Args:
-            camera: Name of the camera; None: the vehicle's first.
-            encoding: ``"jpeg"``, ``"h264"`` or ``"raw"``; None: ``"jpeg"``.
-            quality: Of JPEG, 1 to 100; None: 80.
-            max_fps: Most frames a second; None: all.
-            scale: Factor for width and height, above 0 and up to 1.
-            part: (k, n): only every n-th frame, from k; None: all.
-            kbit_s: Of H.264 [kbit/s]; None: what the path carries.
-            max_age_s: Only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
+    def channel(self, camera: str | None = None, **how: Unpack[VideoOptions]) -> VideoChannel:
+        """Return the channel of a camera's frames; see :meth:`VideoChannels.channel`.
 
         Raises:
-            UnknownNameError: If the vehicle has no camera of this name.
-            UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range, or ``quality`` is given for other frames than JPEG.
-            MissingExtraError: If H.264 is asked for and PyAV is not installed.
             ClosedError: If the drone was closed.
         """
         self.check_open()
-        checked_age(max_age_s)
-        channels = self.state.channels
-        if not channels:
-            raise UnsupportedError("this vehicle has no camera")
-        channel = next(iter(channels.values())) if camera is None else channels.get(camera)
-        if channel is None:
-            raise UnknownNameError("camera", str(camera), channels)
-        if encoding in ("raw", "h264") and quality is not None:
-            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is {encoding!r}')
-        if encoding == "h264":
-            require_pyav("reading H.264")
-        request = VideoRequest(
-            channel.camera.name,
-            encoding="jpeg" if encoding is None else encoding,
-            quality=DEFAULT_QUALITY if quality is None else quality,
-            max_fps=max_fps,
-            scale=scale,
-            part=part,
-            kbit_s=kbit_s,
-            subscriber=self.subscriber if encoding == "h264" and kbit_s is None else "",
-        )
-        return channel if request == channel.request else self.state.video(channel.camera, request)
+        return self.state.video.channel(camera, **how)
+
+    def stream(self, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
+        """Return the channel of a camera's H.264; see :func:`skyloop.extend.stream_channel`."""
+        self.check_open()
+        return self.state.video.stream(camera, **how)
 
     def follow(self, find: Callable[[], C]) -> FollowingChannel[Any, C]:
         """Return the channel that ``find`` returns, also once the proxy was started again with other cameras."""
         return FollowingChannel(find, self.state.on_welcome)
-
-    def stream(self, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
-        """Return the channel of a camera's H.264; see :func:`skyloop.extend.stream_channel`."""
-        return self.state.stream(VideoRequest(self.channel(camera).camera.name, encoding="h264", **how))
 
     def result_channel(self, processor: str) -> ResultChannel:
         """Return the channel of a processor's results, whether or not such a processor runs.

@@ -24,7 +24,7 @@ from skyloop.client.authority import (
     answering,
     authority_request,
 )
-from skyloop.client.channels import Channel, Listener, Mailbox
+from skyloop.client.channels import Channel, Listener, Mailbox, checked_age
 from skyloop.client.commands import (
     above_zero,
     checked,
@@ -39,14 +39,7 @@ from skyloop.client.frame import Arrival, Frame
 from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.client.preflight import PreflightFinding, inspect
 from skyloop.client.publishing import checked_time
-from skyloop.client.results import (
-    Result,
-    ResultListener,
-    ResultMailbox,
-    checked_age,
-    is_old,
-    silence,
-)
+from skyloop.client.results import Result, ResultListener, ResultMailbox, is_old, silence
 from skyloop.client.telemetry import LinkStatus, Wanted, as_predicate
 from skyloop.client.video import StreamChannel, VideoOptions
 from skyloop.errors import (
@@ -735,7 +728,7 @@ class Drone:
             ClosedError: If the drone was closed before.
         """
         channel = self._core.follow(lambda: self._core.channel(camera, **how))
-        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._core.sample_notifier())
+        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._state.scheduler.sample_notifier(self._core.connection))
         self._core.check_may_wait()
         max_age_s, deadline = how.get("max_age_s"), time.monotonic() + timeout_s
         with self._core.closing(mailbox), channel.into(mailbox):
@@ -943,7 +936,7 @@ class Drone:
         def find() -> StreamChannel:
             info = self._core.channel(camera).camera
             as_it_came = bool(info.stream) and kbit_s is None and max_fps is None and scale == 1.0
-            subscriber = "" if as_it_came or kbit_s is not None else f"{self._core.subscriber}-encoded"
+            subscriber = "" if as_it_came or kbit_s is not None else f"{self._state.video.subscriber}-encoded"
             return self._core.stream(info.name, kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
 
         stream, chain = self._core.follow(find), Chain()

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from skyloop.client import Drone, Frame
+from skyloop.client.channels import checked_age
 from skyloop.client.frame import Arrival
-from skyloop.client.results import checked_age, checked_name
+from skyloop.client.results import checked_name
 from skyloop.errors import UsageError
 from skyloop.extend import join_processor
 from skyloop.messages import Severity
