@@ -129,12 +129,7 @@ class FeedbackDemand:
     """
 
     def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
-        """Subscribe to every sample.
-
-        Args:
-            connection: Where it is subscribed to.
-            whole: Whether it stays so, whatever consumers ask for.
-        """
+        """Subscribe to every sample; where ``whole``, it stays so whatever consumers ask for."""
         self._connection = connection
         self._whole = whole
         self._wanted: dict[FeedbackRequest, int] = {}  # how many consumers want each
@@ -144,12 +139,7 @@ class FeedbackDemand:
         connection.subscribe(PLAIN.topic)
 
     def want(self, request: FeedbackRequest, on: bool) -> None:
-        """Count a consumer in, or out again.
-
-        Args:
-            request: What it asks for.
-            on: Whether it comes or goes.
-        """
+        """Count a consumer of this request in, or out again."""
         with self._lock:
             count = self._wanted.get(request, 0) + (1 if on else -1)
             if count > 0:
@@ -205,14 +195,7 @@ class ClientState:
     def __init__(
         self, name: str, connection: ProxyConnection, scheduler: Scheduler, *, whole_feedback: bool = True
     ) -> None:
-        """Make the state of a drone that has not connected yet.
-
-        Args:
-            name: Name of the application.
-            connection: Where topics are subscribed to.
-            scheduler: Source of the time and of waiting.
-            whole_feedback: Whether all feedback is received, even if all consumers ask for less.
-        """
+        """Make the state of a drone that has not connected yet; ``name`` is the application's."""
         self.scheduler = scheduler
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
@@ -270,11 +253,7 @@ class ClientState:
         self.notifier.notify()
 
     def stats(self, sends: ChannelCounter) -> dict[str, ChannelStats]:
-        """Return the statistics of every channel by its name.
-
-        Args:
-            sends: Counts the commands that this application sent.
-        """
+        """Return the statistics of every channel by its name; ``sends`` counts the commands sent."""
         now_ns = self._clock()
         echoes = self.echoes.stats(now_ns)
         found = {
@@ -305,13 +284,6 @@ class ClientState:
         self.status = status
         self.on_link.publish(status)
         self.notifier.notify()
-
-    def vehicle_reason(self) -> str:
-        """Return the reason that the newest event about the vehicle's link gives; empty if there is none."""
-        for event in reversed(self.recent):
-            if event.kind is EventKind.VEHICLE_LINK:
-                return str(event.data.get("reason", "")) or event.text
-        return ""
 
 
 class Receiver:
@@ -413,7 +385,7 @@ class Receiver:
                 and (sample.link_reason, sample.link_remedy) != (state.status.reason, state.status.remedy)
             )
         ):
-            reason = sample.link_reason or ("" if awake else state.vehicle_reason())
+            reason = sample.link_reason or ("" if awake else _link_reason(state.recent))
             status = replace(state.status, vehicle=sample.vehicle_link, reason=reason, remedy=sample.link_remedy)
             state.set_status(status)
 
@@ -439,6 +411,12 @@ class Receiver:
             self._state.overview = whole
             self._state.on_overview.publish(whole)
             self._state.notifier.notify()
+
+
+def _link_reason(events: Sequence[Event]) -> str:
+    """Return the reason that the newest event about the vehicle's link gives; empty if there is none."""
+    found = (event for event in reversed(events) if event.kind is EventKind.VEHICLE_LINK)
+    return next((str(event.data.get("reason", "")) or event.text for event in found), "")
 
 
 def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
