@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 
 from skyloop.child_process import leave_to_parent
+from skyloop.client.actions import ActionWait
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
 from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, checked_age
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
-from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.parameters import Config, Restorer
 from skyloop.client.publishing import Logbook, Membership

@@ -15,6 +15,7 @@ from typing import Any, Final, ParamSpec, Self, TypeVar, Unpack
 import msgspec
 import numpy as np
 
+from skyloop.client.actions import ReturnWatch, is_there
 from skyloop.client.authority import (
     Authority,
     AuthorityStatus,
@@ -33,7 +34,6 @@ from skyloop.client.commands import (
     position_action,
     return_action,
 )
-from skyloop.client.completion import ReturnWatch, is_there
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.monitoring import ChannelStats, Distribution
