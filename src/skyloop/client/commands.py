@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import numbers
 import threading
 from collections.abc import Callable
 from contextvars import ContextVar
@@ -22,7 +20,6 @@ from skyloop.errors import (
     NoAnswerError,
     RefusedError,
     UnsupportedError,
-    UsageError,
 )
 from skyloop.messages import (
     ACTION_NAMES,
@@ -57,10 +54,8 @@ from skyloop.messages import (
 )
 from skyloop.messages.command import SET_POINTS
 from skyloop.messages.config import MAX_REASON
-from skyloop.messages.earth import is_on_earth
 from skyloop.messages.intent import ENDINGS
 
-_OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
 ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
 #: How long to wait at most for the proxy to notice that an earlier session of this process has ended: more than the
 #: time after which a silent one loses the authority.
@@ -68,7 +63,6 @@ OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 #: What an application asked for and no hover of the library's own may end.
 LANDING: Final = (Land, EmergencyStop)
-_ACTIONS: Final = frozenset(ACTION_NAMES)
 _LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
 _REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: so ended, the next set-point is most likely refused, too
 #: What a program sends again and again: that one of them is not sent is no error.
@@ -603,7 +597,7 @@ def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
 def impossible(capabilities: Capabilities) -> dict[type, str]:
     """Return why actions are not possible, by their types: those that neither the vehicle nor its proxy can do."""
     if not capabilities.actions:
-        return dict.fromkeys(_ACTIONS, capabilities.why_not or "the vehicle takes no commands")
+        return dict.fromkeys(ACTION_NAMES, capabilities.why_not or "the vehicle takes no commands")
     found: dict[type, str] = {}
     if ACTION_NAMES[EmergencyStop] not in capabilities.actions:
         found[EmergencyStop] = "the vehicle cannot stop its motors"
@@ -614,144 +608,3 @@ def impossible(capabilities: Capabilities) -> dict[type, str]:
                 "version must be updated"
             )
     return found
-
-
-def checked(action: AnyAction) -> AnyAction:
-    """Return ``action`` if it can be commanded.
-
-    Raises:
-        UsageError: If it is no action, or has a number that is not finite or makes no sense.
-    """
-    if type(action) not in _ACTIONS:
-        raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
-    try:
-        finite, problem = action.finite, action.problem
-    except OverflowError:
-        raise UsageError(f"{action.name} has a number that is too large") from None
-    except TypeError as error:
-        raise UsageError(f"{action!r} has something that is no number: {error}") from None
-    if not finite:
-        raise UsageError(f"{action!r} has a number that is NaN or infinite")
-    if problem:
-        raise UsageError(f"{action.name}: {problem}")
-    return action
-
-
-def position_action(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
-    """Return the action that flies to a place.
-
-    Args:
-        x: East [m].
-        y: North [m].
-        z: Up [m].
-        yaw: Counter-clockwise from x [rad]; None: keep the present one.
-        speed: Greatest one [m/s]; None: as fast as the limits allow.
-
-    Raises:
-        UsageError: If something is no number, not finite, or makes no sense.
-    """
-    place = Position(
-        number("x", x),
-        number("y", y),
-        number("z", z),
-        None if yaw is None else number("yaw", yaw),
-        None if speed is None else number("speed", speed),
-    )
-    checked(place)
-    return place
-
-
-def return_action(height_m: object, land: object) -> ReturnToStart:
-    """Return the action that flies back to the start.
-
-    Args:
-        height_m: Above the start, at least, on the way [m]; None: the proxy's parameter.
-        land: Whether to land there; None: the proxy's parameter.
-
-    Raises:
-        UsageError: If something is no number or no bool, or makes no sense.
-    """
-    if not (land is None or isinstance(land, bool)):
-        raise UsageError(f"land is {land!r:.60} and must be True, False or None (as return.land says)")
-    back = ReturnToStart(None if height_m is None else number("height_m", height_m), land)
-    checked(back)
-    return back
-
-
-def in_world_axes(
-    local: tuple[object, object, object],
-    earth: tuple[object, object, object],
-    newest: Feedback | None,
-    age_s: float,
-) -> tuple[object, object, object]:
-    """Return x, y, z of a place that is given in either way.
-
-    Args:
-        local: x, y, z in world axes [m], or three times None.
-        earth: Latitude and longitude [°] and altitude above mean sea level [m], or three times None; None for the
-            altitude alone: the present height.
-        newest: The newest feedback.
-        age_s: Its age [s].
-
-    Raises:
-        UsageError: If both ways or neither are given, or something is no number or not on the earth.
-        RefusedError: If the vehicle's place on the earth is not known.
-    """
-    if all(one is None for one in earth):
-        if any(one is None for one in local):
-            raise UsageError("go_to needs x, y and z, or latitude_deg and longitude_deg with or without altitude_m")
-        return local
-    if any(one is not None for one in local):
-        raise UsageError("go_to takes x, y, z or latitude_deg, longitude_deg, altitude_m, not some of both")
-    latitude_deg, longitude_deg = number("latitude_deg", earth[0]), number("longitude_deg", earth[1])
-    if not is_on_earth(latitude_deg, longitude_deg):
-        raise UsageError(
-            f"latitude_deg is {latitude_deg:g} and longitude_deg {longitude_deg:g}: they must be within 89.9 and 180"
-        )
-    origin = None if newest is None else newest.origin
-    if newest is None or origin is None or newest.position_m is None or age_s > _OLD_PLACE_S:
-        raise RefusedError(
-            "position: the vehicle does not report its place on the earth (it needs a 3-D fix by satellites, and a "
-            "driver that passes it on): fly it by x, y, z",
-            code=Refusal.WRONG_STATE,
-        )
-    z = newest.position_m[2] if earth[2] is None else number("altitude_m", earth[2]) - origin.altitude_m
-    x, y, _ = origin.position_of(latitude_deg, longitude_deg, origin.altitude_m)
-    return x, y, z
-
-
-def above_zero(name: str, value: object) -> float:
-    """Return ``value`` as a finite float above zero.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: What was given.
-
-    Raises:
-        UsageError: If it is no such number.
-    """
-    found = number(name, value)
-    if not found > 0.0:
-        raise UsageError(f"{name} is {found:g} and must be more than 0")
-    return found
-
-
-def number(name: str, value: object) -> float:
-    """Return ``value`` as a finite float.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: What was given.
-
-    Raises:
-        UsageError: If it is no real number, or not finite.
-    """
-    if type(value) is not float and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
-        raise UsageError(f"{name} is {value!r:.60} and must be a number")
-    try:
-        number = float(value)
-    except OverflowError:
-        raise UsageError(f"{name} is too large for a number") from None
-    if not math.isfinite(number):
-        raise UsageError(f"{name} is {number} and must be finite")
-    return number

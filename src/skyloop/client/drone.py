@@ -15,7 +15,16 @@ from typing import Any, Final, ParamSpec, Self, TypeVar, Unpack
 import msgspec
 import numpy as np
 
-from skyloop.client.actions import ReturnWatch, is_there
+from skyloop.client.actions import (
+    ReturnWatch,
+    above_zero,
+    checked,
+    in_world_axes,
+    is_there,
+    number,
+    position_action,
+    return_action,
+)
 from skyloop.client.authority import (
     Authority,
     AuthorityStatus,
@@ -26,14 +35,6 @@ from skyloop.client.authority import (
     authority_request,
 )
 from skyloop.client.channels import Channel, Listener, Mailbox, checked_age
-from skyloop.client.commands import (
-    above_zero,
-    checked,
-    in_world_axes,
-    number,
-    position_action,
-    return_action,
-)
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.monitoring import ChannelStats, Distribution

@@ -16,16 +16,9 @@ from typing import Final, Literal, Self, TypeVar, Unpack, get_args
 import numpy as np
 
 from skyloop.child_process import interrupt_deferred
+from skyloop.client.actions import above_zero, checked, number, position_action, return_action
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import (
-    GivenUpError,
-    above_zero,
-    cancelled,
-    checked,
-    number,
-    position_action,
-    return_action,
-)
+from skyloop.client.commands import GivenUpError, cancelled
 from skyloop.client.connect import ConnectOptions, connect, explains_moved_options, running_names
 from skyloop.client.drone import Drone, by_name
 from skyloop.client.monitoring import DEPTH, Distribution, distribution
