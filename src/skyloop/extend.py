@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Unpack
 
 if TYPE_CHECKING:
     from skyloop.client import ChannelStats, Drone, Listener
-    from skyloop.client.core import DroneOptions, InboxOptions, StreamOptions
+    from skyloop.client.core import DroneOptions, InboxOptions
     from skyloop.client.publishing import Membership
     from skyloop.client.telemetry import Mailboxes
-    from skyloop.client.video import StreamChannel, VideoChannel
+    from skyloop.client.video import StreamChannel, StreamOptions, VideoChannel
     from skyloop.errors import SkyloopError
     from skyloop.messages import AnyAction, Feedback, Outcome
     from skyloop.transport.base import Dialer
@@ -29,7 +29,7 @@ class Known:
         core = self._core = drone._core
         self.app: Final = core.app  #: name of this application, as events give it
         self.reach: Final = core.reach  #: name or address by which another process reaches the vehicle; None: it can't
-        self.subscriber: Final = core.subscriber  #: unique to this drone object, for :func:`stream_channel`
+        self.subscriber: Final = core.state.video.subscriber  #: unique to this drone object, for :func:`stream_channel`
 
     @property
     def newest(self) -> Feedback | None:
@@ -89,7 +89,7 @@ def commands(drone: Drone) -> Commands:
 
 def ask(drone: Drone, action: AnyAction) -> int:
     """Command ``action``, whose numbers were checked, as :meth:`skyloop.Drone.command`; return the intent's number."""
-    return drone._core.ask(action)
+    return drone._core.commands.ask(action)
 
 
 def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:

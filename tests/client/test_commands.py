@@ -566,7 +566,7 @@ def test_a_take_off_that_the_proxy_ended_after_20_s_is_asked_for_anew_while_its_
 def test_no_take_off_is_asked_for_anew_once_the_flight_ends(proxy: ScriptedProxy, drone: Drone) -> None:
     drone._core.commands.bar()
     with pytest.raises(ClosedError, match="too late"):
-        drone._core.ask(Takeoff(), automatic=True)
+        drone._core.commands.ask(Takeoff(), automatic=True)
 
 
 def test_a_refused_take_off_that_nobody_waits_for_is_not_repeated(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -235,11 +235,11 @@ def test_callbacks_follow_a_proxy_that_is_restarted_with_another_camera(
         assert set(frames) == set(inline) == {"top"}
         assert named == []
         stream = VideoRequest("top", encoding="h264", kbit_s=100).stream_topic
-        assert drone._core.state.streams[stream].consumed
+        assert drone._core.state.video.streams[stream].consumed
     for listener in listeners:
         listener.cancel()
-    assert not any(channel.consumed for channel in drone._core.state.variants.values())
-    assert not any(channel.consumed for channel in drone._core.state.streams.values())
+    assert not any(channel.consumed for channel in drone._core.state.video.variants.values())
+    assert not any(channel.consumed for channel in drone._core.state.video.streams.values())
     assert not drone._core.state.on_welcome.consumed
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from skyloop.client import Drone, Frame, LinkStatus, Listener
 from skyloop.client.core import DroneCore
-from skyloop.client.telemetry import IDLE_KEPT
+from skyloop.client.video import IDLE_KEPT
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import (
     Annotation,
@@ -533,11 +533,13 @@ def test_channels_that_nobody_reads_are_forgotten(proxy: ScriptedProxy, drone: D
             drone._core.stream(max_fps=float(number))
             state.feedback_channel(FeedbackRequest(max_hz=1.0 + number / 10))
         assert drone._core.channel(scale=0.5) is watched
-        assert {id(channel) for channel in state.channels.values()} <= {id(one) for one in state.variants.values()}
+        assert {id(channel) for channel in state.video.channels.values()} <= {
+            id(one) for one in state.video.variants.values()
+        }
         assert 1.0 < len(state.selected) <= IDLE_KEPT
         assert any(channel.subscribed for channel in state.selected)
-    assert len(state.variants) <= IDLE_KEPT
-    assert len(state.streams) <= IDLE_KEPT
+    assert len(state.video.variants) <= IDLE_KEPT
+    assert len(state.video.streams) <= IDLE_KEPT
 
 
 def test_two_threads_that_ask_for_the_same_channel_get_the_same(drone: Drone) -> None:

@@ -128,7 +128,7 @@ def test_a_slow_callback_gets_the_newest_and_is_an_overrun(proxy: ScriptedProxy,
 
     drone.frame()
     sending = background(
-        lambda: drone.wait(lambda _: len(drone._core.state.channels["front"]._drops) == 1, WAIT_S),
+        lambda: drone.wait(lambda _: len(drone._core.state.video.channels["front"]._drops) == 1, WAIT_S),
         lambda: proxy.frame(1),
     )
     controller = Slow(drone)

@@ -322,7 +322,7 @@ def test_forged_commands_change_nothing(node: Node, drone: Drone) -> None:
 def test_statistics_of_all_channels(node: Node, drone: Drone) -> None:
     drone.takeoff()
     drone.frame()
-    drone.wait(lambda _: drone._core.state.channels["front"].counter.count > 10, WAIT_S)
+    drone.wait(lambda _: drone._core.state.video.channels["front"].counter.count > 10, WAIT_S)
     stats = drone.stats
     for name in ("command", "feedback", "video/front"):
         delay = stats[name].delay_s

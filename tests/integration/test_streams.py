@@ -121,7 +121,7 @@ def test_what_is_lost_on_the_way_costs_pictures_and_never_shows(far: Node) -> No
     with far.connected() as drone:
         frames = drone.frames(encoding="h264", kbit_s=400)
         next(frames)
-        stream = drone._core.state.streams["stream/front?kbit_s=400"]
+        stream = drone._core.state.video.streams["stream/front?kbit_s=400"]
         decoder, received = stream.decoder, stream.receive
         assert decoder is not None
         numbers = itertools.count()
@@ -149,7 +149,7 @@ def test_a_damaged_picture_is_not_shown(far: Node) -> None:
     with far.connected() as drone:
         frames = drone.frames(encoding="h264", kbit_s=400)
         next(frames)
-        stream = drone._core.state.streams["stream/front?kbit_s=400"]
+        stream = drone._core.state.video.streams["stream/front?kbit_s=400"]
         received, numbers, damaged = stream.receive, itertools.count(1), set()
 
         def flipping(part: EncodedFrame) -> None:
@@ -168,7 +168,7 @@ def test_a_decoder_that_is_too_slow_goes_on_with_a_key(far: Node) -> None:
     with far.connected() as drone:
         frames = drone.frames(encoding="h264", kbit_s=400)
         next(frames)
-        decoder = drone._core.state.streams["stream/front?kbit_s=400"].decoder
+        decoder = drone._core.state.video.streams["stream/front?kbit_s=400"].decoder
         assert decoder is not None
         before, slow, decode = decoder.dropped, threading.Event(), decoder._decode
 

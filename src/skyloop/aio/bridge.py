@@ -14,10 +14,10 @@ from types import TracebackType
 from typing import Any, Generic, TypeVar, Unpack
 
 from skyloop import client
-from skyloop.client.channels import Mailbox, Notifier
+from skyloop.client.channels import Mailbox, Notifier, checked_age
 from skyloop.client.commands import cancelled
 from skyloop.client.frame import Arrival
-from skyloop.client.results import ResultMailbox, checked_age, silence
+from skyloop.client.results import ResultMailbox, silence
 from skyloop.client.swarm import Tick
 from skyloop.client.video import VideoChannel, VideoOptions
 from skyloop.drivers.uri import parse_uri

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from _thread import LockType, allocate_lock
@@ -13,7 +14,7 @@ from functools import partial
 from types import TracebackType
 from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
-from skyloop.errors import ClosedError, SkyloopError
+from skyloop.errors import ClosedError, SkyloopError, UsageError
 from skyloop.messages import EventKind, Severity
 
 T = TypeVar("T")
@@ -415,3 +416,14 @@ class Notifier:
         finally:
             with suppress(ValueError):  # the notifying thread has removed it
                 self._waiting.remove(lock)
+
+
+def checked_age(max_age_s: float | None) -> float | None:
+    """Return ``max_age_s`` if it can be a limit of age [s].
+
+    Raises:
+        UsageError: If it is no number, NaN or negative.
+    """
+    if max_age_s is not None and (not isinstance(max_age_s, int | float) or math.isnan(max_age_s) or max_age_s < 0):
+        raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds")
+    return max_age_s

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
-import numbers
 import threading
 from collections.abc import Callable
 from contextvars import ContextVar
-from functools import wraps
-from typing import Final, ParamSpec, TypeVar
+from typing import Final
 
 from skyloop.client.authority import AuthorityStatus, AuthorityTracker
 from skyloop.client.channels import Emit
@@ -22,8 +19,7 @@ from skyloop.errors import (
     LinkError,
     NoAnswerError,
     RefusedError,
-    UnknownNameError,
-    UsageError,
+    UnsupportedError,
 )
 from skyloop.messages import (
     ACTION_NAMES,
@@ -33,6 +29,7 @@ from skyloop.messages import (
     Attitude,
     AuthorityGranted,
     AuthorityQueued,
+    Capabilities,
     Command,
     EmergencyStop,
     Event,
@@ -57,11 +54,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.config import MAX_REASON
-from skyloop.messages.feedback import is_on_earth
 
-P = ParamSpec("P")
-R = TypeVar("R")
-_OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
 ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
 #: How long to wait at most for the proxy to notice that an earlier session of this process has ended: more than the
 #: time after which a silent one loses the authority.
@@ -69,7 +62,7 @@ OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 #: What an application asked for and no hover of the library's own may end.
 LANDING: Final = (Land, EmergencyStop)
-_ACTIONS: Final = frozenset(ACTION_NAMES)
+_LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
 _REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: so ended, the next set-point is most likely refused, too
 #: What a program sends again and again: that one of them is not sent is no error.
 _STREAMED: Final = (Idle, Hover, Velocity, Attitude)
@@ -128,7 +121,8 @@ class CommandSender:
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
         self.barred = False  #: the end of the flight has begun: only the library's own commands and a stop pass
-        self._closed = False
+        self.why_closed = ""  #: why nothing can be commanded any more; empty while something can
+        self._impossible: dict[type, str] = {}  # why, of what neither vehicle nor proxy can do
         self.told: Outcome | None = None  #: the newest that the proxy told of this application's intents
         self._first_set_point = 0  # number of the first in the present row of set-points; 0: the newest is none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
@@ -169,9 +163,9 @@ class CommandSender:
         with self._lock:
             self.barred = True
 
-    def close(self) -> None:
-        """Wake who waits for the authority: nobody gets it any more."""
-        self._closed = True
+    def close(self, why: str) -> None:
+        """Command nothing any more, and wake who waits for the authority: nobody gets it."""
+        self.why_closed = why
         self.notifier.notify()
 
     @property
@@ -216,8 +210,41 @@ class CommandSender:
     # The application's side ------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
-        """Make ``action`` the newest set-point; see :meth:`ask`, and False also while set-points are refused."""
-        intent, sent = self.ask(action, now=now, automatic=automatic)
+        """Make ``action``, whose numbers were checked, the newest set-point; see :class:`skyloop.Drone`.
+
+        Args:
+            action: The action.
+            now: Raise if it can't be sent now. A landing is then kept for when it can, anything else is dropped.
+            automatic: The library asks for it by itself: the proxy takes no vehicle from others for it. It passes when
+                the end of the flight has begun, too.
+
+        Raises:
+            ClosedError: After :meth:`close`, and from :meth:`bar` on.
+            UnsupportedError: If neither the vehicle nor its proxy can do it.
+            AuthorityError: If another application holds the authority, none was requested, or this one only observes;
+                with ``now`` also while the authority is still awaited.
+            RefusedError: If an emergency stop keeps back what is to be done once, or what is to be sent ``now``.
+            LinkError: With ``now`` while the link is down.
+        """
+        if self.why_closed or type(action) in self._impossible:
+            self._check(action)
+        return self.send(action, now=now, automatic=automatic)
+
+    def ask(self, action: AnyAction, *, automatic: bool = False) -> int:
+        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
+
+        :meth:`outcome` tells what became of it.
+        """
+        self._check(action)
+        return self._put(action, automatic=automatic)[0]
+
+    def send(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
+        """Make ``action`` the newest set-point as :meth:`command` does, whatever the vehicle can do.
+
+        Returns:
+            Whether it was sent; False also while set-points are refused.
+        """
+        intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
             self._first_set_point = 0
             return sent
@@ -225,25 +252,15 @@ class CommandSender:
         self._first_set_point = self._first_set_point or intent
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
 
-    def ask(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> tuple[int, bool]:
-        """Make ``action`` the newest set-point.
-
-        Args:
-            action: The action.
-            now: Raise if it can't be sent now. A landing is then kept for when it can, anything else is dropped.
-            automatic: The library asks for it by itself: the proxy takes no vehicle from others for it.
+    def _put(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> tuple[int, bool]:
+        """Make ``action`` the newest set-point, and send it if it can be.
 
         Returns:
             The number of the intent; and False if it can't be sent now, because the link is down or the authority is
             still awaited, or because an emergency stop of this application has not shown yet.
 
         Raises:
-            ClosedError: After :meth:`bar`.
             GivenUpError: If the caller waits no longer; see :data:`cancelled`.
-            RefusedError: If such a stop keeps back what is to be done once, or what is to be sent ``now``.
-            AuthorityError: If another application holds the authority, none was requested, or this one only observes;
-                with ``now`` also while the authority is still awaited.
-            LinkError: With ``now`` while the link is down.
         """
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
@@ -256,10 +273,10 @@ class CommandSender:
             if automatic and type(action) is not Land and type(self._schedule.action) in LANDING:
                 return self._schedule.intent, False
             authority = self._authority
-            may_send = authority.held or stop
+            may_send, connected = authority.held or stop, self._connection.connected
             if (
                 not may_send
-                and self._connection.connected
+                and connected
                 and not (authority.wanted and (authority.status.state == "none" or not authority.settled))
             ):
                 raise self._not_ours(action)
@@ -271,7 +288,7 @@ class CommandSender:
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return self._schedule.intent, False
             intent = self._schedule.ask(action, now_ns, automatic=automatic)
-            if not may_send or not self._connection.connected:
+            if not may_send or not connected:
                 if now:
                     if type(action) is not Land:  # what was refused now must not be carried out later
                         self._schedule.clear(Fate.WITHDRAWN)
@@ -324,7 +341,7 @@ class CommandSender:
         if answered:
             self._wait(lambda: authority.held or not authority.wanted, max(0.0, wait_s))
             self._wait(lambda: authority.settled, OWN_S)
-        if self._closed:
+        if self.why_closed:
             raise ClosedError("this drone was closed while it asked for the authority")
         if not answered:
             self.release(wait=False)
@@ -340,7 +357,7 @@ class CommandSender:
         raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy").with_hint(Hint.OBSERVE)
 
     def _wait(self, ready: Callable[[], bool], timeout_s: float) -> bool:
-        return self.notifier.wait_for(lambda: self._closed or ready(), timeout_s)
+        return self.notifier.wait_for(lambda: self.why_closed != "" or ready(), timeout_s)
 
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer an application that asks for the authority; an answer that is too late changes nothing.
@@ -385,13 +402,15 @@ class CommandSender:
 
     # For the connection ----------------------------------------------------------------------------------------
 
-    def connected(self, app_id: int, run_id: int = 0) -> None:
+    def connected(self, app_id: int, run_id: int = 0, capabilities: Capabilities | None = None) -> None:
         """Reset on a new connection: :meth:`tick` requests the authority again if it is wanted.
 
         Args:
             app_id: Number of this application there.
             run_id: Number of the proxy's run.
+            capabilities: Of the vehicle; None: not known.
         """
+        self._impossible = {} if capabilities is None else impossible(capabilities)
         with self._lock:
             self._authority.connected(app_id, run_id)
             self._seq = 0
@@ -528,6 +547,13 @@ class CommandSender:
         self.notifier.notify()
         self._changed()
 
+    def _check(self, action: AnyAction) -> None:
+        """Raise if nothing can be commanded any more, or not this."""
+        if self.why_closed:
+            raise ClosedError(self.why_closed)
+        if why := self._impossible.get(type(action)):
+            raise UnsupportedError(f"{action.name} is not possible: {why}")
+
     def _not_ours(self, action: AnyAction) -> AuthorityError:
         status = self.status
         if self._role is Role.OBSERVER:
@@ -567,170 +593,17 @@ def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
     )
 
 
-def checked(action: AnyAction) -> AnyAction:
-    """Return ``action`` if it can be commanded.
-
-    Raises:
-        UsageError: If it is no action, or has a number that is not finite or makes no sense.
-    """
-    if type(action) not in _ACTIONS:
-        raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
-    try:
-        finite, problem = action.finite, action.problem
-    except OverflowError:
-        raise UsageError(f"{action.name} has a number that is too large") from None
-    except TypeError as error:
-        raise UsageError(f"{action!r} has something that is no number: {error}") from None
-    if not finite:
-        raise UsageError(f"{action!r} has a number that is NaN or infinite")
-    if problem:
-        raise UsageError(f"{action.name}: {problem}")
-    return action
-
-
-def position_action(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
-    """Return the action that flies to a place.
-
-    Args:
-        x: East [m].
-        y: North [m].
-        z: Up [m].
-        yaw: Counter-clockwise from x [rad]; None: keep the present one.
-        speed: Greatest one [m/s]; None: as fast as the limits allow.
-
-    Raises:
-        UsageError: If something is no number, not finite, or makes no sense.
-    """
-    place = Position(
-        number("x", x),
-        number("y", y),
-        number("z", z),
-        None if yaw is None else number("yaw", yaw),
-        None if speed is None else number("speed", speed),
-    )
-    checked(place)
-    return place
-
-
-def return_action(height_m: object, land: object) -> ReturnToStart:
-    """Return the action that flies back to the start.
-
-    Args:
-        height_m: Above the start, at least, on the way [m]; None: the proxy's parameter.
-        land: Whether to land there; None: the proxy's parameter.
-
-    Raises:
-        UsageError: If something is no number or no bool, or makes no sense.
-    """
-    if not (land is None or isinstance(land, bool)):
-        raise UsageError(f"land is {land!r:.60} and must be True, False or None (as return.land says)")
-    back = ReturnToStart(None if height_m is None else number("height_m", height_m), land)
-    checked(back)
-    return back
-
-
-def in_world_axes(
-    local: tuple[object, object, object],
-    earth: tuple[object, object, object],
-    newest: Feedback | None,
-    age_s: float,
-) -> tuple[object, object, object]:
-    """Return x, y, z of a place that is given in either way.
-
-    Args:
-        local: x, y, z in world axes [m], or three times None.
-        earth: Latitude and longitude [°] and altitude above mean sea level [m], or three times None; None for the
-            altitude alone: the present height.
-        newest: The newest feedback.
-        age_s: Its age [s].
-
-    Raises:
-        UsageError: If both ways or neither are given, or something is no number or not on the earth.
-        RefusedError: If the vehicle's place on the earth is not known.
-    """
-    if all(one is None for one in earth):
-        if any(one is None for one in local):
-            raise UsageError("go_to needs x, y and z, or latitude_deg and longitude_deg with or without altitude_m")
-        return local
-    if any(one is not None for one in local):
-        raise UsageError("go_to takes x, y, z or latitude_deg, longitude_deg, altitude_m, not some of both")
-    latitude_deg, longitude_deg = number("latitude_deg", earth[0]), number("longitude_deg", earth[1])
-    if not is_on_earth(latitude_deg, longitude_deg):
-        raise UsageError(
-            f"latitude_deg is {latitude_deg:g} and longitude_deg {longitude_deg:g}: they must be within 89.9 and 180"
-        )
-    origin = None if newest is None else newest.origin
-    if newest is None or origin is None or newest.position_m is None or age_s > _OLD_PLACE_S:
-        raise RefusedError(
-            "position: the vehicle does not report its place on the earth (it needs a 3-D fix by satellites, and a "
-            "driver that passes it on): fly it by x, y, z",
-            code=Refusal.WRONG_STATE,
-        )
-    z = newest.position_m[2] if earth[2] is None else number("altitude_m", earth[2]) - origin.altitude_m
-    x, y, _ = origin.position_of(latitude_deg, longitude_deg, origin.altitude_m)
-    return x, y, z
-
-
-def above_zero(name: str, value: object) -> float:
-    """Return ``value`` as a finite float above zero.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: What was given.
-
-    Raises:
-        UsageError: If it is no such number.
-    """
-    found = number(name, value)
-    if not found > 0.0:
-        raise UsageError(f"{name} is {found:g} and must be more than 0")
+def impossible(capabilities: Capabilities) -> dict[type, str]:
+    """Return why actions are not possible, by their types: those that neither the vehicle nor its proxy can do."""
+    if not capabilities.actions:
+        return dict.fromkeys(ACTION_NAMES, capabilities.why_not or "the vehicle takes no commands")
+    found: dict[type, str] = {}
+    if ACTION_NAMES[EmergencyStop] not in capabilities.actions:
+        found[EmergencyStop] = "the vehicle cannot stop its motors"
+    for kind in _LATER_ACTIONS:  # which proxies of earlier versions would not even decode
+        if ACTION_NAMES[kind] not in capabilities.actions | capabilities.software:
+            found[kind] = (
+                f"neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a place; a proxy of an earlier "
+                "version must be updated"
+            )
     return found
-
-
-def by_name(function: Callable[P, R]) -> Callable[P, R]:
-    """Let a call of a function with keyword-only numbers that it does not take say what was meant."""
-    known = list(function.__kwdefaults__ or {})
-
-    @wraps(function)
-    def call(*args: P.args, **given: P.kwargs) -> R:
-        try:
-            return function(*args, **given)
-        except TypeError as error:
-            if error.__traceback__ is None or error.__traceback__.tb_next is not None:
-                raise  # not by the call itself
-            for unknown in given.keys() - known:
-                raise UnknownNameError(f"argument of {function.__name__}", unknown, known) from None
-            first = f"{function.__name__}({known[0]}={args[1]!r:.20})" if len(args) > 1 else "its own"
-            raise UsageError(f"{function.__name__} takes {', '.join(known)} by their names, as in {first}") from None
-
-    return call
-
-
-def all_finite(a: object, b: object, c: object, d: object) -> bool:
-    """Return whether four values are floats that can be commanded as they are: :func:`number` need not look at each.
-
-    False is no judgement: an int, or four huge floats whose sum is none, may be fine.
-    """
-    floats = type(a) is float and type(b) is float and type(c) is float and type(d) is float
-    return floats and math.isfinite(a + b + c + d)  # type: ignore[operator]
-
-
-def number(name: str, value: object) -> float:
-    """Return ``value`` as a finite float.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: What was given.
-
-    Raises:
-        UsageError: If it is no real number, or not finite.
-    """
-    if type(value) is not float and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
-        raise UsageError(f"{name} is {value!r:.60} and must be a number")
-    try:
-        number = float(value)
-    except OverflowError:
-        raise UsageError(f"{name} is too large for a number") from None
-    if not math.isfinite(number):
-        raise UsageError(f"{name} is {number} and must be finite")
-    return number

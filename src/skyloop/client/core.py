@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -12,31 +11,27 @@ from contextlib import contextmanager
 from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 
 from skyloop.child_process import leave_to_parent
+from skyloop.client.actions import ActionWait
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
-from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, Notifier
+from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, checked_age
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
-from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.parameters import Config, Restorer
 from skyloop.client.publishing import Logbook, Membership
-from skyloop.client.results import ResultChannel, checked_age, checked_name
+from skyloop.client.results import ResultChannel, checked_name
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
-from skyloop.client.video import StreamChannel, VideoChannel
+from skyloop.client.video import StreamChannel, StreamOptions, VideoChannel, VideoOptions
 from skyloop.errors import (
     ClosedError,
     LinkError,
     NoAnswerError,
     RefusedError,
     SkyloopError,
-    UnknownNameError,
-    UnsupportedError,
     UsageError,
 )
 from skyloop.messages import (
     AnyAction,
-    Capabilities,
-    EmergencyStop,
     EventKind,
     Failsafe,
     Feedback,
@@ -46,21 +41,16 @@ from skyloop.messages import (
     Idle,
     Land,
     LinkState,
-    Position,
     ReturnPhase,
-    ReturnToStart,
     Role,
     Severity,
     Takeoff,
 )
 from skyloop.messages.relayed import MAX_CODE
-from skyloop.messages.subscription import DEFAULT_QUALITY, VideoEncoding, VideoRequest
-from skyloop.pyav import require_pyav
 from skyloop.transport.base import EVENTS, Dialer
 
 Access = Literal["pilot", "observe"]
 OnExit = Literal["land", "hover"]
-LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 STOP_S: Final = 2.0  #: how long closing waits for an emergency stop to show
 DOWN: Final = frozenset({FlightState.LANDED})
@@ -95,15 +85,6 @@ class DroneOptions(TypedDict, total=False):
     scheduler: Scheduler | None
     on_close: Callable[[], None] | None
     reach: str | None
-
-
-class StreamOptions(TypedDict, total=False):
-    """How H.264 is wanted; with none of these, as the vehicle itself encoded it."""
-
-    kbit_s: int | None  #: encoded by the proxy at this rate, once for all who ask for the same [kbit/s]
-    max_fps: float | None  #: most pictures a second; None: all
-    scale: float  #: factor for width and height, above 0 and up to 1
-    subscriber: str  #: encoded by the proxy for this subscriber alone, at the rate that the path to it carries
 
 
 class InboxOptions(TypedDict, total=False):
@@ -163,11 +144,8 @@ class DroneCore:
         scheduler = scheduler or Scheduler()
         self.app = app
         self.role = Role.PILOT if access == "pilot" else Role.OBSERVER
-        self.closed = False
-        self._why_closed = "this drone was closed: connect again"
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
-        self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
         self._end = threading.Lock()  # one end of the flight, whoever asks for it
         self._on_exit = on_exit
         self._on_close = on_close
@@ -258,8 +236,7 @@ class DroneCore:
         if self.closed:
             return
         self._finish_stop()
-        self.closed = True
-        self.commands.close()
+        self.commands.close("this drone was closed: connect again")
         try:
             if self.connection.connected:
                 self.commands.release(wait=not self.connection.receiving)
@@ -280,6 +257,11 @@ class DroneCore:
                 self._on_close()
 
     @property
+    def closed(self) -> bool:
+        """Whether :meth:`close` was called, or the drone belongs to the parent process."""
+        return self.commands.why_closed != ""
+
+    @property
     def ending(self) -> bool:
         """Whether the end of the flight has begun, or it is closed."""
         return self.closed or self.commands.barred
@@ -287,8 +269,7 @@ class DroneCore:
     def forked(self) -> None:
         """Leave the vehicle and the connection to the parent process; in a child made by ``os.fork``."""
         if not self.closed:
-            self.closed = True
-            self._why_closed = (
+            self.commands.why_closed = (
                 f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect here as well"
             )
             self.connection.forked()
@@ -312,7 +293,7 @@ class DroneCore:
             if commands.status.state != "held":
                 commands.drop()
                 return False
-            sent = commands.command(action, automatic=True)
+            sent = commands.send(action, automatic=True)
         except SkyloopError:
             return False
         if type(action) is not Idle:
@@ -370,10 +351,6 @@ class DroneCore:
             return error
         return None
 
-    def sample_notifier(self) -> Notifier:
-        """Return a notifier for a thread that waits for nothing but samples of this drone."""
-        return self.state.scheduler.sample_notifier(self.connection)
-
     @contextmanager
     def closing(self, mailbox: Closable) -> Iterator[None]:
         """Close ``mailbox``, which wakes its consumer, if the drone is closed within the block."""
@@ -386,7 +363,7 @@ class DroneCore:
     def check_open(self) -> None:
         """Raise :class:`ClosedError` after :meth:`close`."""
         if self.closed:
-            raise ClosedError(self._why_closed)
+            raise ClosedError(self.commands.why_closed)
 
     def check_may_wait(self) -> None:
         """Raise :class:`UsageError` on the receiving thread."""
@@ -445,40 +422,6 @@ class DroneCore:
 
     # Commands ----------------------------------------------------------------------------------------------------
 
-    def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
-        """Make ``action``, whose numbers were checked, the newest set-point; see :class:`Drone`.
-
-        Args:
-            action: The action.
-            now: See :meth:`CommandSender.ask`.
-            automatic: See :meth:`CommandSender.ask`; it passes when the end of the flight has begun, too.
-
-        Raises:
-            ClosedError: After :meth:`close`, and from the beginning of :meth:`end_flight` on.
-        """
-        self._check_can_do(action)
-        return self.commands.command(action, now=now, automatic=automatic)
-
-    def ask(self, action: AnyAction, *, automatic: bool = False) -> int:
-        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
-
-        ``commands.outcome`` tells what became of it.
-        """
-        self._check_can_do(action)
-        return self.commands.ask(action, automatic=automatic)[0]
-
-    def _check_can_do(self, action: AnyAction) -> None:
-        if self.closed:
-            self.check_open()
-        welcome = self.state.welcome
-        if welcome is not None and not welcome.capabilities.actions:
-            why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
-            raise UnsupportedError(f"{action.name} is not possible: {why_not}")
-        if type(action) is EmergencyStop and welcome is not None and action.name not in welcome.capabilities.actions:
-            raise UnsupportedError("emergency_stop is not possible: the vehicle cannot stop its motors")
-        if welcome is not None and type(action) in LATER_ACTIONS:
-            _check_knows(welcome.capabilities, action)
-
     def complete(
         self,
         action: AnyAction,
@@ -494,7 +437,7 @@ class DroneCore:
         but for a landing.
         """
         if not wait:
-            self.command(action, now=True)
+            self.commands.command(action, now=True)
             return
         if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
             self.check_may_wait()
@@ -504,11 +447,10 @@ class DroneCore:
             waiting = ActionWait(
                 action,
                 is_done,
-                lambda asked, by_itself: self.ask(asked, automatic=automatic or by_itself),
-                lambda: self.closed or (self.ending and not automatic),
                 self.commands,
                 self.state,
                 self.connection,
+                automatic=automatic,
             )
             self.check_may_wait()
             waiting.wait(timeout_s, deadline_s)
@@ -524,68 +466,23 @@ class DroneCore:
 
     # Consumers -----------------------------------------------------------------------------------------------------
 
-    def channel(
-        self,
-        camera: str | None = None,
-        *,
-        encoding: VideoEncoding | None = None,
-        quality: int | None = None,
-        max_fps: float | None = None,
-        scale: float = 1.0,
-        part: tuple[int, int] | None = None,
-        kbit_s: int | None = None,
-        max_age_s: float | None = None,
-    ) -> VideoChannel:
-        """Return the channel of a camera whose frames come as requested; see :meth:`Drone.frames` for the options.
-
-        Args:
-            camera: Name of the camera; None: the vehicle's first.
-            encoding: ``"jpeg"``, ``"h264"`` or ``"raw"``; None: ``"jpeg"``.
-            quality: Of JPEG, 1 to 100; None: 80.
-            max_fps: Most frames a second; None: all.
-            scale: Factor for width and height, above 0 and up to 1.
-            part: (k, n): only every n-th frame, from k; None: all.
-            kbit_s: Of H.264 [kbit/s]; None: what the path carries.
-            max_age_s: Only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
+    def channel(self, camera: str | None = None, **how: Unpack[VideoOptions]) -> VideoChannel:
+        """Return the channel of a camera's frames; see :meth:`VideoChannels.channel`.
 
         Raises:
-            UnknownNameError: If the vehicle has no camera of this name.
-            UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range, or ``quality`` is given for other frames than JPEG.
-            MissingExtraError: If H.264 is asked for and PyAV is not installed.
             ClosedError: If the drone was closed.
         """
         self.check_open()
-        checked_age(max_age_s)
-        channels = self.state.channels
-        if not channels:
-            raise UnsupportedError("this vehicle has no camera")
-        channel = next(iter(channels.values())) if camera is None else channels.get(camera)
-        if channel is None:
-            raise UnknownNameError("camera", str(camera), channels)
-        if encoding in ("raw", "h264") and quality is not None:
-            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is {encoding!r}')
-        if encoding == "h264":
-            require_pyav("reading H.264")
-        request = VideoRequest(
-            channel.camera.name,
-            encoding="jpeg" if encoding is None else encoding,
-            quality=DEFAULT_QUALITY if quality is None else quality,
-            max_fps=max_fps,
-            scale=scale,
-            part=part,
-            kbit_s=kbit_s,
-            subscriber=self.subscriber if encoding == "h264" and kbit_s is None else "",
-        )
-        return channel if request == channel.request else self.state.video(channel.camera, request)
+        return self.state.video.channel(camera, **how)
+
+    def stream(self, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
+        """Return the channel of a camera's H.264; see :func:`skyloop.extend.stream_channel`."""
+        self.check_open()
+        return self.state.video.stream(camera, **how)
 
     def follow(self, find: Callable[[], C]) -> FollowingChannel[Any, C]:
         """Return the channel that ``find`` returns, also once the proxy was started again with other cameras."""
         return FollowingChannel(find, self.state.on_welcome)
-
-    def stream(self, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
-        """Return the channel of a camera's H.264; see :func:`skyloop.extend.stream_channel`."""
-        return self.state.stream(VideoRequest(self.channel(camera).camera.name, encoding="h264", **how))
 
     def result_channel(self, processor: str) -> ResultChannel:
         """Return the channel of a processor's results, whether or not such a processor runs.
@@ -658,15 +555,6 @@ class DroneCore:
             self.commands.bar()
             # No daemon: the interpreter waits for the landing.
             threading.Thread(target=self.end_flight, name="skyloop-end").start()
-
-
-def _check_knows(capabilities: Capabilities, action: AnyAction) -> None:
-    """Raise if the proxy does not know the action, which proxies of earlier versions would not even decode."""
-    if action.name not in capabilities.actions | capabilities.software:
-        raise UnsupportedError(
-            f"{action.name} is not possible: neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a "
-            "place; a proxy of an earlier version must be updated"
-        )
 
 
 def _returns(feedback: Feedback) -> bool:

@@ -7,13 +7,24 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar, Unpack
+from typing import Any, Final, ParamSpec, Self, TypeVar, Unpack
 
 import msgspec
 import numpy as np
 
+from skyloop.client.actions import (
+    ReturnWatch,
+    above_zero,
+    checked,
+    in_world_axes,
+    is_there,
+    number,
+    position_action,
+    return_action,
+)
 from skyloop.client.authority import (
     Authority,
     AuthorityStatus,
@@ -23,31 +34,13 @@ from skyloop.client.authority import (
     answering,
     authority_request,
 )
-from skyloop.client.channels import Channel, Listener, Mailbox
-from skyloop.client.commands import (
-    above_zero,
-    all_finite,
-    by_name,
-    checked,
-    in_world_axes,
-    number,
-    position_action,
-    return_action,
-)
-from skyloop.client.completion import ReturnWatch, is_there
+from skyloop.client.channels import Channel, Listener, Mailbox, checked_age
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.client.preflight import PreflightFinding, inspect
 from skyloop.client.publishing import checked_time
-from skyloop.client.results import (
-    Result,
-    ResultListener,
-    ResultMailbox,
-    checked_age,
-    is_old,
-    silence,
-)
+from skyloop.client.results import Result, ResultListener, ResultMailbox, is_old, silence
 from skyloop.client.telemetry import LinkStatus, Wanted, as_predicate
 from skyloop.client.video import StreamChannel, VideoOptions
 from skyloop.errors import (
@@ -55,6 +48,7 @@ from skyloop.errors import (
     ClosedError,
     LinkError,
     NoAnswerError,
+    UnknownNameError,
     UsageError,
 )
 from skyloop.messages import (
@@ -92,11 +86,41 @@ from skyloop.messages.relayed import Shape
 from skyloop.messages.subscription import PLAIN
 from skyloop.transport.base import Dialer
 
+P = ParamSpec("P")
+R = TypeVar("R")
 T = TypeVar("T")
 EVENT_DEPTH: Final = 256  #: how many events, log entries and the like wait for a slow callback
 WHOLE_S: Final = 1.0  #: for every field of feedback to come, where less had been asked for
 _LOOK_S: Final = 0.5  #: how often who waits for a frame looks whether its camera is still there
 _log = logging.getLogger("skyloop")
+
+
+def by_name(function: Callable[P, R]) -> Callable[P, R]:
+    """Let a call of a function with keyword-only numbers that it does not take say what was meant."""
+    known = list(function.__kwdefaults__ or {})
+
+    @wraps(function)
+    def call(*args: P.args, **given: P.kwargs) -> R:
+        try:
+            return function(*args, **given)
+        except TypeError as error:
+            if error.__traceback__ is None or error.__traceback__.tb_next is not None:
+                raise  # not by the call itself
+            for unknown in given.keys() - known:
+                raise UnknownNameError(f"argument of {function.__name__}", unknown, known) from None
+            first = f"{function.__name__}({known[0]}={args[1]!r:.20})" if len(args) > 1 else "its own"
+            raise UsageError(f"{function.__name__} takes {', '.join(known)} by their names, as in {first}") from None
+
+    return call
+
+
+def _all_finite(a: object, b: object, c: object, d: object) -> bool:
+    """Return whether four values are floats that can be commanded as they are: :func:`number` need not look at each.
+
+    False is no judgement: an int, or four huge floats whose sum is none, may be fine.
+    """
+    floats = type(a) is float and type(b) is float and type(c) is float and type(d) is float
+    return floats and math.isfinite(a + b + c + d)  # type: ignore[operator]
 
 
 class Drone:
@@ -129,6 +153,7 @@ class Drone:
     def __init__(self, core: DroneCore) -> None:
         """Show what ``core`` is made of to an application; :func:`skyloop.connect` does it."""
         self._core = core
+        self._commands = core.commands
         self._state = core.state
         self.config = core.config
         self.log = core.log
@@ -170,7 +195,7 @@ class Drone:
     @property
     def app_id(self) -> int:
         """Number of this application in this run of the proxy."""
-        return self._core.commands.app_id
+        return self._commands.app_id
 
     @property
     def link(self) -> LinkStatus:
@@ -199,7 +224,7 @@ class Drone:
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
         callback. Otherwise the proxy is asked for the delay over all pilots, which waits up to 0.2 s.
         """
-        found = self._state.stats(self._core.commands.sends)
+        found = self._state.stats(self._commands.sends)
         uncertainty_s = self.clock_uncertainty_ns / 1e9
         found = {name: replace(stats, uncertainty_s=uncertainty_s) for name, stats in found.items()}
         if found["command"].delay_s is None and self._core.connection.connected and not self._core.connection.receiving:
@@ -225,14 +250,14 @@ class Drone:
             UsageError: If ``function`` can't be called.
             ClosedError: If the drone was closed.
         """
-        return self.on_event(answering(function, lambda: self.app_id, self._core.commands.answer))
+        return self.on_event(answering(function, lambda: self.app_id, self._commands.answer))
 
     # Authority and commands --------------------------------------------------------------------------------------
 
     @property
     def authority(self) -> AuthorityStatus:
         """Current state of this application's authority."""
-        return self._core.commands.status
+        return self._commands.status
 
     def request_authority(
         self,
@@ -268,10 +293,8 @@ class Drone:
             ClosedError: If the drone was closed.
         """
         self._core.check_open()
-        request = authority_request(
-            self._core.commands.status.priority if priority is None else priority, for_s, takeover
-        )
-        return self._core.commands.request(request, wait_s, stay=stay)
+        request = authority_request(self._commands.status.priority if priority is None else priority, for_s, takeover)
+        return self._commands.request(request, wait_s, stay=stay)
 
     def release_authority(self) -> None:
         """Release the authority, or leave the queue, and wait until the proxy has confirmed it.
@@ -283,7 +306,7 @@ class Drone:
             ClosedError: If the drone was closed.
         """
         self._core.check_open()
-        self._core.commands.release()
+        self._commands.release()
 
     def command(self, action: AnyAction) -> bool:
         """Make ``action`` the newest set-point.
@@ -291,7 +314,7 @@ class Drone:
         Returns:
             Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
         """
-        return self._core.command(checked(action))
+        return self._commands.command(checked(action))
 
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover.
@@ -340,11 +363,11 @@ class Drone:
 
     def hover(self) -> bool:
         """Stop and hold the position. Returns and raises as every command; see :class:`Drone`."""
-        return self._core.command(Hover())
+        return self._commands.command(Hover())
 
     def idle(self) -> bool:
         """Ask for nothing: keep the authority and leave the vehicle as it is."""
-        return self._core.command(Idle())
+        return self._commands.command(Idle())
 
     @by_name
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
@@ -359,10 +382,10 @@ class Drone:
         Returns:
             Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
         """
-        if not all_finite(forward, left, up, yaw_rate):
+        if not _all_finite(forward, left, up, yaw_rate):
             forward, left = number("forward", forward), number("left", left)
             up, yaw_rate = number("up", up), number("yaw_rate", yaw_rate)
-        return self._core.command(Velocity(forward, left, up, yaw_rate))
+        return self._commands.command(Velocity(forward, left, up, yaw_rate))
 
     @by_name
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
@@ -377,10 +400,10 @@ class Drone:
         Returns:
             Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
         """
-        if not all_finite(roll, pitch, climb, yaw_rate):
+        if not _all_finite(roll, pitch, climb, yaw_rate):
             roll, pitch = number("roll", roll), number("pitch", pitch)
             climb, yaw_rate = number("climb", climb), number("yaw_rate", yaw_rate)
-        return self._core.command(Attitude(roll, pitch, climb, yaw_rate))
+        return self._commands.command(Attitude(roll, pitch, climb, yaw_rate))
 
     @by_name
     def go_to(
@@ -492,14 +515,14 @@ class Drone:
             UnsupportedError: If the vehicle can't stop its motors, or takes no commands.
             ClosedError: If the drone was closed.
         """
-        return self._core.command(EmergencyStop())
+        return self._commands.command(EmergencyStop())
 
     def reset_emergency(self) -> bool:
         """Leave the emergency state, on the ground.
 
         One that is asked for while a stop of this application has not shown is sent once it has, within 2 s.
         """
-        return self._core.command(ResetEmergency())
+        return self._commands.command(ResetEmergency())
 
     def send_external_pose(
         self,
@@ -706,7 +729,7 @@ class Drone:
             ClosedError: If the drone was closed before.
         """
         channel = self._core.follow(lambda: self._core.channel(camera, **how))
-        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._core.sample_notifier())
+        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._state.scheduler.sample_notifier(self._core.connection))
         self._core.check_may_wait()
         max_age_s, deadline = how.get("max_age_s"), time.monotonic() + timeout_s
         with self._core.closing(mailbox), channel.into(mailbox):
@@ -914,7 +937,7 @@ class Drone:
         def find() -> StreamChannel:
             info = self._core.channel(camera).camera
             as_it_came = bool(info.stream) and kbit_s is None and max_fps is None and scale == 1.0
-            subscriber = "" if as_it_came or kbit_s is not None else f"{self._core.subscriber}-encoded"
+            subscriber = "" if as_it_came or kbit_s is not None else f"{self._state.video.subscriber}-encoded"
             return self._core.stream(info.name, kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
 
         stream, chain = self._core.follow(find), Chain()

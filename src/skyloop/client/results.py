@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import threading
 import time
@@ -337,17 +336,6 @@ def checked_name(processor: str) -> str:
     if not isinstance(processor, str) or not re.fullmatch(PROCESSOR_NAME, processor):
         raise UsageError(f"the name of a processor has 1 to 64 letters, digits and any of _ . -, not {processor!r:.80}")
     return processor
-
-
-def checked_age(max_age_s: float | None) -> float | None:
-    """Return ``max_age_s`` if it can be a limit of age [s].
-
-    Raises:
-        UsageError: If it is no number, NaN or negative.
-    """
-    if max_age_s is not None and (not isinstance(max_age_s, int | float) or math.isnan(max_age_s) or max_age_s < 0):
-        raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds")
-    return max_age_s
 
 
 def silence(processor: str, timeout_s: float, expired: int) -> str:

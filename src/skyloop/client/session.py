@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from skyloop.client.frame import size_error
 from skyloop.client.monitoring import LinkMonitor, Offset, OffsetEstimator, StallWatch, Thresholds
 from skyloop.clock import Clock, clock_identity, nanoseconds
 from skyloop.errors import DecodeError, LinkError, NoAnswerError
 from skyloop.messages import (
-    Annotation,
     AnyReply,
     AnyRequest,
-    Applied,
-    EncodedFrame,
-    Event,
     Feedback,
     FeedbackRequest,
     FrameHeader,
     LinkState,
-    LogEntry,
-    Overview,
     Ping,
     Pong,
-    ProcessorResult,
-    ProcessorShare,
     Reply,
     Request,
     Sample,
@@ -163,14 +155,8 @@ class ConnectionHandler(Protocol):
 
     def feedback(self, sample: Feedback, now_ns: int) -> None: ...
     def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
-    def event(self, event: Event, now_ns: int) -> None: ...
-    def applied(self, applied: Applied, now_ns: int) -> None: ...
-    def annotation(self, annotation: Annotation, now_ns: int) -> None: ...
-    def log_entry(self, entry: LogEntry, now_ns: int) -> None: ...
-    def encoded(self, picture: EncodedFrame, now_ns: int) -> None: ...
-    def result(self, result: ProcessorResult, now_ns: int) -> None: ...
-    def share(self, share: ProcessorShare, now_ns: int) -> None: ...
-    def overview(self, page: Overview, now_ns: int) -> None: ...
+    @property
+    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: called with the other kinds, and the time
 
 
 class ProxySession:
@@ -201,17 +187,7 @@ class ProxySession:
         self._pinged = False  # and not answered yet
         self._trips = OffsetEstimator()
         self._video_users: dict[str, set[str]] = {}  # topic of the transport: the topics that it serves
-        self._handlers: dict[type, Callable[..., None]] = {
-            Event: handler.event,
-            Applied: handler.applied,
-            Annotation: handler.annotation,
-            LogEntry: handler.log_entry,
-            EncodedFrame: handler.encoded,
-            ProcessorResult: handler.result,
-            ProcessorShare: handler.share,
-            Overview: handler.overview,
-            Reply: self._reply,
-        }
+        self._handlers = {**handler.samples, Reply: self._reply}
         self._take_feedback = handler.feedback
         self._feedback = PLAIN  # how feedback comes in this session
         self._only_plain = False  # the proxy sends no other form

@@ -16,19 +16,11 @@ from typing import Final, Literal, Self, TypeVar, Unpack, get_args
 import numpy as np
 
 from skyloop.child_process import interrupt_deferred
+from skyloop.client.actions import above_zero, checked, number, position_action, return_action
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import (
-    GivenUpError,
-    above_zero,
-    by_name,
-    cancelled,
-    checked,
-    number,
-    position_action,
-    return_action,
-)
+from skyloop.client.commands import GivenUpError, cancelled
 from skyloop.client.connect import ConnectOptions, connect, explains_moved_options, running_names
-from skyloop.client.drone import Drone
+from skyloop.client.drone import Drone, by_name
 from skyloop.client.monitoring import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
 from skyloop.errors import (
@@ -464,10 +456,9 @@ class Swarm:
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
-            action, core = actions[name], ready[name]._core
+            action, commands = actions[name], ready[name]._core.commands
             if type(action) is Hover:  # of all, which is no decision to take one from a safety pilot
-                automatic = type(core.commands.newest) is not Land
-                handed = core.command(action, automatic=automatic)
+                handed = commands.command(action, automatic=type(commands.newest) is not Land)
             else:
                 handed = ready[name].command(action)
             if handed:

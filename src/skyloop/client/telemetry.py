@@ -4,53 +4,47 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import reduce
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
 from skyloop.client.channels import Channel, FollowingChannel, Mailbox
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection, Scheduler
-from skyloop.client.feedback_demand import FeedbackChannel, FeedbackDemand
 from skyloop.client.frame import Arrival, FeedbackHistory, Frame
 from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.client.parameters import Restorer
 from skyloop.client.results import Result, ResultChannels, ResultMailbox
-from skyloop.client.video import StreamChannel, StreamDecoder, VideoChannel, usual
+from skyloop.client.video import VideoChannel, VideoChannels, forget_idle
 from skyloop.errors import UnknownNameError
 from skyloop.messages import (
     Annotation,
     Applied,
-    CameraInfo,
     EncodedFrame,
     Event,
     EventKind,
     Feedback,
     FeedbackRequest,
     FlightState,
-    FrameHeader,
     LinkState,
     LogEntry,
     Overview,
     ProcessorResult,
     ProcessorShare,
     Severity,
-    VideoRequest,
     Welcome,
 )
 from skyloop.messages.feedback import OverviewPages
-from skyloop.messages.subscription import PLAIN
-from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW, Pixels, stream
+from skyloop.messages.subscription import PLAIN, RateLimiter
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW
 
 RECENT_EVENTS: Final = 256
-IDLE_KEPT: Final = 32  #: so many channels of each kind are kept; beyond that those that nobody reads are forgotten
 #: What can be waited for: a flight state (or its name), one of several, or a predicate on feedback.
 Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
-K = TypeVar("K")
-C = TypeVar("C", bound=Channel[Any])
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,20 +120,81 @@ class Mailboxes:
         return video.current.picture(arrival)
 
 
+class FeedbackDemand:
+    """Subscribes to the form of feedback that all consumers of a drone need together.
+
+    A pilot is sent every sample whole: its link, its authority and a failsafe show in them. An observer is, too, until
+    a consumer asks for less, and whenever one asks for all. A connection has one form at a time.
+    """
+
+    def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
+        """Subscribe to every sample; where ``whole``, it stays so whatever consumers ask for."""
+        self._connection = connection
+        self._whole = whole
+        self._wanted: dict[FeedbackRequest, int] = {}  # how many consumers want each
+        self._kept: set[FeedbackRequest] = set()  # wanted for good
+        self._lock = threading.Lock()
+        self.request = PLAIN  #: what is subscribed to now
+        connection.subscribe(PLAIN.topic)
+
+    def want(self, request: FeedbackRequest, on: bool) -> None:
+        """Count a consumer of this request in, or out again."""
+        with self._lock:
+            count = self._wanted.get(request, 0) + (1 if on else -1)
+            if count > 0:
+                self._wanted[request] = count
+            else:
+                self._wanted.pop(request, None)
+            self._update()
+
+    def keep(self, request: FeedbackRequest) -> None:
+        """Want this for good."""
+        if not self._whole and request not in self._kept:
+            with self._lock:
+                self._kept.add(request)
+                self._update()
+
+    @contextmanager
+    def wanted(self, request: FeedbackRequest) -> Iterator[None]:
+        """Want this within the block."""
+        self.want(request, True)
+        try:
+            yield
+        finally:
+            self.want(request, False)
+
+    def _update(self) -> None:
+        """Change the subscription if another is needed. The lock is held."""
+        asked = [*self._wanted, *self._kept]
+        needed = PLAIN if self._whole or not asked else reduce(FeedbackRequest.union, asked)
+        before = self.request
+        if needed != before:
+            self.request = needed
+            self._connection.subscribe(needed.topic, True)  # first, so that none is missing in between
+            self._connection.subscribe(before.topic, False)
+
+
+class FeedbackChannel(Channel[Feedback]):
+    """Feedback for consumers that ask for fewer samples than the connection may be sent for others."""
+
+    def __init__(self, request: FeedbackRequest, demand: FeedbackDemand) -> None:
+        super().__init__(lambda on: demand.want(request, on))
+        self.request = request
+        self._rate = RateLimiter(request.max_hz)
+
+    def receive(self, sample: Feedback) -> None:
+        """Publish a sample if it is due; on the receiving thread."""
+        if self._consumers and self._rate.in_time(sample.published_ns):
+            self.publish(sample)
+
+
 class ClientState:
     """The newest state of a connected vehicle, and the channels that publish changes of it."""
 
     def __init__(
         self, name: str, connection: ProxyConnection, scheduler: Scheduler, *, whole_feedback: bool = True
     ) -> None:
-        """Make the state of a drone that has not connected yet.
-
-        Args:
-            name: Name of the application.
-            connection: Where topics are subscribed to.
-            scheduler: Source of the time and of waiting.
-            whole_feedback: Whether all feedback is received, even if all consumers ask for less.
-        """
+        """Make the state of a drone that has not connected yet; ``name`` is the application's."""
         self.scheduler = scheduler
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
@@ -149,9 +204,7 @@ class ClientState:
         self.notifier = scheduler.notifier()
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
-        self.channels: dict[str, VideoChannel] = {}  #: by camera, with the usual request
-        self.variants: dict[str, VideoChannel] = {}  #: all channels, by the topic of their request
-        self.streams: dict[str, StreamChannel] = {}  #: by topic
+        self.video = VideoChannels(connection, scheduler, self.history)
         self.counter = ChannelCounter()  #: of feedback
         self.echoes = ChannelCounter()
         self.demand = FeedbackDemand(connection, whole=whole_feedback)
@@ -172,40 +225,6 @@ class ClientState:
         self._connection = connection
         self._making = threading.RLock()  # a channel: two threads that ask for the same one get the same
 
-    def video(self, camera: CameraInfo, request: VideoRequest | None = None) -> VideoChannel:
-        """Return the channel of a camera's frames as requested, made on the first call.
-
-        Args:
-            camera: The camera.
-            request: How frames are wanted; None: see :func:`skyloop.client.video.usual`.
-        """
-        topic = (request or usual(camera.name)).topic
-        with self._making:
-            channel = self.variants.get(topic)
-            if channel is None:
-                _forget_idle(self.variants, keep=self.channels.values())
-                channel = VideoChannel(camera, self._connection, self.scheduler, self.history, request)
-                if channel.request.encoding == "h264":
-                    encoded, deliver = self.stream(channel.request), partial(channel.receive, as_asked=True)
-                    encoded.decoder = StreamDecoder(encoded, deliver, self._clock, f"skyloop-decode-{camera.name}")
-                self.variants[topic] = channel
-        return channel
-
-    def stream(self, request: VideoRequest) -> StreamChannel:
-        """Return the channel of an encoded stream, made on the first call.
-
-        Args:
-            request: With ``encoding="h264"``.
-        """
-        topic = request.stream_topic
-        with self._making:
-            channel = self.streams.get(topic)
-            if channel is None:
-                decoded = [one.request for one in self.variants.values() if one.request.encoding == "h264"]
-                _forget_idle(self.streams, keep={self.streams.get(one.stream_topic) for one in decoded})
-                channel = self.streams[topic] = StreamChannel(topic, self._connection, self._clock)
-        return channel
-
     def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
         """Return the channel of feedback as requested, made on the first call."""
         if request.is_plain:
@@ -213,7 +232,7 @@ class ClientState:
         with self._making:
             known = {channel.request: channel for channel in self.selected}
             if request not in known:
-                _forget_idle(known)
+                forget_idle(known)
                 known[request] = FeedbackChannel(request, self.demand)
                 self.selected = tuple(known.values())
         return known[request]
@@ -233,11 +252,7 @@ class ClientState:
         self.notifier.notify()
 
     def stats(self, sends: ChannelCounter) -> dict[str, ChannelStats]:
-        """Return the statistics of every channel by its name.
-
-        Args:
-            sends: Counts the commands that this application sent.
-        """
+        """Return the statistics of every channel by its name; ``sends`` counts the commands sent."""
         now_ns = self._clock()
         echoes = self.echoes.stats(now_ns)
         found = {
@@ -249,7 +264,7 @@ class ClientState:
                 malformed=self._connection.malformed,
             ),
         }
-        for channel in tuple(self.variants.values()):
+        for channel in tuple(self.video.variants.values()):
             found[channel.name] = channel.stats(now_ns)
         for results in self.results.all():
             found[results.name] = results.stats(now_ns)
@@ -258,7 +273,7 @@ class ClientState:
     def wake_all(self) -> None:
         """Wake every thread that waits, so that it checks its condition again."""
         self.notifier.notify()
-        for channel in tuple(self.variants.values()):
+        for channel in tuple(self.video.variants.values()):
             channel.notifier.notify()
         for results in self.results.all():
             results.notifier.notify()
@@ -268,13 +283,6 @@ class ClientState:
         self.status = status
         self.on_link.publish(status)
         self.notifier.notify()
-
-    def vehicle_reason(self) -> str:
-        """Return the reason that the newest event about the vehicle's link gives; empty if there is none."""
-        for event in reversed(self.recent):
-            if event.kind is EventKind.VEHICLE_LINK:
-                return str(event.data.get("reason", "")) or event.text
-        return ""
 
 
 class Receiver:
@@ -297,20 +305,26 @@ class Receiver:
         self._restorer = restorer
         self._clock = state.scheduler.clock
         self._overview_pages = OverviewPages()
+        self.frame = state.video.receive
+        self.samples: Mapping[type, Callable[[Any, int], None]] = {
+            Event: self._event,
+            Applied: self._applied,
+            EncodedFrame: state.video.receive_encoded,
+            ProcessorResult: state.results.receive,
+            Overview: self._overview,
+            Annotation: _publishing(state.on_annotation),
+            LogEntry: _publishing(state.on_log),
+            ProcessorShare: _publishing(state.on_share),
+        }
 
     def connected(self, welcome: Welcome) -> None:
         """Reset the counters, and take in the vehicle's capabilities; see :class:`ConnectionHandler`."""
         state = self._state
         state.welcome = welcome
-        now_ns = self._clock()
-        for channel in state.variants.values():
-            channel.restart(now_ns)
-        # The proxy may have been started again, with other cameras, of which another one is the first.
-        cameras = welcome.capabilities.cameras
-        state.channels = {one.name: state.channels.get(one.name) or state.video(one) for one in cameras}
+        state.video.connected(welcome.capabilities.cameras, self._clock())
         state.results.restart()
         self._restorer.connected(welcome.run_id)
-        self._commands.connected(welcome.app_id, welcome.run_id)
+        self._commands.connected(welcome.app_id, welcome.run_id, welcome.capabilities)
         state.on_welcome.publish(welcome)
 
     def disconnected(self, reason: str) -> None:  # noqa: ARG002  (link_changed publishes it)
@@ -333,10 +347,7 @@ class Receiver:
         Returns:
             When to call again at the latest [ns].
         """
-        flows = self._connection.state is LinkState.UP
-        for channel in tuple(self._state.variants.values()):
-            if channel.watch.stalled(flows, now_ns):
-                self._connection.resubscribe(channel.request.topic)
+        self._state.video.renew(self._connection.state is LinkState.UP, now_ns)
         return self._commands.tick(now_ns)
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:
@@ -368,30 +379,11 @@ class Receiver:
                 and (sample.link_reason, sample.link_remedy) != (state.status.reason, state.status.remedy)
             )
         ):
-            reason = sample.link_reason or ("" if awake else state.vehicle_reason())
+            reason = sample.link_reason or ("" if awake else _link_reason(state.recent))
             status = replace(state.status, vehicle=sample.vehicle_link, reason=reason, remedy=sample.link_remedy)
             state.set_status(status)
 
-    def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None:
-        """Deliver a frame to the channels that want it.
-
-        Args:
-            header: Describes the pixels.
-            pixels: Bytes of the frame, shape (size,), uint8.
-            now_ns: When it came, on this process's clock.
-            topic: The request that the proxy made it for; empty: a plain frame of the camera, for all its channels.
-        """
-        if topic:
-            channel = self._state.variants.get(topic)
-            if channel is not None:
-                channel.receive(header, pixels, now_ns, as_asked=True)
-            return
-        for channel in tuple(self._state.variants.values()):
-            mine = channel.subscribed and channel.camera.name == header.camera
-            if mine and channel.filter.wants(header.seq, header.captured_ns):
-                channel.receive(header, pixels, now_ns, as_asked=False)
-
-    def event(self, event: Event, now_ns: int) -> None:
+    def _event(self, event: Event, now_ns: int) -> None:
         """Keep and publish an event."""
         self._state.recent.append(event)
         if event.kind is EventKind.PARAMETER_CHANGED and event.data.get("app_id") != self._commands.app_id:
@@ -400,35 +392,13 @@ class Receiver:
         self._state.on_event.publish(event)
         self._state.notifier.notify()
 
-    def applied(self, applied: Applied, now_ns: int) -> None:
+    def _applied(self, applied: Applied, now_ns: int) -> None:
         """Publish the echo of a command, and measure the delay of this application's own."""
         if applied.app_id == self._commands.app_id:
             self._state.echoes.add(applied.applied_ns - applied.sent_ns, applied.sent_ns, now_ns)
         self._state.on_command.publish(applied)
 
-    def annotation(self, annotation: Annotation, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
-        """Publish an annotation."""
-        self._state.on_annotation.publish(annotation)
-
-    def log_entry(self, entry: LogEntry, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
-        """Publish an entry of an application's log."""
-        self._state.on_log.publish(entry)
-
-    def encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
-        """Publish a picture of an encoded stream."""
-        channel = self._state.streams.get(picture.topic or stream(picture.camera))
-        if channel is not None:
-            channel.receive(picture)
-
-    def result(self, result: ProcessorResult, now_ns: int) -> None:
-        """Publish the result of a processor."""
-        self._state.results.receive(result, now_ns)
-
-    def share(self, share: ProcessorShare, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
-        """Publish a worker's share of a processor's frames."""
-        self._state.on_share.publish(share)
-
-    def overview(self, page: Overview, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+    def _overview(self, page: Overview, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
         """Publish an overview whose pages have all come."""
         whole = self._overview_pages.add(page)
         if whole is not None:
@@ -437,13 +407,14 @@ class Receiver:
             self._state.notifier.notify()
 
 
-def _forget_idle(channels: dict[K, C], keep: Collection[C | None] = ()) -> None:
-    """Forget the oldest channels that nobody reads, where there are too many for one more."""
-    for name, channel in list(channels.items()):
-        if len(channels) < IDLE_KEPT:
-            return
-        if not channel.subscribed and channel not in keep:
-            del channels[name]
+def _link_reason(events: Sequence[Event]) -> str:
+    """Return the reason that the newest event about the vehicle's link gives; empty if there is none."""
+    found = (event for event in reversed(events) if event.kind is EventKind.VEHICLE_LINK)
+    return next((str(event.data.get("reason", "")) or event.text for event in found), "")
+
+
+def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
+    return lambda sample, _: channel.publish(sample)
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:

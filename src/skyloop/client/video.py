@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
+import secrets
 import threading
 from collections import deque
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, TypedDict
+from collections.abc import Callable, Collection, Iterable
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypedDict, Unpack
 
 import numpy as np
 
-from skyloop.client.channels import Channel
+from skyloop.client.channels import Channel, checked_age
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.frame import Arrival, FeedbackHistory, Frame, SmallArrival
 from skyloop.client.monitoring import ChannelCounter, ChannelStats, StallWatch
 from skyloop.clock import Clock
-from skyloop.errors import DecodeError
+from skyloop.errors import DecodeError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, EncodedFrame, FrameHeader, StreamReport, VideoRequest, encode
 from skyloop.messages.frame import H264, Chain, Pieces
-from skyloop.messages.subscription import FrameFilter, VideoEncoding
-from skyloop.pyav import new_decoder
-from skyloop.transport.base import Pixels, video
+from skyloop.messages.subscription import DEFAULT_QUALITY, FrameFilter, VideoEncoding
+from skyloop.pyav import new_decoder, require_pyav
+from skyloop.transport.base import Pixels, stream, video
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
 #: Pictures that may wait to be decoded. With more, decoding is too slow for what comes: they are left out up to a key.
 MOST_WAITING: Final = 6
+IDLE_KEPT: Final = 32  #: so many channels of each kind are kept; of more, those that nobody reads are forgotten
 ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key picture before it is asked for again
 _IDLE_S: Final = 2.0
 _PURPOSE: Final = "reading H.264"
@@ -36,9 +39,9 @@ class VideoOptions(TypedDict, total=False):
 
     encoding: VideoEncoding
     quality: int
-    max_fps: float
+    max_fps: float | None
     scale: float
-    part: tuple[int, int]
+    part: tuple[int, int] | None
     kbit_s: int
     max_age_s: float
 
@@ -46,6 +49,15 @@ class VideoOptions(TypedDict, total=False):
 def usual(camera: str) -> VideoRequest:
     """Return the request of a consumer that asks for nothing in particular: JPEG where frames travel over a network."""
     return VideoRequest(camera, encoding="jpeg")
+
+
+class StreamOptions(TypedDict, total=False):
+    """How H.264 is wanted; with none of these, as the vehicle itself encoded it."""
+
+    kbit_s: int | None  #: encoded by the proxy at this rate, once for all who ask for the same [kbit/s]
+    max_fps: float | None  #: most pictures a second; None: all
+    scale: float  #: factor for width and height, above 0 and up to 1
+    subscriber: str  #: encoded by the proxy for this subscriber alone, at the rate that the path to it carries
 
 
 class VideoChannel(Channel[Arrival]):
@@ -293,3 +305,144 @@ class StreamDecoder:
             return None
         pixels.flags.writeable = False
         return pixels
+
+
+class VideoChannels:
+    """The channels of all cameras and their streams. Asked for on any thread; video comes on the receiving one."""
+
+    def __init__(self, connection: ProxyConnection, scheduler: Scheduler, history: FeedbackHistory) -> None:
+        self.channels: dict[str, VideoChannel] = {}  #: by camera, with the usual request
+        self.variants: dict[str, VideoChannel] = {}  #: all channels, by the topic of their request
+        self.streams: dict[str, StreamChannel] = {}  #: by topic
+        self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
+        self._connection = connection
+        self._scheduler = scheduler
+        self._history = history
+        self._making = threading.RLock()  # a channel: two threads that ask for the same one get the same
+
+    def channel(
+        self,
+        camera: str | None = None,
+        *,
+        encoding: VideoEncoding | None = None,
+        quality: int | None = None,
+        max_fps: float | None = None,
+        scale: float = 1.0,
+        part: tuple[int, int] | None = None,
+        kbit_s: int | None = None,
+        max_age_s: float | None = None,
+    ) -> VideoChannel:
+        """Return the channel of a camera whose frames come as requested; see :meth:`skyloop.Drone.frames`.
+
+        Args:
+            camera: Name of the camera; None: the vehicle's first.
+            encoding: ``"jpeg"``, ``"h264"`` or ``"raw"``; None: ``"jpeg"``.
+            quality: Of JPEG, 1 to 100; None: 80.
+            max_fps: Most frames a second; None: all.
+            scale: Factor for width and height, above 0 and up to 1.
+            part: (k, n): only every n-th frame, from k; None: all.
+            kbit_s: Of H.264 [kbit/s]; None: what the path carries.
+            max_age_s: Only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
+
+        Raises:
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If the vehicle has no camera.
+            UsageError: If an option is out of range, or ``quality`` is given for other frames than JPEG.
+            MissingExtraError: If H.264 is asked for and PyAV is not installed.
+        """
+        checked_age(max_age_s)
+        channels = self.channels
+        if not channels:
+            raise UnsupportedError("this vehicle has no camera")
+        channel = next(iter(channels.values())) if camera is None else channels.get(camera)
+        if channel is None:
+            raise UnknownNameError("camera", str(camera), channels)
+        if encoding in ("raw", "h264") and quality is not None:
+            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is {encoding!r}')
+        if encoding == "h264":
+            require_pyav(_PURPOSE)
+        request = VideoRequest(
+            channel.camera.name,
+            encoding="jpeg" if encoding is None else encoding,
+            quality=DEFAULT_QUALITY if quality is None else quality,
+            max_fps=max_fps,
+            scale=scale,
+            part=part,
+            kbit_s=kbit_s,
+            subscriber=self.subscriber if encoding == "h264" and kbit_s is None else "",
+        )
+        return channel if request == channel.request else self.made(channel.camera, request)
+
+    def stream(self, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
+        """Return the channel of a camera's H.264; see :func:`skyloop.extend.stream_channel`."""
+        return self._made_stream(VideoRequest(self.channel(camera).camera.name, encoding="h264", **how))
+
+    def made(self, camera: CameraInfo, request: VideoRequest | None = None) -> VideoChannel:
+        """Return the channel of a camera's frames as requested (None: as :func:`usual`), made on the first call."""
+        topic = (request or usual(camera.name)).topic
+        with self._making:
+            channel = self.variants.get(topic)
+            if channel is None:
+                forget_idle(self.variants, keep=self.channels.values())
+                channel = VideoChannel(camera, self._connection, self._scheduler, self._history, request)
+                if channel.request.encoding == "h264":
+                    encoded, deliver = self._made_stream(channel.request), partial(channel.receive, as_asked=True)
+                    encoded.decoder = StreamDecoder(
+                        encoded, deliver, self._scheduler.clock, f"skyloop-decode-{camera.name}"
+                    )
+                self.variants[topic] = channel
+        return channel
+
+    def _made_stream(self, request: VideoRequest) -> StreamChannel:
+        """Return the channel of an encoded stream, made on the first call; ``request`` has ``encoding="h264"``."""
+        topic = request.stream_topic
+        with self._making:
+            channel = self.streams.get(topic)
+            if channel is None:
+                decoded = [one.request for one in self.variants.values() if one.request.encoding == "h264"]
+                forget_idle(self.streams, keep={self.streams.get(one.stream_topic) for one in decoded})
+                channel = self.streams[topic] = StreamChannel(topic, self._connection, self._scheduler.clock)
+        return channel
+
+    def connected(self, cameras: Iterable[CameraInfo], now_ns: int) -> None:
+        """Take in the cameras of a proxy that was connected, which may count its frames from 0."""
+        for channel in self.variants.values():
+            channel.restart(now_ns)
+        # The proxy may have been started again, with other cameras, of which another one is the first.
+        self.channels = {one.name: self.channels.get(one.name) or self.made(one) for one in cameras}
+
+    def renew(self, flows: bool, now_ns: int) -> None:
+        """Subscribe again to cameras that have stalled although other samples come (``flows``)."""
+        for channel in tuple(self.variants.values()):
+            if channel.watch.stalled(flows, now_ns):
+                self._connection.resubscribe(channel.request.topic)
+
+    def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None:
+        """Deliver a frame to the channels that want it.
+
+        ``topic`` is the request that the proxy made it for; empty: a plain frame of the camera, for all its channels.
+        """
+        if topic:
+            channel = self.variants.get(topic)
+            if channel is not None:
+                channel.receive(header, pixels, now_ns, as_asked=True)
+            return
+        for channel in tuple(self.variants.values()):
+            mine = channel.subscribed and channel.camera.name == header.camera
+            if mine and channel.filter.wants(header.seq, header.captured_ns):
+                channel.receive(header, pixels, now_ns, as_asked=False)
+
+    def receive_encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (all samples come like this)
+        """Deliver a picture of an encoded stream."""
+        channel = self.streams.get(picture.topic or stream(picture.camera))
+        if channel is not None:
+            channel.receive(picture)
+
+
+def forget_idle(channels: dict[Any, Any], keep: Collection[Channel[Any] | None] = ()) -> None:
+    """Forget the oldest channels that nobody reads, where there are too many for one more."""
+    for name, channel in list(channels.items()):
+        if len(channels) < IDLE_KEPT:
+            return
+        if not channel.subscribed and channel not in keep:
+            del channels[name]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Self
 
 from skyloop.client import AuthorityStatus, Drone
-from skyloop.client.completion import OUTDONE, OVERRULED
+from skyloop.client.actions import OUTDONE, OVERRULED
 from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError
 from skyloop.extend import Known, commands, let_go, open_unasked

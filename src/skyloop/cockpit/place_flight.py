@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from skyloop.client.commands import position_action
-from skyloop.client.completion import ReturnWatch
+from skyloop.client.actions import ReturnWatch, position_action
 from skyloop.control.route_flight import save_photo
 from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto
 from skyloop.control.waypoint import Waypoint, lacking, reached

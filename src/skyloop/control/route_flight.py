@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from skyloop.client.completion import OVERRULED
+from skyloop.client.actions import OVERRULED
 from skyloop.clock import nanoseconds
 from skyloop.control.controller import Controller
 from skyloop.control.route import Route

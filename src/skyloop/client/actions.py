@@ -1,8 +1,9 @@
-"""Waits until an action is done: judged by what the proxy tells of its intent, and by feedback from after it."""
+"""Actions of an application: checks of what they are asked with, and the wait until one is done."""
 
 from __future__ import annotations
 
 import math
+import numbers
 import time
 from collections.abc import Callable
 from typing import Final
@@ -16,8 +17,10 @@ from skyloop.errors import (
     NoAnswerError,
     RefusedError,
     UnsupportedError,
+    UsageError,
 )
 from skyloop.messages import (
+    ACTION_NAMES,
     AnyAction,
     Fate,
     Feedback,
@@ -32,16 +35,159 @@ from skyloop.messages import (
     Takeoff,
 )
 from skyloop.messages.command import SET_POINTS
+from skyloop.messages.feedback import is_on_earth
 from skyloop.messages.geometry import wrap_angle
 
 AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
 #: Where the proxy does not tell: feedback received sooner after a command may be older than it.
 _STALE_NS: Final = 100_000_000
-_TO_PLACES: Final = (Position, ReturnToStart)
+_ACTIONS: Final = frozenset(ACTION_NAMES)
+_OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
 AGAIN_NS: Final = 500_000_000  #: between a take-off that is not possible yet and the next attempt
 _NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
 OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refused: it may be asked for again
 OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
+
+
+def checked(action: AnyAction) -> AnyAction:
+    """Return ``action`` if it can be commanded.
+
+    Raises:
+        UsageError: If it is no action, or has a number that is not finite or makes no sense.
+    """
+    if type(action) not in _ACTIONS:
+        raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
+    try:
+        finite, problem = action.finite, action.problem
+    except OverflowError:
+        raise UsageError(f"{action.name} has a number that is too large") from None
+    except TypeError as error:
+        raise UsageError(f"{action!r} has something that is no number: {error}") from None
+    if not finite:
+        raise UsageError(f"{action!r} has a number that is NaN or infinite")
+    if problem:
+        raise UsageError(f"{action.name}: {problem}")
+    return action
+
+
+def position_action(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
+    """Return the action that flies to a place.
+
+    Args:
+        x: East [m].
+        y: North [m].
+        z: Up [m].
+        yaw: Counter-clockwise from x [rad]; None: keep the present one.
+        speed: Greatest one [m/s]; None: as fast as the limits allow.
+
+    Raises:
+        UsageError: If something is no number, not finite, or makes no sense.
+    """
+    place = Position(
+        number("x", x),
+        number("y", y),
+        number("z", z),
+        None if yaw is None else number("yaw", yaw),
+        None if speed is None else number("speed", speed),
+    )
+    checked(place)
+    return place
+
+
+def return_action(height_m: object, land: object) -> ReturnToStart:
+    """Return the action that flies back to the start.
+
+    Args:
+        height_m: Above the start, at least, on the way [m]; None: the proxy's parameter.
+        land: Whether to land there; None: the proxy's parameter.
+
+    Raises:
+        UsageError: If something is no number or no bool, or makes no sense.
+    """
+    if not (land is None or isinstance(land, bool)):
+        raise UsageError(f"land is {land!r:.60} and must be True, False or None (as return.land says)")
+    back = ReturnToStart(None if height_m is None else number("height_m", height_m), land)
+    checked(back)
+    return back
+
+
+def in_world_axes(
+    local: tuple[object, object, object],
+    earth: tuple[object, object, object],
+    newest: Feedback | None,
+    age_s: float,
+) -> tuple[object, object, object]:
+    """Return x, y, z of a place that is given in either way.
+
+    Args:
+        local: x, y, z in world axes [m], or three times None.
+        earth: Latitude and longitude [°] and altitude above mean sea level [m], or three times None; None for the
+            altitude alone: the present height.
+        newest: The newest feedback.
+        age_s: Its age [s].
+
+    Raises:
+        UsageError: If both ways or neither are given, or something is no number or not on the earth.
+        RefusedError: If the vehicle's place on the earth is not known.
+    """
+    if all(one is None for one in earth):
+        if any(one is None for one in local):
+            raise UsageError("go_to needs x, y and z, or latitude_deg and longitude_deg with or without altitude_m")
+        return local
+    if any(one is not None for one in local):
+        raise UsageError("go_to takes x, y, z or latitude_deg, longitude_deg, altitude_m, not some of both")
+    latitude_deg, longitude_deg = number("latitude_deg", earth[0]), number("longitude_deg", earth[1])
+    if not is_on_earth(latitude_deg, longitude_deg):
+        raise UsageError(
+            f"latitude_deg is {latitude_deg:g} and longitude_deg {longitude_deg:g}: they must be within 89.9 and 180"
+        )
+    origin = None if newest is None else newest.origin
+    if newest is None or origin is None or newest.position_m is None or age_s > _OLD_PLACE_S:
+        raise RefusedError(
+            "position: the vehicle does not report its place on the earth (it needs a 3-D fix by satellites, and a "
+            "driver that passes it on): fly it by x, y, z",
+            code=Refusal.WRONG_STATE,
+        )
+    z = newest.position_m[2] if earth[2] is None else number("altitude_m", earth[2]) - origin.altitude_m
+    x, y, _ = origin.position_of(latitude_deg, longitude_deg, origin.altitude_m)
+    return x, y, z
+
+
+def above_zero(name: str, value: object) -> float:
+    """Return ``value`` as a finite float above zero.
+
+    Args:
+        name: Name of the argument, for the error.
+        value: What was given.
+
+    Raises:
+        UsageError: If it is no such number.
+    """
+    found = number(name, value)
+    if not found > 0.0:
+        raise UsageError(f"{name} is {found:g} and must be more than 0")
+    return found
+
+
+def number(name: str, value: object) -> float:
+    """Return ``value`` as a finite float.
+
+    Args:
+        name: Name of the argument, for the error.
+        value: What was given.
+
+    Raises:
+        UsageError: If it is no real number, or not finite.
+    """
+    if type(value) is not float and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
+        raise UsageError(f"{name} is {value!r:.60} and must be a number")
+    try:
+        number = float(value)
+    except OverflowError:
+        raise UsageError(f"{name} is too large for a number") from None
+    if not math.isfinite(number):
+        raise UsageError(f"{name} is {number} and must be finite")
+    return number
 
 
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
@@ -83,31 +229,28 @@ class ActionWait:
         self,
         action: AnyAction,
         is_done: Callable[[Feedback], bool],
-        ask: Callable[[AnyAction, bool], int],
-        closed: Callable[[], bool],
         commands: CommandSender,
         state: ClientState,
         connection: ProxyConnection,
+        *,
+        automatic: bool = False,
     ) -> None:
         """Send the action.
 
         Args:
             action: The action.
             is_done: Whether feedback that is newer than the action shows it.
-            ask: Sends it, now and where it is commanded again, under a new number, which it returns. Its second
-                argument: whether the library asks by itself, which takes no vehicle from others.
-            closed: Whether the drone was closed.
-            commands: Tells what became of an intent.
+            commands: Sends it, now and where it is commanded again, under a new number, and tells what became of it.
             state: Newest feedback.
             connection: State of the link.
+            automatic: The library asks by itself, which takes no vehicle from others, also at the end of the flight.
 
         Raises:
-            AuthorityError: As ``ask`` does.
+            SkyloopError: As :meth:`CommandSender.ask`.
         """
         self._action = action
         self._is_done = is_done
-        self._ask = ask
-        self._closed = closed
+        self._automatic = automatic
         self._commands = commands
         self._state = state
         self._connection = connection
@@ -119,7 +262,7 @@ class ActionWait:
         self._asked_ns = state.scheduler.clock()
         # The call may take the vehicle from the pilot who has it now, or when it can first be sent.
         self._others, self._may_be_sent = self._others_now, commands.may_ask
-        self._intent = ask(action, False)
+        self._intent = commands.ask(action, automatic=automatic)
 
     @property
     def outdone(self) -> bool:
@@ -174,7 +317,7 @@ class ActionWait:
     def _why_not(self) -> Exception | None:
         """Why waiting longer can't help; None if it can. Asks again for what may be possible then."""
         name = self._action.name
-        if self._closed():
+        if self._commands.why_closed or (self._commands.barred and not self._automatic):
             return ClosedError(f"this drone was closed while {name} was under way")
         if cancelled.get()():
             return GivenUpError()
@@ -236,7 +379,7 @@ class ActionWait:
 
     def _again(self, *, automatic: bool = True) -> None:
         self._asked_ns = self._state.scheduler.clock()
-        self._intent = self._ask(self._action, automatic)
+        self._intent = self._commands.ask(self._action, automatic=automatic or self._automatic)
 
     @property
     def _others_now(self) -> str | None:
