@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pictures import draw
 from PIL import Image
 
-from skyloop.gym.picture import look_at
+from skyloop.gym.envs import look_at
 from skyloop.messages import Annotation, Feedback, Text
 from skyloop.recording.layout import Channel
 from skyloop.recording.reader import Recording

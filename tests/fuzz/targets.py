@@ -141,8 +141,7 @@ def msp(data: bytes) -> None:
 def vrpn(data: bytes) -> None:
     """What a motion capture server sends by VRPN, or whoever pretends to be one; what comes out goes on as frames."""
     from skyloop.motion_capture.pose import plausible
-    from skyloop.motion_capture.vrpn import SensorSelection
-    from skyloop.motion_capture.vrpn_wire import Decoder
+    from skyloop.motion_capture.vrpn import Decoder, SensorSelection
 
     decoder, selection = Decoder(), SensorSelection(["Tracker"])
     with suppress(DecodeError):
