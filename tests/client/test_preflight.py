@@ -17,7 +17,7 @@ from skyloop.client.preflight import PreflightState, check_before_flight
 from skyloop.errors import ClosedError, NoAnswerError
 from skyloop.messages import CameraInfo, Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.checkup import MAX_TEXT, Diagnostic, decode_checkup, encode_checkup
-from skyloop.vehicles.ardrone.diagnostics import diagnose
+from skyloop.vehicles.ardrone.telemetry import diagnose
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.mavlink.autopilots import ArduCopterProfile, AutopilotProfile, Px4Profile
 from skyloop.vehicles.tello.telemetry import Health

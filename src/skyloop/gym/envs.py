@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
+from typing import Any, ClassVar, Final, Literal, get_args
 
 import gymnasium
 import numpy as np
@@ -20,6 +20,8 @@ from skyloop.gym.tasks import (
     MOTIONS,
     OBSERVATIONS,
     PERIOD_S,
+    Arena,
+    Floats,
     Following,
     Hovering,
     Infos,
@@ -27,15 +29,28 @@ from skyloop.gym.tasks import (
     Racing,
     Reaching,
 )
+from skyloop.sim.camera import look_at
 
-if TYPE_CHECKING:
-    from skyloop.gym.tasks import Arena
-
+#: Centre in the cell [m], normal (None: it faces the camera), radius [m].
+Rings = Iterable[tuple[Floats, Floats | None, float]]
 Observe = Literal["state", "pixels", "both"]
 #: What an observation is: numbers, a picture, or a dict of picture and motion.
 Seen = Observation | NDArray[np.uint8] | dict[str, NDArray[Any]]
 
 SIZES_PX: Final = (16, 512)  #: least and greatest edge of a picture
+SIZE: Final = (320, 240)
+ONBOARD_PX: Final = 64  #: edge of the pictures on board, if nothing else is asked for
+_FOCAL_PX: Final = 260.0
+_ONBOARD_FOCAL: Final = 40.0 / 64.0  # of the edge: 77° across
+_FROM: Final = np.array([-5.5, -3.0, 3.2])  #: where the onlooker stands, from the middle of the first cell's floor [m]
+_AT: Final = np.array([0.0, 0.0, 1.8])  #: and what it looks at
+_EYE_M: Final = np.array([0.12, 0.0, 0.0])  # in front of its own body
+_AHEAD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body from optical axes
+_RED: Final = (40, 40, 230)  # BGR
+_LATER: Final = (40, 160, 230)  # of what is to be reached after it
+_NEAREST_M: Final = 0.05
+_TURN: Final = np.linspace(0.0, 2.0 * np.pi, 25)
+_CIRCLE: Final = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)  # (25, 2)
 
 
 class _Observer:
@@ -249,25 +264,6 @@ class GatesVectorEnv(TaskVectorEnv):
     task = Racing
 
 
-Floats = NDArray[np.float64]
-#: Centre in the cell [m], normal (None: it faces the camera), radius [m].
-Rings = Iterable[tuple[Floats, Floats | None, float]]
-
-SIZE: Final = (320, 240)
-ONBOARD_PX: Final = 64  #: edge of the pictures on board, if nothing else is asked for
-_FOCAL_PX: Final = 260.0
-_ONBOARD_FOCAL: Final = 40.0 / 64.0  # of the edge: 77° across
-_FROM: Final = np.array([-5.5, -3.0, 3.2])  #: where the onlooker stands, from the middle of the first cell's floor [m]
-_AT: Final = np.array([0.0, 0.0, 1.8])  #: and what it looks at
-_EYE_M: Final = np.array([0.12, 0.0, 0.0])  # in front of its own body
-_AHEAD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body from optical axes
-_RED: Final = (40, 40, 230)  # BGR
-_LATER: Final = (40, 160, 230)  # of what is to be reached after it
-_NEAREST_M: Final = 0.05
-_TURN: Final = np.linspace(0.0, 2.0 * np.pi, 25)
-_CIRCLE: Final = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)  # (25, 2)
-
-
 class _View:
     """Draws one drone of an arena, and rings, without the other drones: they fly in one world only to save time.
 
@@ -343,11 +339,3 @@ def _circle(centre: Floats, normal: Floats, radius: float) -> Floats:
     a, b, c = aside.tolist()
     points: Floats = centre + radius * (_CIRCLE @ np.array([aside, [y * c - z * b, z * a - x * c, x * b - y * a]]))
     return points
-
-
-def look_at(eye: Floats, target: Floats) -> Floats:
-    """World from optical axes (x right, y down, z forward) of a camera that looks from one point at another."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward], axis=1)

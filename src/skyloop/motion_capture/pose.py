@@ -1,18 +1,23 @@
-"""Poses of bodies from a motion capture system, in Skyloop's axes."""
+"""Poses of bodies from a motion capture system in Skyloop's axes, and the calibration of their own. Pure.
+
+The calibration is the rotation between a tracked body's axes, as the system defines them, and the drone's. As MAVwork
+did it: the drone stands still for two seconds, the poses are averaged, and the calibration is refused when they are
+spread too much. At rest the drone's own roll and pitch show how it stands; its heading is taken from the way it is put
+down: nose along the world's x axis, or as given by ``heading``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from dataclasses import dataclass, replace
-from numpy.typing import NDArray
-from skyloop.errors import MissingExtraError
-from skyloop.errors import UsageError
-from skyloop.messages.geometry import quaternion_from_euler
-from typing import Final
-from typing import TYPE_CHECKING, Any
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
 import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.messages.geometry import quaternion_from_euler
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform, Rotation

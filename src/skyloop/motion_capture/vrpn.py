@@ -1,4 +1,29 @@
-"""VRPN as a source of frames: a TCP client that distinguishes the sensors of a tracker."""
+"""VRPN, the Virtual-Reality Peripheral Network, as a source of frames: its protocol, and a client over TCP.
+
+Server and client each send a cookie of 24 bytes that names the protocol's version. Everything from then on is a
+message: a header of 24 bytes, then the payload, padded to a multiple of 8 bytes. The length in the header counts the
+header and the payload without its padding. All numbers are big endian.
+
+======  =====  ====================================================================================
+offset  type   meaning
+======  =====  ====================================================================================
+0       u32    length
+4       u32    time of the report, seconds; then microseconds at 8
+12      i32    sender: number of a tracker, by the server's descriptions
+16      i32    type: number of a kind of message, by the server's descriptions; negative: of the protocol itself
+20      u32    sequence number, for sniffers only
+======  =====  ====================================================================================
+
+A description (type -1: of a sender, -2: of a type) has the number in the sender's place, and as payload the length of
+the name (u32, with the NUL at its end) and the name. A tracker's pose has the type that is described as
+``vrpn_Tracker Pos_Quat``, and as payload the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the
+quaternion x, y, z, w (7 doubles).
+
+A client that never sends a UDP port gets everything over TCP.
+
+Sources: ``Format_Of_Protocol.txt``, ``vrpn_Connection.C`` (``marshall_message``, ``check_vrpn_cookie``) and
+``vrpn_Tracker.C`` (``encode_to``) of https://github.com/vrpn/vrpn (Boost licence).
+"""
 
 from __future__ import annotations
 

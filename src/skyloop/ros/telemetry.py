@@ -14,12 +14,13 @@ from skyloop.ros.time import RosTime
 from skyloop.vehicles.ros2.wire.conversions import (
     VARIANCE,
     Quaternion,
+    Transform,
     body_velocity,
     covariance,
+    encode_transforms,
     quaternion_of,
     stamp_of,
 )
-from skyloop.vehicles.ros2.wire.tf_message import Transform, encode_transforms
 
 SLOW_NS: Final = 1_000_000_000  #: battery and place on the earth, once in so long
 _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)

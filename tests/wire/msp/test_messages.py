@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from skyloop.errors import DecodeError
 from skyloop.vehicles.msp.wire import curves
 from skyloop.vehicles.msp.wire import messages as msp
+from skyloop.vehicles.msp.wire.curves import explained, flag_names
 from skyloop.vehicles.msp.wire.messages import Sensor, Status
-from skyloop.vehicles.msp.wire.names import explained, flag_names
 
 #: What Betaflight 4.6.0's own simulation answered, at rest and not set up.
 STATUS_EX = bytes.fromhex("7d0000002300000000000000000400001d0403000000000004")

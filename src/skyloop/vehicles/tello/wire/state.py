@@ -1,8 +1,19 @@
-"""The Tello's state, ten texts a second, as typed values in the units that it comes in; what it does not know is None.
+"""The Ryze Tello's text protocol: commands, replies, state, video. Pure.
 
-Axes are those of aviation, x forward, y right, z down: positive pitch is nose up, positive roll right side down,
-positive yaw clockwise. That attitude and accelerations agree in this is seen in recorded strings: a Tello that sends a
-pitch of 8° sends 0.116 g along its x.
+From Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide".
+
+What SDK 3.0 (Tello Talent, and EDU with newer firmware) has besides is known from the commands that djitellopy sends.
+
+A reply does not say what it answers, and may come seconds late or twice. So a reply is taken for a command's only if it
+has the shape that this command's answers have.
+
+State comes ten times a second; what is not known is None. Axes are those of aviation, x forward, y right, z down:
+positive pitch is nose up, positive roll right side down, positive yaw clockwise. That attitude and accelerations agree
+in this is seen in recorded strings: a Tello that sends a pitch of 8° sends 0.116 g along its x.
+
+Video is H.264 in Annex B form, cut into pieces of 1460 bytes without any header. Nothing numbers the pieces. A piece
+that is shorter than the others ends a picture; one that begins with a start code begins the next. Of a picture whose
+piece was lost in the middle the only sign is that it does not decode.
 """
 
 from __future__ import annotations
@@ -10,11 +21,136 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from enum import Enum, StrEnum
 from typing import Final
 
+from skyloop.drivers.h264 import (
+    IDR,
+    PPS,
+    SLICE,
+    SPS,
+    START,
+    Sequence,
+    Slice,
+    missing_between,
+    parse_sequence,
+    parse_slice,
+)
+from skyloop.drivers.h264 import unit_type as type_of
+from skyloop.drivers.h264 import units as units_of
 from skyloop.errors import DecodeError
 
-LONGEST: Final = 1024
+PORT: Final = 8889  #: where the Tello takes commands; it answers to where a command came from
+STATE_PORT: Final = 8890  #: of the client, where state comes
+VIDEO_PORT: Final = 11111  #: of the client, where video comes
+HOST: Final = "192.168.10.1"  #: of a Tello that is its own access point
+SILENCE_S: Final = 15.0  #: without a command for so long the Tello lands by itself
+
+ENTER: Final = "command"  #: nothing works before it
+MAX_STICK: Final = 100
+#: What a stick of 100 comes to. Estimates: no guide says it, and people take ``rc`` for cm/s and degrees a second.
+FULL_SPEED_M_S: Final = 1.0
+FULL_CLIMB_M_S: Final = 1.0
+FULL_YAW_RATE_RAD_S: Final = 1.75
+MAX_COMMAND: Final = 256  #: no command and no reply of the SDK is nearly as long
+
+
+class Sdk(StrEnum):
+    """Versions of the protocol. Each knows what those before it know."""
+
+    V1_3 = "1.3"
+    V2_0 = "2.0"
+    V3_0 = "3.0"
+
+    def knows(self, other: Sdk) -> bool:
+        """Whether it is this one or newer."""
+        return self.value >= other.value
+
+
+@dataclass(frozen=True, slots=True)
+class Stick:
+    """``rc``: each from -100 to 100. Positive is right, forward, up, and clockwise seen from above."""
+
+    right: int = 0
+    forward: int = 0
+    up: int = 0
+    clockwise: int = 0
+
+    @property
+    def text(self) -> str:
+        return f"rc {self.right} {self.forward} {self.up} {self.clockwise}"
+
+
+LEVEL: Final = Stick()
+
+
+def ports(state: int, video: int) -> str:
+    """SDK 3.0: where state and video are to be sent."""
+    return f"port {state} {video}"
+
+
+def decoded(datagram: bytes) -> str | None:
+    """The text of a datagram without what surrounds it; None for what is no text of this protocol."""
+    if len(datagram) > MAX_COMMAND:
+        return None
+    try:
+        text = datagram.decode("ascii").strip("\r\n\0 ")
+    except UnicodeDecodeError:
+        return None
+    return text if text.isprintable() else None
+
+
+_ERROR: Final = re.compile(r"(error|unknown command|out of range|unactive|forced stop)", re.IGNORECASE)
+
+
+class Shape(Enum):
+    """What an answer that is no error looks like."""
+
+    OK = re.compile(r"ok\Z", re.IGNORECASE)
+    NUMBER = re.compile(r"-?\d+(\.\d+)?\Z")  #: ``battery?``, ``wifi?``, ``sdk?``, ``speed?``, ``baro?``
+    TIME = re.compile(r"\d+( ?s)?\Z")  #: ``time?``: a bare number, or with its unit
+    LENGTH = re.compile(r"-?\d+ ?(mm|dm|cm)\Z")  #: ``height?``, ``tof?``
+    TEMPERATURE = re.compile(r"-?\d+~-?\d+ ?C\Z")  #: ``temp?``
+    NAME = re.compile(r"(?=.*[A-Za-z])(?!ok\Z)[0-9A-Za-z]{4,32}\Z")  #: ``sn?``
+    FIELDS = re.compile(r"[a-z]+:-?[\d.]+;([a-z]+:-?[\d.]+;)*\Z")  #: ``attitude?``, ``acceleration?``
+
+
+#: What is answered otherwise than with "ok".
+READ: Final = {
+    "speed?": Shape.NUMBER,
+    "battery?": Shape.NUMBER,
+    "time?": Shape.TIME,
+    "height?": Shape.LENGTH,
+    "temp?": Shape.TEMPERATURE,
+    "attitude?": Shape.FIELDS,
+    "baro?": Shape.NUMBER,
+    "acceleration?": Shape.FIELDS,
+    "tof?": Shape.LENGTH,
+    "wifi?": Shape.NUMBER,
+    "sdk?": Shape.NUMBER,
+    "sn?": Shape.NAME,
+}
+
+
+def shape_of(command: str) -> Shape:
+    """Of a command's answer."""
+    return READ.get(command, Shape.OK)
+
+
+def is_error(reply: str) -> bool:
+    """Whether it reports that a command, whichever, was not executed."""
+    return _ERROR.match(reply) is not None
+
+
+def answers(reply: str, command: str) -> bool:
+    """Whether this reply can be this command's: an answer of its shape, or an error."""
+    if reply.lower().startswith("unknown command"):
+        named = reply.partition(":")[2].strip()
+        return named in ("", command)
+    return is_error(reply) or shape_of(command).value.match(reply) is not None
+
+
+MAX_STATE: Final = 1024
 FIELDS: Final = 64  #: more than any version has
 NO_DISTANCE_CM: Final = 6553  #: the distance sensor's "nothing measured"
 GROUND_CM: Final = 10  #: what the distance sensor reports on the ground, and the least that it can
@@ -59,8 +195,8 @@ def parse(datagram: bytes) -> State:
 
     A string that was cut off loses its last field, unless it ends with its semicolon.
     """
-    if len(datagram) > LONGEST:
-        raise DecodeError(f"a state string of {len(datagram)} bytes; the Tello's have less than {LONGEST}")
+    if len(datagram) > MAX_STATE:
+        raise DecodeError(f"a state string of {len(datagram)} bytes; the Tello's have less than {MAX_STATE}")
     try:
         text = datagram.decode("ascii")
     except UnicodeDecodeError:
@@ -123,3 +259,116 @@ def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector 
 def build(fields: list[tuple[str, str]]) -> bytes:
     """A state datagram with these fields, in their order, as a Tello ends it."""
     return ("".join(f"{name}:{value};" for name, value in fields) + "\r\n").encode("ascii")
+
+
+PIECE: Final = 1460  #: bytes of every datagram of a picture but its last
+MAX_PICTURE: Final = 1 << 19  #: bytes; real ones have a fiftieth of that
+_HEAD: Final = 256  # bytes in which parameter sets and the beginning of the first slice are looked for
+
+
+@dataclass(frozen=True, slots=True)
+class AccessUnit:
+    """One picture as it came."""
+
+    data: bytes
+    is_key: bool  #: decoding can begin here
+    arrived_ns: int  #: when its first piece came
+    after_gap: bool  #: a picture before it is known to be missing or damaged
+    whole: bool  #: nothing shows that a piece of its own is missing
+    number: int = 0  #: counts the pictures that came
+    width: int = 0  #: by the newest parameters [px]; 0 before the first
+    height: int = 0
+
+
+def pieces(picture: bytes) -> list[bytes]:
+    """A picture's datagrams."""
+    return [picture[at : at + PIECE] for at in range(0, len(picture), PIECE)]
+
+
+class Assembly:
+    """Pieces in the order of their coming to pictures. Never raises for what it is fed.
+
+    ``stray`` counts bytes that belong to no picture, ``missing`` the pictures that the numbers in the stream show to be
+    missing.
+    """
+
+    def __init__(self) -> None:
+        self.stray = 0
+        self.missing = 0
+        self._pieces: list[bytes] = []
+        self._size = 0
+        self._arrived_ns = 0
+        self._sequence: Sequence | None = None
+        self._before: Slice | None = None
+        self._gap = True  # since the last picture that was given out
+        self._count = 0
+
+    def feed(self, piece: bytes, now_ns: int) -> list[AccessUnit]:
+        """A datagram that came now; the pictures that are complete with it, at most two."""
+        found = []
+        begins = piece.startswith(START)
+        if begins and self._has_picture():
+            found += self._end(whole=False)  # its last piece was lost, unless it was as long as the others
+        if not begins and not self._pieces:
+            self.stray += len(piece)
+            self._gap = True
+            return found
+        if not self._pieces:
+            self._arrived_ns = now_ns
+        self._pieces.append(piece)
+        self._size += len(piece)
+        if self._size > MAX_PICTURE:
+            self._drop()
+        elif len(piece) < PIECE and self._has_picture():
+            found += self._end(whole=True)
+        return found
+
+    def _has_picture(self) -> bool:
+        """Whether a slice has come; parameter sets may come in datagrams of their own."""
+        if not self._pieces:
+            return False
+        return any(type_of(unit) in (SLICE, IDR) for unit in units_of(self._head()))
+
+    def _head(self) -> bytes:
+        head = b""
+        for piece in self._pieces:
+            head += piece[:_HEAD]
+            if len(piece) > _HEAD:
+                break
+        return head
+
+    def _drop(self) -> None:
+        self.stray += self._size
+        self._pieces, self._size, self._gap = [], 0, True
+
+    def _end(self, *, whole: bool) -> list[AccessUnit]:
+        head = units_of(self._head())
+        kinds = {type_of(unit) for unit in head}
+        gap = self._is_gap(head)
+        data = b"".join(self._pieces)
+        self._pieces, self._size = [], 0
+        is_key = IDR in kinds and {SPS, PPS} <= kinds
+        size = (0, 0) if self._sequence is None else (self._sequence.width, self._sequence.height)
+        made = AccessUnit(data, is_key, self._arrived_ns, self._gap or gap, whole, self._count, *size)
+        self._gap = False
+        self._count += 1
+        return [made]
+
+    def _is_gap(self, head: list[bytes]) -> bool:
+        """Whether the number of this picture does not follow that of the one before. Takes note of it."""
+        try:
+            for unit in head:
+                if type_of(unit) == SPS:
+                    self._sequence = parse_sequence(unit)
+            if self._sequence is None:
+                return False
+            now = parse_slice(next(unit for unit in head if type_of(unit) in (SLICE, IDR)), self._sequence)
+        except DecodeError:
+            self._before = None
+            return False
+        before, self._before = self._before, now
+        if now.is_key or before is None:
+            return False
+        skipped = missing_between(before, now, self._sequence)
+        self.missing += min(skipped, 1 << self._sequence.frame_number_bits - 1)
+        return skipped != 0 or not now.is_first
