@@ -31,7 +31,7 @@ from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser, av
 from skyloop.vehicles.emulation.video import OneCamera
 from skyloop.vehicles.tello.emulator.emulator import TelloPacker, automatic_kbps
 from skyloop.vehicles.tello.video import TelloVideo
-from skyloop.vehicles.tello.wire.state import Assembly, pieces
+from skyloop.vehicles.tello.wire import Assembly, pieces
 from tests.recordings import FIXTURES
 
 LOSSES: Final = (0.01, 0.05, 0.10)

@@ -21,7 +21,7 @@ from skyloop.vehicles.ardrone.telemetry import diagnose
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.mavlink.autopilots import ArduCopterProfile, AutopilotProfile, Px4Profile
 from skyloop.vehicles.tello.telemetry import Health
-from skyloop.vehicles.tello.wire.state import parse
+from skyloop.vehicles.tello.wire import parse
 
 GOOD = Feedback(
     captured_ns=1,

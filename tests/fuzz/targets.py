@@ -91,12 +91,12 @@ def ardrone(data: bytes) -> None:
 def tello(data: bytes) -> None:
     """What a Tello sends."""
     from skyloop.drivers import h264
-    from skyloop.vehicles.tello.wire import state
-    from skyloop.vehicles.tello.wire.state import Assembly
+    from skyloop.vehicles.tello import wire
+    from skyloop.vehicles.tello.wire import Assembly
 
     with suppress(DecodeError):
-        state.parse(data)
-    state.decoded(data)
+        wire.parse(data)
+    wire.decoded(data)
     with suppress(DecodeError):
         sequence = h264.parse_sequence(data[: len(data) // 2])
         h264.parse_slice(data[len(data) // 2 :], sequence)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from skyloop.errors import DecodeError
 from skyloop.messages import Encoding, Intrinsics
 from skyloop.messages.geometry import quaternion_from_euler, rotation_from_euler
-from skyloop.vehicles.ros2.wire.conversions import (
+from skyloop.vehicles.ros2.wire import (
     ENCODINGS,
     NOT_KNOWN,
     ClockMap,

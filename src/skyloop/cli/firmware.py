@@ -138,7 +138,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
     from skyloop.sim.render.planar import Quality, prepare
     from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
     from skyloop.vehicles.tello.emulator.emulator import FRONT
-    from skyloop.vehicles.tello.wire.state import PORT
+    from skyloop.vehicles.tello.wire import PORT
 
     prepare(FRONT, Quality(options.quality))  # so that its first picture comes at once when it is asked for
     host = SimHost(with_tellos(options), drones)

@@ -11,7 +11,7 @@ from skyloop.messages import CameraInfo, Feedback, LinkState
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.ros.names import Frames
 from skyloop.ros.time import RosTime
-from skyloop.vehicles.ros2.wire.conversions import (
+from skyloop.vehicles.ros2.wire import (
     VARIANCE,
     Quaternion,
     Transform,

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from skyloop.errors import UnsupportedError
-from skyloop.vehicles.ros2.wire.conversions import TYPE_HASH, TYPE_NAME
+from skyloop.vehicles.ros2.wire import TYPE_HASH, TYPE_NAME
 
 KNOWN_MAJOR: Final = "9"  #: of the package ros-rclpy whose structures these are
 _FAST_DDS: Final = b"rosidl_typesupport_fastrtps_c"

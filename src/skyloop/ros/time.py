@@ -6,7 +6,7 @@ import threading
 from typing import Any
 
 from skyloop.client import Drone
-from skyloop.vehicles.ros2.wire.conversions import ClockMap
+from skyloop.vehicles.ros2.wire import ClockMap
 
 
 class RosTime:

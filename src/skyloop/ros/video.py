@@ -13,7 +13,7 @@ from skyloop.messages import CameraInfo
 from skyloop.ros.names import Frames
 from skyloop.ros.time import RosTime
 from skyloop.vehicles.ros2.node import ros_name
-from skyloop.vehicles.ros2.wire.conversions import camera_model, stamp_of
+from skyloop.vehicles.ros2.wire import camera_model, stamp_of
 
 JPEG_QUALITY: Final = 90
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Final
 
 from skyloop.messages.checkup import Diagnostic
-from skyloop.vehicles.msp.wire.curves import (
+from skyloop.vehicles.msp.wire.firmwares import (
     ANGLE,
     ARM,
     MSP_OVERRIDE,

@@ -22,7 +22,7 @@ from skyloop.vehicles.msp.requests import Questions, Telemetry
 from skyloop.vehicles.msp.setpoints import PASSING, Phase, Report, SetpointController
 from skyloop.vehicles.msp.telemetry import MotionEstimate, Reported, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
-from skyloop.vehicles.msp.wire.curves import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
+from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, Sensor
 

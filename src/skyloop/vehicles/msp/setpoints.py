@@ -20,7 +20,7 @@ from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Id
 from skyloop.messages.geometry import clamped
 from skyloop.vehicles.msp.firmware import Setup
 from skyloop.vehicles.msp.telemetry import Motion
-from skyloop.vehicles.msp.wire.curves import ARM_SWITCH, Curve, explained, stick_for
+from skyloop.vehicles.msp.wire.firmwares import ARM_SWITCH, Curve, explained, stick_for
 
 GRAVITY_M_S2: Final = 9.80665
 LEVEL: Final = Attitude()

@@ -14,7 +14,7 @@ from skyloop.messages import AnyAction, Capabilities, Velocity
 from skyloop.vehicles.ros2.node import RosContext, require_rclpy, stay_on_this_machine
 from skyloop.vehicles.ros2.options import Options, options_of
 from skyloop.vehicles.ros2.protocol import PERIOD_S, RobotSession
-from skyloop.vehicles.ros2.wire.conversions import stamp_of
+from skyloop.vehicles.ros2.wire import stamp_of
 
 _MESSAGES = ("geometry_msgs.msg", "nav_msgs.msg", "sensor_msgs.msg", "std_srvs.srv")
 

@@ -31,7 +31,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.vehicles.ros2.options import Options
-from skyloop.vehicles.ros2.wire.conversions import (
+from skyloop.vehicles.ros2.wire import (
     euler_of,
     intrinsics_of,
     levelled_velocity,

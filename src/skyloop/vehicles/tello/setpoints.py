@@ -29,7 +29,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.geometry import clamped
 from skyloop.vehicles.tello.telemetry import FlightWatch
-from skyloop.vehicles.tello.wire.state import (
+from skyloop.vehicles.tello.wire import (
     FULL_CLIMB_M_S,
     FULL_SPEED_M_S,
     FULL_YAW_RATE_RAD_S,

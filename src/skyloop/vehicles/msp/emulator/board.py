@@ -18,7 +18,7 @@ from skyloop.sim.parameters import VehicleParameters
 from skyloop.vehicles.emulation.flight import FlightControl
 from skyloop.vehicles.emulation.vehicle import Vehicle
 from skyloop.vehicles.msp.wire import messages as msp
-from skyloop.vehicles.msp.wire.curves import (
+from skyloop.vehicles.msp.wire.firmwares import (
     ARM_SWITCH,
     BETAFLIGHT_FLAGS,
     AxisRates,

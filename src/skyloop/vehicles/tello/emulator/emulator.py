@@ -23,7 +23,7 @@ from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
 from skyloop.vehicles.emulation.video import OneCamera, Piece, VideoEncoding
 from skyloop.vehicles.tello.emulator.logic import TelloLogic
 from skyloop.vehicles.tello.emulator.telemetry import MOST
-from skyloop.vehicles.tello.wire.state import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, PORT, Sdk, pieces
+from skyloop.vehicles.tello.wire import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, PORT, Sdk, pieces
 
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera

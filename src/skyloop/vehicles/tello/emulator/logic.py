@@ -21,7 +21,7 @@ from skyloop.vehicles.emulation.vehicle import Vehicle
 from skyloop.vehicles.tello.emulator import telemetry
 from skyloop.vehicles.tello.emulator.manoeuvres import OK, Flipping, Going, Job, Landing, Rising, Turning
 from skyloop.vehicles.tello.emulator.telemetry import Sighting, seen
-from skyloop.vehicles.tello.wire.state import (
+from skyloop.vehicles.tello.wire import (
     ENTER,
     FULL_CLIMB_M_S,
     FULL_SPEED_M_S,

@@ -11,7 +11,7 @@ from skyloop.messages.geometry import turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.reports import VehicleTruth
-from skyloop.vehicles.tello.wire.state import GROUND_CM, NO_DISTANCE_CM, NO_PAD, NOWHERE_CM, Sdk, build
+from skyloop.vehicles.tello.wire import GROUND_CM, NO_DISTANCE_CM, NO_PAD, NOWHERE_CM, Sdk, build
 
 MOST: Final = 8
 LOWEST_M: Final = 0.3  #: between these heights a pad is recognised; estimates
