@@ -22,8 +22,8 @@ from skyloop.bench import Flight, Machine, Spread, rounds, spread
 from skyloop.drivers.live_frames import Coded
 from skyloop.errors import MissingExtraError
 from skyloop.sim.camera import FRONT_CAMERA
-from skyloop.vehicles.ardrone.emulator.uvlc import encode as encode_uvlc
 from skyloop.vehicles.ardrone.emulator.video import H264_360P
+from skyloop.vehicles.ardrone.emulator.video import encode as encode_uvlc
 from skyloop.vehicles.ardrone.video import PaveVideo
 from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.options import LAYOUTS

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from pictures import draw
 from PIL import Image
 
-from skyloop.gym.picture import look_at
 from skyloop.messages import Annotation, Feedback, Text
 from skyloop.recording.layout import Channel
 from skyloop.recording.reader import Recording
 from skyloop.sim import load_world
-from skyloop.sim.camera import CameraModel, CameraPose
+from skyloop.sim.camera import CameraModel, CameraPose, look_at
 from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState
 from skyloop.sim.world import TargetState, Vec3
 

@@ -13,7 +13,7 @@ import pytest
 
 from skyloop.errors import UsageError
 from skyloop.vehicles.msp.firmware import LONG_DELAY_S
-from skyloop.vehicles.sim.firmware import apart, betaflight
+from skyloop.vehicles.sim.firmware import betaflight, ports
 from skyloop.vehicles.sim.firmware.betaflight import LEAST_SPACING_S, SETTINGS, VARIABLE, Betaflight
 from skyloop.vehicles.sim.firmware.coupling import STOPPED
 from skyloop.vehicles.sim.firmware.ports import bound
@@ -82,7 +82,7 @@ def test_its_death_stops_the_rotors_and_it_is_started_again_as_it_is(rig: Rig) -
 
 
 def test_another_flies_in_a_network_of_its_own(rig: Rig, tmp_path: Path) -> None:
-    if not apart.is_possible():
+    if not ports.is_possible():
         pytest.skip("no network of one's own can be had here: it takes root or user namespaces")
     rig.answered()
     with flying(lambda on_event: Betaflight(on_event, folder=tmp_path / "other")) as other:
@@ -99,7 +99,7 @@ def test_another_flies_in_a_network_of_its_own(rig: Rig, tmp_path: Path) -> None
 
 
 def test_one_flies_where_there_is_one_network(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(apart, "is_possible", lambda: False)
+    monkeypatch.setattr(ports, "is_possible", lambda: False)
     rig.answered()
     with pytest.raises(UsageError, match="no ports are free for another Betaflight: 1 at most"):
         Betaflight(print).start()

@@ -19,7 +19,7 @@ from benchmarks.autopilots import compared, follow
 from skyloop.control import FIVE_GATES, FlyThroughGates
 from skyloop.errors import NoAnswerError, RefusedError
 from skyloop.messages import Failsafe, FlightState, LinkState
-from skyloop.vehicles.sim.firmware import apart
+from skyloop.vehicles.sim.firmware import ports
 from skyloop.vehicles.sim.firmware.betaflight import program_path
 from tests.autopilots.real_betaflight import real_betaflight
 from tests.processes.conftest import Process, eventually, proxy, sockets, start
@@ -158,7 +158,7 @@ def _lands_without_its_pilot(observer: skyloop.Drone, start: Callable[..., Proce
 
 
 def test_another_flies_in_a_network_of_its_own(start: Callable[..., Process], tmp_path: Path) -> None:
-    if not apart.is_possible():
+    if not ports.is_possible():
         pytest.skip("no network of one's own can be had here: it takes root or user namespaces")
     words = ("--world", "empty", "--option", "cameras=none", "--option", f"autopilot_folder={tmp_path}")
     several = start("-m", "skyloop", "sim", "--autopilot", "betaflight", "--drones", "2", *words)

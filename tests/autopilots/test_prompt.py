@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from skyloop.vehicles.sim.firmware.prompt import NICENESS, SLACK_NS, become_prompt
+from skyloop.vehicles.sim.firmware.keeper import NICENESS, SLACK_NS, become_prompt
 
 
 @pytest.fixture

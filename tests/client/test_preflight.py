@@ -16,11 +16,11 @@ from skyloop.client.preflight import PreflightState, check_before_flight, inspec
 from skyloop.errors import ClosedError, NoAnswerError
 from skyloop.messages import CameraInfo, Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.parameter import MAX_CHECKUP_TEXT, Diagnostic, decode_checkup, encode_checkup
-from skyloop.vehicles.ardrone.diagnostics import diagnose
+from skyloop.vehicles.ardrone.telemetry import diagnose
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.mavlink.autopilots import ArduCopterProfile, AutopilotProfile, Px4Profile
 from skyloop.vehicles.tello.telemetry import Health
-from skyloop.vehicles.tello.wire.state import parse
+from skyloop.vehicles.tello.wire import parse
 
 GOOD = Feedback(
     captured_ns=1,

@@ -16,10 +16,9 @@ from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.datagrams import Address
 from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
+from skyloop.vehicles.tello.emulator.emulator import LIMITS, TELLO
 from skyloop.vehicles.tello.emulator.logic import TelloLogic
-from skyloop.vehicles.tello.emulator.settings import LIMITS, TELLO
-from skyloop.vehicles.tello.wire.commands import Sdk
-from skyloop.vehicles.tello.wire.state import State, parse
+from skyloop.vehicles.tello.wire import Sdk, State, parse
 
 TICK_S: Final = 0.02
 PILOT: Final = ("10.0.0.2", 9000)

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from skyloop.messages import FlightState
 from skyloop.vehicles.ardrone.emulator.logic import LedAnimation, VideoSettings
 from skyloop.vehicles.ardrone.wire.at import to_bits
-from skyloop.vehicles.ardrone.wire.configuration import parse_dump
-from skyloop.vehicles.ardrone.wire.keys import VideoChannel, VideoCodec
+from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec, parse_dump
 from skyloop.vehicles.ardrone.wire.navdata import State
 from tests.emulators.rig import Bench
 

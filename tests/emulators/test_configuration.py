@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.vehicles.ardrone.emulator.configuration import MOST_CUSTOM, Configuration, Ids
-from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, parse_dump
-from skyloop.vehicles.ardrone.wire.keys import KEYS, Value, VideoCodec, keys_of
+from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, KEYS, Value, VideoCodec, keys_of, parse_dump
 
 MINE: Ids = ("0a0b0c0d", "11111111", "22222222")
 

@@ -21,8 +21,7 @@ from skyloop.messages import (
 )
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.vehicles.ardrone.emulator.configuration import Configuration
-from skyloop.vehicles.ardrone.emulator.flight import CALIBRATION_RATE_RAD_S
-from skyloop.vehicles.ardrone.emulator.setpoints import Progress, limits_of, set_point
+from skyloop.vehicles.ardrone.emulator.flight import CALIBRATION_RATE_RAD_S, Progress, limits_of, set_point
 from skyloop.vehicles.ardrone.wire.at import Pcmd, Ref
 from skyloop.vehicles.ardrone.wire.navdata import State
 from tests.emulators.rig import RESTING, Bench

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.vehicles.ardrone.emulator.sequence import CommandSequence
+from skyloop.vehicles.ardrone.emulator.logic import CommandSequence
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skyloop.messages import FlightState
 from skyloop.messages.geometry import wrap_angle
-from skyloop.vehicles.tello.wire.commands import SILENCE_S, Sdk
+from skyloop.vehicles.tello.wire import SILENCE_S, Sdk
 from tests.emulators.tello_rig import PILOT, Bench
 
 

@@ -16,8 +16,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.tello.emulator import Faults, TelloFirmware, with_tellos
 from skyloop.vehicles.tello.emulator.emulator import FULL_KBPS, LEAST_KBPS, automatic_kbps
-from skyloop.vehicles.tello.wire.state import parse
-from skyloop.vehicles.tello.wire.video import PIECE, AccessUnit, Assembly
+from skyloop.vehicles.tello.wire import PIECE, AccessUnit, Assembly, parse
 from tests.drivers.tello.addresses import Addresses
 
 pytest.importorskip("av")

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.transport.testing import wait_until
-from skyloop.vehicles.ardrone.emulator.clock import DroneClock
 from skyloop.vehicles.ardrone.emulator.logic import VideoSettings
 from skyloop.vehicles.ardrone.emulator.video import (
     BOTTOM_1,
@@ -23,12 +22,13 @@ from skyloop.vehicles.ardrone.emulator.video import (
     FORMATS,
     FRONT_1,
     FRONT_2,
+    DroneClock,
     PavePacker,
     UvlcPacker,
 )
 from skyloop.vehicles.ardrone.video import cameras_of
 from skyloop.vehicles.ardrone.wire import uvlc
-from skyloop.vehicles.ardrone.wire.keys import VideoChannel, VideoCodec
+from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame, PaveParser
 from skyloop.vehicles.emulation.encoders import GROUP, Encoder, as_the_drone_does, require_encoder
 from skyloop.vehicles.emulation.video import Piece, VideoEncoding, with_inset

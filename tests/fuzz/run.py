@@ -16,7 +16,7 @@ PACKAGES = {
     "tello": ["skyloop.vehicles.tello.wire"],
     "mavlink": ["skyloop.vehicles.mavlink.wire"],
     "msp": ["skyloop.vehicles.msp.wire"],
-    "vrpn": ["skyloop.motion_capture.vrpn_wire", "skyloop.motion_capture.vrpn"],
+    "vrpn": ["skyloop.motion_capture.vrpn", "skyloop.motion_capture.vrpn"],
     "recording": ["skyloop.recording", "mcap"],
     "files": ["skyloop.sim", "skyloop.calibration", "skyloop.zones", "skyloop.drivers.uri", "tomllib"],
     "page": ["skyloop.cockpit.commands"],

@@ -91,12 +91,12 @@ def ardrone(data: bytes) -> None:
 def tello(data: bytes) -> None:
     """What a Tello sends."""
     from skyloop.drivers import h264
-    from skyloop.vehicles.tello.wire import commands, state
-    from skyloop.vehicles.tello.wire.video import Assembly
+    from skyloop.vehicles.tello import wire
+    from skyloop.vehicles.tello.wire import Assembly
 
     with suppress(DecodeError):
-        state.parse(data)
-    commands.decoded(data)
+        wire.parse(data)
+    wire.decoded(data)
     with suppress(DecodeError):
         sequence = h264.parse_sequence(data[: len(data) // 2])
         h264.parse_slice(data[len(data) // 2 :], sequence)
@@ -141,8 +141,7 @@ def msp(data: bytes) -> None:
 def vrpn(data: bytes) -> None:
     """What a motion capture server sends by VRPN, or whoever pretends to be one; what comes out goes on as frames."""
     from skyloop.motion_capture.pose import plausible
-    from skyloop.motion_capture.vrpn import SensorSelection
-    from skyloop.motion_capture.vrpn_wire import Decoder
+    from skyloop.motion_capture.vrpn import Decoder, SensorSelection
 
     decoder, selection = Decoder(), SensorSelection(["Tracker"])
     with suppress(DecodeError):

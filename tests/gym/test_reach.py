@@ -25,8 +25,9 @@ from skyloop.gym import (
     ReachVectorEnv,
     register,
 )
-from skyloop.gym.picture import OnBoard, _circle, look_at
+from skyloop.gym.envs import OnBoard, _circle
 from skyloop.gym.tasks import FOLLOWED_M, GATES, NEAR_M
+from skyloop.sim.camera import look_at
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "learn_to_reach.py"
 

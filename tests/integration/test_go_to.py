@@ -22,7 +22,7 @@ from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.vehicles.mavlink.emulator.places import ORIGIN
+from skyloop.vehicles.mavlink.emulator.manoeuvres import ORIGIN
 from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
 from tests.client.scripted import WAIT_S
 from tests.drivers.tello.addresses import Addresses

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.motion_capture import BodyPose, TrackState, calibrate, parse_system
-from skyloop.motion_capture.calibration import mean_quaternion
-from skyloop.motion_capture.pose import Quaternion, Vector, matrix, multiply, plausible, z_up
+from skyloop.motion_capture.pose import Quaternion, Vector, matrix, mean_quaternion, multiply, plausible, z_up
 from skyloop.motion_capture.tracking import Track
 from skyloop.motion_capture.worker import LENGTH, RawFrame, read, write
 

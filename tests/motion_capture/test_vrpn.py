@@ -18,8 +18,7 @@ from skyloop.motion_capture import BodyPose, TrackEvent, TrackState, mocap, pars
 from skyloop.motion_capture import vrpn as client
 from skyloop.motion_capture.capture import MAX_UNKNOWN, MotionCapture
 from skyloop.motion_capture.source import ChildSource
-from skyloop.motion_capture.vrpn import SETTLE_S, SensorSelection, split_name
-from skyloop.motion_capture.vrpn_wire import COOKIE, TrackerPose
+from skyloop.motion_capture.vrpn import COOKIE, SETTLE_S, SensorSelection, TrackerPose, split_name
 from skyloop.motion_capture.worker import RawFrame
 from skyloop.transport.testing import wait_until
 from tests.motion_capture import vrpn as server

@@ -17,7 +17,7 @@ import threading
 import time
 from typing import Final
 
-from skyloop.motion_capture.vrpn_wire import (
+from skyloop.motion_capture.vrpn import (
     COOKIE,
     POS_QUAT,
     SENDER_DESCRIPTION,

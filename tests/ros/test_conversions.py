@@ -17,13 +17,15 @@ from hypothesis import strategies as st
 from skyloop.errors import DecodeError
 from skyloop.messages import Encoding, Intrinsics
 from skyloop.messages.geometry import quaternion_from_euler, rotation_from_euler
-from skyloop.vehicles.ros2.wire.conversions import (
+from skyloop.vehicles.ros2.wire import (
     ENCODINGS,
     NOT_KNOWN,
     ClockMap,
+    Transform,
     body_velocity,
     camera_model,
     covariance,
+    encode_transforms,
     euler_of,
     intrinsics_of,
     levelled_velocity,
@@ -33,7 +35,6 @@ from skyloop.vehicles.ros2.wire.conversions import (
     rotation_of,
     stamp_of,
 )
-from skyloop.vehicles.ros2.wire.tf_message import Transform, encode_transforms
 from skyloop.vision import unproject
 
 ANGLE = st.floats(-math.pi, math.pi)

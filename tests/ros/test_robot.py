@@ -18,8 +18,7 @@ from skyloop.messages import Encoding, FlightState, Hover, Idle, Land, LinkState
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.vehicles.ros2.driver import Ros2Driver
 from skyloop.vehicles.ros2.options import Options, options_of
-from skyloop.vehicles.ros2.protocol import ANSWER_S, RobotSession
-from skyloop.vehicles.ros2.telemetry import CaptureClock, battery_of, state_of
+from skyloop.vehicles.ros2.protocol import ANSWER_S, CaptureClock, RobotSession, battery_of, state_of
 
 SERVED = "ros2://robot?takeoff=takeoff&land=land&width=4&height=2"
 EPOCH_NS = 1_700_000_000 * 10**9

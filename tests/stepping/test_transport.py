@@ -10,8 +10,7 @@ import pytest
 
 from skyloop.errors import LinkError, UsageError
 from skyloop.messages import Encoding, FrameHeader
-from skyloop.stepping.executor import StepExecutor
-from skyloop.stepping.transport import SteppedServer
+from skyloop.stepping.transport import StepExecutor, SteppedServer
 from skyloop.transport.base import Peer, Pixels
 
 PIXELS = np.arange(12, dtype=np.uint8)

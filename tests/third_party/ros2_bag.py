@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import BatteryState, CameraInfo, CompressedImage, Image, Imu
 
 from skyloop.ros.names import tf_message_type
-from skyloop.vehicles.ros2.wire.tf_message import TYPE_HASH, TYPE_NAME
+from skyloop.vehicles.ros2.wire import TYPE_HASH, TYPE_NAME
 
 LASTING = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TOPICS = {  # type, and how many are waited for

@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.sim.firmware.ardupilot_json import (
+from skyloop.vehicles.sim.firmware.ardupilot import (
     MAX_PACKET,
     ServoPacket,
     SimulatedState,

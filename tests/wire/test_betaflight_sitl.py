@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.sim.firmware.betaflight_sitl import (
+from skyloop.vehicles.sim.firmware.betaflight import (
     FlightState,
     decode_motors,
     decode_state,

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.motion_capture.vrpn_wire import (
+from skyloop.motion_capture.vrpn import (
     COOKIE,
     COOKIE_SIZE,
     DISCONNECT,

@@ -120,7 +120,7 @@ def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: S
 def _racers(options: SimOptions, drones: int, serving: Serving) -> list[BetaflightFirmware]:
     from skyloop.sim.host import SimHost
     from skyloop.vehicles.msp.emulator import BetaflightFirmware, with_racers
-    from skyloop.vehicles.msp.emulator.settings import PORT
+    from skyloop.vehicles.msp.emulator.board import PORT
 
     if serving.faults.drop or serving.delay_s:
         raise UsageError(
@@ -137,8 +137,8 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
     from skyloop.sim.host import SimHost
     from skyloop.sim.render.planar import Quality, prepare
     from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
-    from skyloop.vehicles.tello.emulator.settings import FRONT
-    from skyloop.vehicles.tello.wire.commands import PORT
+    from skyloop.vehicles.tello.emulator.emulator import FRONT
+    from skyloop.vehicles.tello.wire import PORT
 
     prepare(FRONT, Quality(options.quality))  # so that its first picture comes at once when it is asked for
     host = SimHost(with_tellos(options), drones)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 
 from skyloop.motion_capture.address import SIM, VRPN, System, parse_system
-from skyloop.motion_capture.calibration import Calibration, calibrate
 from skyloop.motion_capture.capture import MotionCapture, Source, TrackEvent
-from skyloop.motion_capture.pose import BodyPose
-from skyloop.motion_capture.source import ChildSource
+from skyloop.motion_capture.pose import BodyPose, Calibration, calibrate
+from skyloop.motion_capture.source import ChildSource, TruthSource
 from skyloop.motion_capture.tracking import TrackState
-from skyloop.motion_capture.truth import TruthSource
 from skyloop.motion_capture.vrpn import VrpnSource
 from skyloop.motion_capture.worker import RawFrame
 

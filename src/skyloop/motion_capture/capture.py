@@ -17,8 +17,7 @@ from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageEr
 from skyloop.messages import Severity
 from skyloop.messages.relayed import MOCAP
 from skyloop.motion_capture.address import System
-from skyloop.motion_capture.calibration import REST_S, Calibration, calibrate
-from skyloop.motion_capture.pose import BodyPose, plausible, z_up
+from skyloop.motion_capture.pose import REST_S, BodyPose, Calibration, calibrate, plausible, z_up
 from skyloop.motion_capture.tracking import Track, TrackState
 from skyloop.motion_capture.worker import RawFrame
 

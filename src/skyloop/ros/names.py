@@ -21,8 +21,7 @@ from typing import Any, Final
 from skyloop.client import Drone
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.vehicles.ros2.node import ros_name
-from skyloop.vehicles.ros2.wire.conversions import ClockMap
-from skyloop.vehicles.ros2.wire.tf_message import TYPE_HASH, TYPE_NAME
+from skyloop.vehicles.ros2.wire import TYPE_HASH, TYPE_NAME, ClockMap
 
 KNOWN_MAJOR: Final = "9"  #: of the package ros-rclpy whose structures these are
 _FAST_DDS: Final = b"rosidl_typesupport_fastrtps_c"

@@ -12,7 +12,7 @@ from skyloop.client import Drone
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.messages import Event, EventKind, Parameter, ParameterType, Value
 from skyloop.ros.names import Frames, RosTime
-from skyloop.vehicles.ros2.wire.conversions import euler_of, nanoseconds_of
+from skyloop.vehicles.ros2.wire import euler_of, nanoseconds_of
 
 NEAR_M: Final = 0.2  #: of a goal without a tolerance
 WARN_AGAIN_S: Final = 5.0  #: between two warnings of one kind

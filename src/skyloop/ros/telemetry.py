@@ -14,16 +14,17 @@ from skyloop.messages import CameraInfo, Feedback, LinkState
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.ros.names import Frames, RosTime
 from skyloop.vehicles.ros2.node import ros_name
-from skyloop.vehicles.ros2.wire.conversions import (
+from skyloop.vehicles.ros2.wire import (
     VARIANCE,
     Quaternion,
+    Transform,
     body_velocity,
     camera_model,
     covariance,
+    encode_transforms,
     quaternion_of,
     stamp_of,
 )
-from skyloop.vehicles.ros2.wire.tf_message import Transform, encode_transforms
 
 SLOW_NS: Final = 1_000_000_000  #: battery and place on the earth, once in so long
 _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)

@@ -34,6 +34,14 @@ def looking_up(tilt_rad: float) -> Rotation9:
     return (0.0, s, c, -1.0, 0.0, 0.0, 0.0, -c, s)
 
 
+def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World from optical axes (x right, y down, z forward) of a camera that looks from one point at another."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
 @dataclass(frozen=True, slots=True)
 class CameraPose:
     """The pose of a camera in the world.

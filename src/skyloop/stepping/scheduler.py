@@ -13,7 +13,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import LinkState
 from skyloop.proxy.core.autopilot import PERIOD_S
 from skyloop.proxy.proxy import Proxy
-from skyloop.stepping.executor import StepExecutor
+from skyloop.stepping.transport import StepExecutor
 
 AFTER_NS: Final = 60 * NS_PER_S  #: after the recording's end, for a wait without a limit
 _TICK_NS: Final = nanoseconds(PERIOD_S)

@@ -10,7 +10,7 @@ import os
 import socket
 from pathlib import Path
 
-from skyloop.vehicles.sim.firmware.ardupilot_json import ServoPacket, encode_servos
+from skyloop.vehicles.sim.firmware.ardupilot import ServoPacket, encode_servos
 
 parser = argparse.ArgumentParser()
 for option in ("model", "instance", "sim-port-out", "serial0", "sysid", "home", "defaults"):

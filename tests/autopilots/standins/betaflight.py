@@ -13,7 +13,7 @@ from pathlib import Path
 
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
 from skyloop.vehicles.msp.wire.messages import Function
-from skyloop.vehicles.sim.firmware.betaflight_sitl import decode_state, encode_motors
+from skyloop.vehicles.sim.firmware.betaflight import decode_state, encode_motors
 
 API_VERSION = encode(Frame(Function.API_VERSION))
 

@@ -10,7 +10,7 @@ from skyloop.errors import DriverError, ParameterError, UsageError
 from skyloop.messages import Hover
 from skyloop.vehicles.ardrone.driver import ACTIONS, ArdroneDriver
 from skyloop.vehicles.ardrone.options import ArdroneOptions, options_of
-from skyloop.vehicles.ardrone.wire.ports import Ports
+from skyloop.vehicles.ardrone.wire.navdata import Ports
 
 
 def test_the_usual_address() -> None:

@@ -11,8 +11,7 @@ from skyloop.vehicles.ardrone.parameters import PREFIX, Commands, entries_of
 from skyloop.vehicles.ardrone.setpoints import SetpointController
 from skyloop.vehicles.ardrone.telemetry import _REASONS
 from skyloop.vehicles.ardrone.video import cameras_of
-from skyloop.vehicles.ardrone.wire.configuration import format_value
-from skyloop.vehicles.ardrone.wire.keys import keys_of
+from skyloop.vehicles.ardrone.wire.configuration import format_value, keys_of
 from tests.docs.pages import rows, section
 
 DRIVER = section("docs/ardrone.md", "## The driver")

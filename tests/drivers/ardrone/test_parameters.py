@@ -14,10 +14,8 @@ from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.proxy.parameters import check
 from skyloop.vehicles.ardrone.parameters import Commands, active_camera, entries_of, taken, written
 from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController
-from skyloop.vehicles.ardrone.wire.animations import FLIGHT_ANIMATIONS, LED_ANIMATIONS
 from skyloop.vehicles.ardrone.wire.at import AtMessage
-from skyloop.vehicles.ardrone.wire.configuration import format_value
-from skyloop.vehicles.ardrone.wire.keys import keys_of
+from skyloop.vehicles.ardrone.wire.configuration import FLIGHT_ANIMATIONS, LED_ANIMATIONS, format_value, keys_of
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, State
 
 DRONES = {version: {name: format_value(key.default) for name, key in keys_of(version).items()} for version in (1, 2)}

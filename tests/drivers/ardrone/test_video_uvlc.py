@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from skyloop.clock import ManualClock
 from skyloop.drivers.live_frames import Coded
 from skyloop.drivers.live_video import VideoEvent
-from skyloop.vehicles.ardrone.emulator.uvlc import encode
+from skyloop.vehicles.ardrone.emulator.video import encode
 from skyloop.vehicles.ardrone.video import WAKE, UvlcVideo
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, is_intra, is_p264
 from tests.drivers.ardrone.video_ports import HOST, PATIENCE_S, Viewer, digest, receiver_of

@@ -24,9 +24,8 @@ from skyloop.vehicles.mavlink.parameters import (
     with_limit,
     writable_parameter,
 )
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Message, to_field
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.parameter_values import to_field
 
 S = 1_000_000_000
 

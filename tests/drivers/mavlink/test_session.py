@@ -32,10 +32,9 @@ from skyloop.vehicles.mavlink.options import PoseMessage
 from skyloop.vehicles.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession, rank_of
 from skyloop.vehicles.mavlink.setpoints import STEP_NS, Goal
 from skyloop.vehicles.mavlink.telemetry import VehicleState
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message, chunks_of
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS
-from skyloop.vehicles.mavlink.wire.texts import chunks_of
 from tests.drivers.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
 from tests.recordings import recorded
 

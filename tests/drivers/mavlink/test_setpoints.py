@@ -23,9 +23,8 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.vehicles.mavlink.wire.axes import angles_of, from_wire
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Message, chunks_of
 from skyloop.vehicles.mavlink.wire.modes import Landed
-from skyloop.vehicles.mavlink.wire.texts import chunks_of
 from tests.drivers.mavlink.scripted import ARDUPILOT, PX4, Bench, Vehicle
 
 ARM, MODE, TAKEOFF = 400, 176, 22

@@ -22,8 +22,8 @@ from skyloop.errors import UsageError
 from skyloop.messages import EventKind
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink.driver import MavlinkDriver
-from skyloop.vehicles.mavlink.emulator import Kind, Ports, video
-from skyloop.vehicles.mavlink.emulator.video import TransportStream
+from skyloop.vehicles.mavlink.emulator import Kind, Ports, emulator
+from skyloop.vehicles.mavlink.emulator.emulator import TransportStream
 from tests.drivers.ardrone.video_ports import TcpPort
 from tests.drivers.mavlink.film import FPS, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
 from tests.drivers.mavlink.rtsp_server import HOST, RtspServer
@@ -289,7 +289,7 @@ def test_pictures_that_come_close_together_go_out_with_stamps_of_their_own() -> 
         listener.bind((HOST, 0))
         stream = TransportStream(HOST, listener.getsockname()[1])
         for number in range(12):  # FFmpeg refuses a second picture of one stamp
-            stream.pack(picture_of(number), video._SETTINGS, number * 20_000_000)
+            stream.pack(picture_of(number), emulator._SETTINGS, number * 20_000_000)
         stream.close()
         assert listener.recv(2048)[0] == 0x47
 

@@ -18,8 +18,7 @@ from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
-from skyloop.vehicles.msp.emulator.board import Board
-from skyloop.vehicles.msp.emulator.settings import RACER, BoardSettings
+from skyloop.vehicles.msp.emulator.board import RACER, Board, BoardSettings
 from skyloop.vehicles.msp.options import MspOptions, options_of
 from skyloop.vehicles.msp.protocol import MspSession
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode

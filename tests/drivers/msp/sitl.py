@@ -15,7 +15,7 @@ from typing import IO, Final
 from skyloop.vehicles.msp.wire.frames import Frame, encode
 from skyloop.vehicles.msp.wire.messages import Function
 from skyloop.vehicles.sim.firmware.betaflight import connected, program_path
-from skyloop.vehicles.sim.firmware.prompt import become_prompt
+from skyloop.vehicles.sim.firmware.keeper import become_prompt
 
 MSP_PORT: Final = 5761  # all its ports are constants
 _STATE, _MOTORS = 9003, 9002

@@ -15,13 +15,12 @@ from skyloop.errors import DriverError, ParameterError, UnknownNameError, UsageE
 from skyloop.messages import Attitude, EmergencyStop, FlightState, LinkState, ResetEmergency, Takeoff
 from skyloop.vehicles.msp.driver import MspDriver
 from skyloop.vehicles.msp.firmware import Setup, hindrances
-from skyloop.vehicles.msp.motion import MotionEstimate
 from skyloop.vehicles.msp.options import options_of
 from skyloop.vehicles.msp.parameters import DriverParameters
 from skyloop.vehicles.msp.protocol import MspSession
 from skyloop.vehicles.msp.requests import PATIENCE_NS, Questions, Telemetry
 from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
-from skyloop.vehicles.msp.telemetry import charge_left
+from skyloop.vehicles.msp.telemetry import MotionEstimate, charge_left
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import Function, Identity, ModeRange

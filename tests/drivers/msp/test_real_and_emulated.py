@@ -19,9 +19,9 @@ from skyloop.messages import Attitude, FlightState, LinkState, Takeoff
 from skyloop.vehicles.msp.driver import MspDriver
 from skyloop.vehicles.msp.emulator import BetaflightFirmware
 from skyloop.vehicles.msp.emulator.board import bit
+from skyloop.vehicles.msp.wire.firmwares import flag_names
 from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import Function, Status, channels, pack_channels
-from skyloop.vehicles.msp.wire.names import flag_names
 from tests.autopilots.real_betaflight import real_betaflight
 from tests.drivers.msp.rig import world
 from tests.drivers.msp.sitl import MSP_PORT, Sitl

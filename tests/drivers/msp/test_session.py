@@ -13,10 +13,9 @@ from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
 from skyloop.errors import DriverError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, Hover, Idle, LinkState, ResetEmergency
-from skyloop.vehicles.msp.emulator.board import bit
-from skyloop.vehicles.msp.emulator.settings import BoardSettings
-from skyloop.vehicles.msp.motion import Motion
+from skyloop.vehicles.msp.emulator.board import BoardSettings, bit
 from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
+from skyloop.vehicles.msp.telemetry import Motion
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
 from skyloop.vehicles.msp.wire.messages import FailsafeConfig, Function, ModeRange, OnLoss, channels
 from tests.drivers.msp.bench import TICK_S, Bench, options

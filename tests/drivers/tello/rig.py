@@ -9,7 +9,7 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.messages import AnyAction, Feedback, FlightState
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.protocol import TelloSession
-from skyloop.vehicles.tello.wire.commands import Sdk
+from skyloop.vehicles.tello.wire import Sdk
 from tests.emulators.tello_rig import PILOT, Bench
 
 STATE_TICKS = 5

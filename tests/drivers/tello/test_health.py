@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from skyloop.messages import Severity
 from skyloop.vehicles.tello.telemetry import PAD_LOST, Health
-from skyloop.vehicles.tello.wire.state import Pad, State
+from skyloop.vehicles.tello.wire import Pad, State
 
 
 def hot(celsius: float) -> State:

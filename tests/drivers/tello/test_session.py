@@ -23,7 +23,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.vehicles.tello.options import TelloOptions, VelocityAxes
-from skyloop.vehicles.tello.wire.commands import Sdk
+from skyloop.vehicles.tello.wire import Sdk
 from tests.drivers.tello.rig import Rig
 from tests.emulators.tello_rig import PILOT
 from tests.wire.tello.test_state import strings

@@ -8,7 +8,7 @@ from skyloop.clock import nanoseconds
 from skyloop.messages import FlightState
 from skyloop.vehicles.tello.options import VelocityAxes
 from skyloop.vehicles.tello.telemetry import FlightWatch, height_m, velocity_m_s
-from skyloop.vehicles.tello.wire.state import State
+from skyloop.vehicles.tello.wire import State
 
 PERIOD_S = 0.1
 

@@ -13,12 +13,11 @@ from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
 from skyloop.vehicles.mavlink.emulator import Kind
 from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
-from skyloop.vehicles.mavlink.emulator.places import geodetic
+from skyloop.vehicles.mavlink.emulator.links import Streams
+from skyloop.vehicles.mavlink.emulator.manoeuvres import geodetic
 from skyloop.vehicles.mavlink.emulator.px4 import Px4
-from skyloop.vehicles.mavlink.emulator.streams import Streams
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import Codec, Message, Texts
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.texts import Texts
 
 TICK_STEPS = 4
 HOME_M = 488.0

@@ -9,7 +9,7 @@ import pytest
 
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
 from skyloop.vehicles.mavlink.emulator import Kind
-from skyloop.vehicles.mavlink.emulator.places import geodetic
+from skyloop.vehicles.mavlink.emulator.manoeuvres import geodetic
 from skyloop.vehicles.mavlink.wire.axes import to_wire
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m

@@ -17,7 +17,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import PATIENCE_S
 from skyloop.vehicles.emulation.loop import Loop
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.vehicles.mavlink.emulator.streams import Streams
+from skyloop.vehicles.mavlink.emulator.links import Streams
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.emulators.mavlink.rig import Rig
@@ -150,7 +150,7 @@ def test_drones_on_free_ports_share_none(kind: Kind, monkeypatch: pytest.MonkeyP
         def getsockname(self) -> tuple[str, int]:
             return "127.0.0.1", self.number
 
-    monkeypatch.setattr("skyloop.vehicles.mavlink.emulator.settings.socket.socket", Reused)
+    monkeypatch.setattr("skyloop.vehicles.mavlink.emulator.links.socket.socket", Reused)
     several = Ports.several(kind, 0, 5)
     numbers = [port for ports in several for port in (ports.udp, ports.remote, ports.tcp) if port is not None]
     assert len(several) == 5

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from skyloop.vehicles.mavlink.emulator import Kind
-from skyloop.vehicles.mavlink.emulator.places import geodetic, on_earth, place_of
+from skyloop.vehicles.mavlink.emulator.manoeuvres import geodetic, on_earth, place_of
 from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.emulators.mavlink.rig import HOME_M, Rig

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skyloop.messages import Attitude
-from skyloop.vehicles.mavlink.emulator.setpoints import attitude_target_of
+from skyloop.vehicles.mavlink.emulator.manoeuvres import attitude_target_of
 from skyloop.vehicles.mavlink.emulator.telemetry import MAKERS
 from skyloop.vehicles.mavlink.manoeuvres import AttitudeSetpoint
 from skyloop.vehicles.mavlink.wire.codec import dialect as m

@@ -9,8 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, format_dump, format_value, parse_dump, parse_value
-from skyloop.vehicles.ardrone.wire.keys import KEYS, Value
+from skyloop.vehicles.ardrone.wire.configuration import (
+    END_OF_DUMP,
+    KEYS,
+    Value,
+    format_dump,
+    format_value,
+    parse_dump,
+    parse_value,
+)
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False, width=32)
 

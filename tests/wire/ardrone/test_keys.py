@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.vehicles.ardrone.wire.configuration import format_value, parse_value
-from skyloop.vehicles.ardrone.wire.keys import (
+from skyloop.vehicles.ardrone.wire.configuration import (
     KEYS,
     NAVDATA_OPTIONS_USUAL,
     Category,
     Key,
     VideoChannel,
     VideoCodec,
+    format_value,
     keys_of,
+    parse_value,
 )
 from skyloop.vehicles.ardrone.wire.options import LAYOUTS, Demo, VisionDetect
 

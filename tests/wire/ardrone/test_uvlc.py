@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skyloop.errors import DecodeError
 from skyloop.vehicles.ardrone.wire.uvlc import MAX_PACKET, UvlcDecoder, UvlcPicture, is_p264
-from skyloop.vehicles.ardrone.wire.uvlc_tables import SIZES, PictureType
+from skyloop.vehicles.ardrone.wire.uvlc_codes import SIZES, PictureType
 from tests.wire.ardrone.uvlc_bits import (
     END,
     GREY,

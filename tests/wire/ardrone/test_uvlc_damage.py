@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.ardrone.emulator.uvlc import encode
+from skyloop.vehicles.ardrone.emulator.video import encode
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture
 from tests.wire.ardrone.test_uvlc_round_trip import noise, scenery
 from tests.wire.ardrone.uvlc_bits import START, aligned, packet

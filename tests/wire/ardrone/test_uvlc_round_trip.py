@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
-from skyloop.vehicles.ardrone.emulator.uvlc import MAX_DATAGRAM, encode
+from skyloop.vehicles.ardrone.emulator.video import MAX_DATAGRAM, encode
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture
-from skyloop.vehicles.ardrone.wire.uvlc_tables import SIZES
+from skyloop.vehicles.ardrone.wire.uvlc_codes import SIZES
 from tests.wire.ardrone.uvlc_bits import GREY, header, level, macroblock, packet, picture, run
 
 Picture = NDArray[np.uint8]

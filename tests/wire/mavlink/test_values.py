@@ -12,9 +12,16 @@ from hypothesis import strategies as st
 from skyloop.errors import DecodeError
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.vehicles.mavlink.wire import axes, modes
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
-from skyloop.vehicles.mavlink.wire.parameter_values import bounds, from_field, is_integer, to_field
-from skyloop.vehicles.mavlink.wire.texts import Texts, chunks_of
+from skyloop.vehicles.mavlink.wire.codec import (
+    Codec,
+    Message,
+    Texts,
+    bounds,
+    chunks_of,
+    from_field,
+    is_integer,
+    to_field,
+)
 
 INTEGERS = st.sampled_from([1, 2, 3, 4, 5, 6])
 ANGLES = st.floats(-3.1, 3.1)

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.msp.wire import curves
+from skyloop.vehicles.msp.wire import firmwares
 from skyloop.vehicles.msp.wire import messages as msp
+from skyloop.vehicles.msp.wire.firmwares import explained, flag_names
 from skyloop.vehicles.msp.wire.messages import Sensor, Status
-from skyloop.vehicles.msp.wire.names import explained, flag_names
 
 #: What Betaflight 4.6.0's own simulation answered, at rest and not set up.
 STATUS_EX = bytes.fromhex("7d0000002300000000000000000400001d0403000000000004")
@@ -123,7 +123,7 @@ READERS: list[Callable[[bytes], object]] = [
     msp.rx_map,
     msp.features,
     msp.angle_limit_deg,
-    curves.betaflight_rates,
+    firmwares.betaflight_rates,
 ]
 
 
@@ -137,13 +137,13 @@ def test_hostile_payloads(read: Callable[[bytes], object], payload: bytes) -> No
 
 
 def test_rates_of_a_real_one() -> None:
-    rates = curves.betaflight_rates(RC_TUNING)
+    rates = firmwares.betaflight_rates(RC_TUNING)
     assert rates.kind == "actual"
-    assert rates.yaw == curves.AxisRates(7, 0, 67)
-    curve = curves.rate_curve(rates.kind, rates.roll)
+    assert rates.yaw == firmwares.AxisRates(7, 0, 67)
+    curve = firmwares.rate_curve(rates.kind, rates.roll)
     assert curve(1.0) == pytest.approx(670.0)
     assert curve(0.5) == pytest.approx(185.0), "as Betaflight's rates tab plots it"
-    assert curves.betaflight_rates(curves.pack_betaflight_rates(rates)) == rates
+    assert firmwares.betaflight_rates(firmwares.pack_betaflight_rates(rates)) == rates
 
 
 kinds = st.sampled_from(["betaflight", "raceflight", "kiss", "actual", "quick", "unknown"])
@@ -151,15 +151,15 @@ kinds = st.sampled_from(["betaflight", "raceflight", "kiss", "actual", "quick", 
 
 @given(kinds, st.integers(1, 255), st.integers(0, 100), st.integers(0, 99), st.floats(-1.0, 1.0))
 def test_a_stick_is_found_for_every_rate(kind: str, centre: int, expo: int, most: int, share: float) -> None:
-    curve = curves.rate_curve(kind, curves.AxisRates(centre, expo, most))
+    curve = firmwares.rate_curve(kind, firmwares.AxisRates(centre, expo, most))
     wanted = share * curve(1.0)
-    stick = curves.stick_for(curve, wanted)
+    stick = firmwares.stick_for(curve, wanted)
     assert -1.0 <= stick <= 1.0
     reached = curve(abs(stick)) * (1 if stick >= 0 else -1)
     assert reached == pytest.approx(wanted, abs=max(0.5, abs(wanted) * 0.02))
 
 
 def test_a_full_stick_is_the_most() -> None:
-    assert curves.stick_for(curves.inav_curve(70, 30.0), 99.0) == 1.0
-    assert curves.stick_for(curves.inav_curve(70, 30.0), -99.0) == -1.0
-    assert curves.share_of(lambda _: 0.0)(0.3) == 0.3
+    assert firmwares.stick_for(firmwares.inav_curve(70, 30.0), 99.0) == 1.0
+    assert firmwares.stick_for(firmwares.inav_curve(70, 30.0), -99.0) == -1.0
+    assert firmwares.share_of(lambda _: 0.0)(0.3) == 0.3

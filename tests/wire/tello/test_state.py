@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.tello.wire.state import State, build, parse
+from skyloop.vehicles.tello.wire import State, build, parse
 from tests.recordings import recorded
 
 

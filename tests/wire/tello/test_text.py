@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.vehicles.tello.wire.commands import LEVEL, Sdk, Stick, decoded, ports
-from skyloop.vehicles.tello.wire.replies import READ, answers, is_error
+from skyloop.vehicles.tello.wire import LEVEL, READ, Sdk, Stick, answers, decoded, is_error, ports
 
 
 def test_commands_are_written_as_the_guide_has_them() -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skyloop.drivers.h264 import START, Slice, parse_sequence, parse_slice, units
 from skyloop.errors import DecodeError
-from skyloop.vehicles.tello.wire.video import MAX_PICTURE, PIECE, AccessUnit, Assembly, pieces
+from skyloop.vehicles.tello.wire import MAX_PICTURE, PIECE, AccessUnit, Assembly, pieces
 
 #: Of a real Tello.
 SPS = bytes.fromhex("674d402895a03c05b9")

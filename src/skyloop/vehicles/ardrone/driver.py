@@ -24,11 +24,11 @@ from skyloop.messages import (
 )
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.ardrone.configuration import own_ids
-from skyloop.vehicles.ardrone.diagnostics import diagnose
 from skyloop.vehicles.ardrone.link import ArdroneLink
 from skyloop.vehicles.ardrone.options import options_of
 from skyloop.vehicles.ardrone.parameters import Commands, Entry, active_camera, entries_of, taken, written
 from skyloop.vehicles.ardrone.protocol import ArdroneSession
+from skyloop.vehicles.ardrone.telemetry import diagnose
 from skyloop.vehicles.ardrone.video import EncodedStream, VideoReceiver, cameras_of, make_decoder
 
 ACTIONS: Final = frozenset({"idle", "takeoff", "hover", "land", "attitude", "emergency_stop", "reset_emergency"})

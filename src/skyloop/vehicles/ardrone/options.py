@@ -11,8 +11,8 @@ from skyloop.drivers.camera_options import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.vehicles.ardrone.telemetry import OPTION_TAGS
-from skyloop.vehicles.ardrone.wire import at, configuration, navdata, ports
-from skyloop.vehicles.ardrone.wire.ports import Ports
+from skyloop.vehicles.ardrone.wire import at, configuration, navdata
+from skyloop.vehicles.ardrone.wire.navdata import Ports
 
 MAX_RATE_HZ: Final = 200.0
 _Meaning = TypeVar("_Meaning")
@@ -31,7 +31,7 @@ class ArdroneOptions:
     """A parsed address."""
 
     host: str
-    ports: Ports = ports.STANDARD
+    ports: Ports = navdata.STANDARD
     version: int | None = None  #: of the drone; None: as its configuration says
     full: bool = False  #: navdata of 200 Hz with all options instead of the demo mode
     navdata_options: int | None = None  #: one bit for each tag; None: as the drone is configured
@@ -58,7 +58,7 @@ def options_of(uri: VehicleUri) -> ArdroneOptions:
         host=uri.place,
         ports=Ports(
             navdata=_port(uri, "navdata_port", navdata.PORT),
-            video=_port(uri, "video_port", ports.VIDEO),
+            video=_port(uri, "video_port", navdata.VIDEO),
             at=_port(uri, "at_port", at.PORT),
             control=_port(uri, "control_port", configuration.PORT),
         ),

@@ -13,10 +13,18 @@ import msgspec
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController
-from skyloop.vehicles.ardrone.wire.animations import FIRST_FLIP, FLIGHT_ANIMATIONS, LED_ANIMATIONS, NO_ANIMATION
 from skyloop.vehicles.ardrone.wire.at import AtMessage
-from skyloop.vehicles.ardrone.wire.configuration import format_value, parse_value
-from skyloop.vehicles.ardrone.wire.keys import KEYS, VideoChannel, VideoCodec
+from skyloop.vehicles.ardrone.wire.configuration import (
+    FIRST_FLIP,
+    FLIGHT_ANIMATIONS,
+    KEYS,
+    LED_ANIMATIONS,
+    NO_ANIMATION,
+    VideoChannel,
+    VideoCodec,
+    format_value,
+    parse_value,
+)
 
 # Keys of the configuration -------------------------------------------------------------------------------------------
 

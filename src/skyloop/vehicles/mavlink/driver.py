@@ -22,7 +22,7 @@ from skyloop.messages import (
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.mavlink.link import MavlinkLink
 from skyloop.vehicles.mavlink.microservices import pose_message
-from skyloop.vehicles.mavlink.options import options_of
+from skyloop.vehicles.mavlink.options import camera_info, camera_receiver, options_of, source
 from skyloop.vehicles.mavlink.parameters import (
     VehicleParameter,
     check_exact,
@@ -32,8 +32,7 @@ from skyloop.vehicles.mavlink.parameters import (
     writable_parameter,
 )
 from skyloop.vehicles.mavlink.protocol import MavlinkSession
-from skyloop.vehicles.mavlink.video import camera_info, camera_receiver, source
-from skyloop.vehicles.mavlink.wire.parameter_values import is_integer
+from skyloop.vehicles.mavlink.wire.codec import is_integer
 
 ACTIONS: Final = frozenset(
     {"idle", "takeoff", "hover", "land", "attitude", "velocity", "position", "emergency_stop", "reset_emergency"}

@@ -1,4 +1,4 @@
-"""Options of a ``mavlink://`` address. Pure. ``docs/mavlink.md`` has them as a table."""
+"""Options of a ``mavlink://`` address, and the camera that one names. Pure. ``docs/mavlink.md`` has them as a table."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from typing import Final
 
-from skyloop.drivers.base import reject_unknown_options
-from skyloop.drivers.camera_options import INTRINSICS_OPTIONS, check_intrinsics
+from skyloop.drivers.base import Sink, reject_unknown_options
+from skyloop.drivers.camera_options import INTRINSICS_OPTIONS, CameraSource, check_intrinsics, intrinsics_of, source_of
+from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.uri import VehicleUri, host_and_port
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.files import expand, read_bytes
+from skyloop.messages import CameraInfo
+from skyloop.messages.frame import H264
 
 Peer = tuple[str, int] | None  #: of UDP; a stream has no other
 
@@ -279,3 +283,45 @@ def limits_text(values: Mapping[str, float]) -> str:
         f"limits: {speed:g} m/s, {climb:g} m/s up and down, {altitude:g} m high; raise them by the parameters "
         "limits.speed, limits.climb and limits.altitude, or in the address (?speed=…&climb=…&altitude=…)"
     )
+
+
+def camera_info(uri: VehicleUri, options: CameraOptions) -> CameraInfo:
+    """Return the camera as it is announced before the first picture: from the network most send H.264."""
+    return CameraInfo(
+        options.name,
+        options.width,
+        options.height,
+        options.fps,
+        intrinsics=intrinsics_of(uri, options.width, options.height),
+        rotation=FACINGS[options.facing],
+        stream=H264 if options.stream and source(uri, options).scheme else "",
+    )
+
+
+def source(uri: VehicleUri, options: CameraOptions) -> CameraSource:
+    """Return where the camera's video comes from.
+
+    Raises:
+        UsageError: Its address is neither a stream's nor a device.
+    """
+    return source_of(options.source, f"{uri}: camera")
+
+
+def camera_receiver(uri: VehicleUri, options: CameraOptions, sink: Sink) -> LiveCamera:
+    """Return a receiver of the camera, not started.
+
+    Args:
+        uri: The vehicle's address, with the intrinsics.
+        options: Of the camera.
+        sink: The proxy's.
+    """
+    settings = LiveCameraSettings(
+        source(uri, options),
+        options.name,
+        options.width,
+        options.height,
+        options.fps,
+        stream=options.stream,
+        purpose="a camera beside the autopilot",
+    )
+    return LiveCamera(settings, sink, partial(intrinsics_of, uri))

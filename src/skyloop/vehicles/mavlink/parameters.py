@@ -13,9 +13,8 @@ from skyloop.clock import nanoseconds
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.vehicles.mavlink.options import OWN_LIMITS
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Message, bounds, from_field, is_integer, to_field
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.parameter_values import bounds, from_field, is_integer, to_field
 
 QUIET_NS: Final = nanoseconds(0.7)  #: after silence for so long, what is missing is asked for
 AT_ONCE: Final = 20  #: missing ones that are asked for together

@@ -14,9 +14,8 @@ from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.feedback import EarthOrigin
 from skyloop.messages.geometry import turned
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Message, Texts
 from skyloop.vehicles.mavlink.wire.modes import Landed, ModeFlag, SystemState
-from skyloop.vehicles.mavlink.wire.texts import Texts
 
 FLOWING_S: Final = 1.0  #: older than this, attitude, position and velocity are not known
 SLOW_S: Final = 6.0  #: the same for battery, GPS and the like

@@ -9,7 +9,17 @@ from itertools import pairwise
 from typing import Final
 
 from skyloop.messages.parameter import Diagnostic
-from skyloop.vehicles.msp.wire.curves import Curve, Rates, inav_curve, rate_curve, share_of
+from skyloop.vehicles.msp.wire.firmwares import (
+    ANGLE,
+    ARM,
+    MSP_OVERRIDE,
+    PREARM,
+    Curve,
+    Rates,
+    inav_curve,
+    rate_curve,
+    share_of,
+)
 from skyloop.vehicles.msp.wire.messages import (
     BETAFLIGHT,
     INAV,
@@ -22,7 +32,6 @@ from skyloop.vehicles.msp.wire.messages import (
     OnLoss,
     RxConfig,
 )
-from skyloop.vehicles.msp.wire.names import ANGLE, ARM, MSP_OVERRIDE, PREARM
 
 SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: channels beside the sticks that are always sent

@@ -12,7 +12,7 @@ from skyloop.errors import DecodeError
 from skyloop.vehicles.msp.firmware import Setup
 from skyloop.vehicles.msp.requests import Questions
 from skyloop.vehicles.msp.wire import messages as msp
-from skyloop.vehicles.msp.wire.curves import betaflight_rates
+from skyloop.vehicles.msp.wire.firmwares import betaflight_rates
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function
 
 _INAV_TUNING: Final = 7  # bytes of RC_TUNING up to the yaw rate

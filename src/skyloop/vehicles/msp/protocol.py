@@ -23,15 +23,14 @@ from skyloop.messages.feedback import WAKING_UP
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.msp.firmware import SUPPORTED, Setup, hindrances
 from skyloop.vehicles.msp.identification import Identification
-from skyloop.vehicles.msp.motion import MotionEstimate
 from skyloop.vehicles.msp.options import MspOptions
 from skyloop.vehicles.msp.requests import Questions, Telemetry
 from skyloop.vehicles.msp.setpoints import PASSING, Phase, Report, SetpointController
-from skyloop.vehicles.msp.telemetry import Reported, feedback_of
+from skyloop.vehicles.msp.telemetry import MotionEstimate, Reported, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
+from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, Sensor
-from skyloop.vehicles.msp.wire.names import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
 
 DEGRADED_NS: Final = nanoseconds(0.4)
 LOST_NS: Final = nanoseconds(1.0)

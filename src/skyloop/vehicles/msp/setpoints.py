@@ -19,9 +19,8 @@ from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Idle, ResetEmergency, Severity
 from skyloop.messages.geometry import clamped
 from skyloop.vehicles.msp.firmware import Setup
-from skyloop.vehicles.msp.motion import Motion
-from skyloop.vehicles.msp.wire.curves import Curve, stick_for
-from skyloop.vehicles.msp.wire.names import ARM_SWITCH, explained
+from skyloop.vehicles.msp.telemetry import Motion
+from skyloop.vehicles.msp.wire.firmwares import ARM_SWITCH, Curve, explained, stick_for
 
 GRAVITY_M_S2: Final = 9.80665
 LEVEL: Final = Attitude()

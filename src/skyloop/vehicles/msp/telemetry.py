@@ -1,13 +1,183 @@
-"""What a flight controller reports, in SI units and our axes. Pure."""
+"""What a flight controller reports, in SI units and our axes, and how it moves by whatever measures that. Pure.
+
+MSP has no velocity of its own but the barometer's climb, so poses from outside are differentiated.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Final
 
+from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.base import ExternalPose
 from skyloop.messages import Feedback, FlightState, Value
-from skyloop.vehicles.msp.motion import Motion
-from skyloop.vehicles.msp.wire.messages import Altitude, Attitude, Battery, CellVoltages, Status
+from skyloop.messages.feedback import EarthOrigin
+from skyloop.messages.geometry import wrap_angle
+from skyloop.vehicles.msp.wire.messages import Altitude, Attitude, Battery, CellVoltages, Gps, Status
+
+Vector = tuple[float, float, float]
+
+POSE_NS: Final = nanoseconds(0.25)  #: an older pose counts no more
+ALTITUDE_NS: Final = nanoseconds(0.5)
+GPS_NS: Final = nanoseconds(1.0)
+GAP_NS: Final = nanoseconds(0.4)  #: after a longer one the velocity begins anew
+SMOOTH_S: Final = 0.05  #: time constant of the velocity from poses
+LEAST_SATELLITES: Final = 5
+GROUND_SAMPLES: Final = 10  #: the height of the ground is averaged over about so many
+EARTH_RADIUS_M: Final = 6_371_000.0
+
+
+class VelocityFilter:
+    """Velocity from positions: a critically damped g-h filter (E. Brookner, "Tracking and Kalman Filtering", 1998)."""
+
+    def __init__(self) -> None:
+        self.velocity: Vector | None = None  #: None before the second position
+        self._place: Vector = (0.0, 0.0, 0.0)
+        self._at_ns: int | None = None
+
+    def update(self, place: Vector, at_ns: int) -> None:
+        """Take in a position [m], measured at a time [ns]; one that is not newer is left out."""
+        gap_ns = None if self._at_ns is None else at_ns - self._at_ns
+        if gap_ns is not None and gap_ns <= 0:
+            return
+        if gap_ns is None or gap_ns > GAP_NS:
+            self.velocity = None
+        elif self.velocity is None:
+            self.velocity = _scaled(_minus(place, self._place), 1 / seconds(gap_ns))
+        else:
+            step_s = seconds(gap_ns)
+            kept = math.exp(-step_s / SMOOTH_S)
+            residual = _minus(_minus(place, self._place), _scaled(self.velocity, step_s))
+            self.velocity = _plus(self.velocity, _scaled(residual, (1 - kept) ** 2 / step_s))
+            place = _minus(place, _scaled(residual, kept**2))
+        self._place, self._at_ns = place, at_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What is known now; None is not known. World axes east, north, up."""
+
+    climb_m_s: float | None = None
+    height_m: float | None = None  #: above where it stood last
+    velocity_m_s: Vector | None = None  #: in world axes
+    position_m: Vector | None = None
+    yaw_rad: float | None = None
+    precise: bool = False  #: whether height and climb come from poses and not from a barometer
+
+
+class MotionEstimate:
+    """Keeps the newest of each source. Poses from outside go before GPS and barometer."""
+
+    def __init__(self) -> None:
+        self._pose: ExternalPose | None = None
+        self._filter = VelocityFilter()
+        self._altitude: tuple[Altitude, int] | None = None
+        self._gps: tuple[Gps, int] | None = None
+        self._origin: Gps | None = None
+        self._heading_rad: float | None = None  # as yaw, counter-clockwise from east
+        self._turned_rad: float | None = None  # what poses' yaw differs from it
+        self._ground: dict[str, float] = {}  # height of each source where the vehicle stood last
+        self._stood = 0  # samples of it
+        self.satellites: int | None = None
+
+    @property
+    def origin(self) -> EarthOrigin | None:
+        """Where the world axes begin on the earth; None without GPS, or where poses define them."""
+        if self._origin is None or self._pose is not None:
+            return None
+        first = self._origin
+        return EarthOrigin(first.latitude_deg, first.longitude_deg, first.altitude_m, EARTH_RADIUS_M)
+
+    def on_pose(self, pose: ExternalPose) -> None:
+        """Take in a pose from outside."""
+        self._filter.update(pose.position_m, pose.captured_ns)
+        if self._pose is None or pose.captured_ns > self._pose.captured_ns:
+            self._pose = pose
+            if self._heading_rad is not None:
+                self._turned_rad = wrap_angle(_yaw(pose) - self._heading_rad)
+
+    def on_attitude(self, attitude: Attitude) -> None:
+        """Take in the flight controller's attitude."""
+        self._heading_rad = wrap_angle(math.pi / 2 - math.radians(attitude.heading_deg))
+
+    def on_altitude(self, altitude: Altitude, now_ns: int) -> None:
+        """Take in the flight controller's altitude."""
+        self._altitude = altitude, now_ns
+
+    def on_gps(self, gps: Gps, now_ns: int) -> None:
+        """Take in a fix of GPS, or that there is none."""
+        self.satellites = gps.satellites
+        if gps.fix and gps.satellites >= LEAST_SATELLITES:
+            self._gps = gps, now_ns
+            if self._origin is None:
+                self._origin = gps
+
+    def lost(self) -> None:
+        """Forget what the flight controller reported: it is no longer received."""
+        self._altitude = self._gps = None
+
+    def stands(self, *, does: bool) -> None:
+        """Learn the height of the ground while it stands: one sample may be wrong by more than shows a lift-off."""
+        self._stood = min(GROUND_SAMPLES, self._stood + 1) if does else 0
+        if does and self._pose is not None:
+            self._learn("pose", self._pose.position_m[2])
+        if does and self._altitude is not None:
+            self._learn("altitude", self._altitude[0].height_m)
+
+    def _learn(self, source: str, height_m: float) -> None:
+        before_m = self._ground.get(source, height_m)
+        self._ground[source] = before_m + (height_m - before_m) / self._stood
+
+    def at(self, now_ns: int) -> Motion:
+        """Return what is known now."""
+        yaw = self._heading_rad
+        if yaw is not None and self._turned_rad is not None:
+            yaw = wrap_angle(yaw + self._turned_rad)
+        pose = self._pose
+        velocity = self._filter.velocity
+        if pose is not None and velocity is not None and now_ns - pose.captured_ns <= POSE_NS:
+            return Motion(
+                climb_m_s=velocity[2],
+                height_m=pose.position_m[2] - self._ground.get("pose", 0.0),
+                velocity_m_s=velocity,
+                position_m=pose.position_m,
+                yaw_rad=_yaw(pose),
+                precise=True,
+            )
+        return self._by_itself(now_ns, yaw)
+
+    def _by_itself(self, now_ns: int, yaw: float | None) -> Motion:
+        climb = height = None
+        if self._altitude is not None and now_ns - self._altitude[1] <= ALTITUDE_NS:
+            climb = self._altitude[0].climb_m_s
+            height = self._altitude[0].height_m - self._ground.get("altitude", 0.0)
+        velocity = position = None
+        origin = self.origin
+        if self._gps is not None and origin is not None and now_ns - self._gps[1] <= GPS_NS:
+            gps = self._gps[0]
+            course = math.radians(gps.course_deg)
+            velocity = gps.speed_m_s * math.sin(course), gps.speed_m_s * math.cos(course), climb or 0.0
+            east, north, up = origin.position_of(gps.latitude_deg, gps.longitude_deg, gps.altitude_m)
+            position = east, north, up if height is None else height
+        return Motion(climb, height, velocity, position, yaw)
+
+
+def _yaw(pose: ExternalPose) -> float:
+    x, y, z, w = pose.quaternion
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _plus(one: Vector, other: Vector) -> Vector:
+    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
+
+
+def _minus(one: Vector, other: Vector) -> Vector:
+    return one[0] - other[0], one[1] - other[1], one[2] - other[2]
+
+
+def _scaled(vector: Vector, by: float) -> Vector:
+    return vector[0] * by, vector[1] * by, vector[2] * by
 
 
 @dataclass(slots=True)

@@ -1,15 +1,20 @@
-"""The driver of ``ros2://``: what the proxy calls."""
+"""The driver of ``ros2://``: what the proxy calls, and the robot's topics and services, by rclpy."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DriverError
-from skyloop.messages import AnyAction, Capabilities
-from skyloop.vehicles.ros2.link import PURPOSE, RobotLink
-from skyloop.vehicles.ros2.node import require_rclpy
-from skyloop.vehicles.ros2.options import options_of
-from skyloop.vehicles.ros2.protocol import RobotSession
+from skyloop.messages import AnyAction, Capabilities, Velocity
+from skyloop.vehicles.ros2.node import RosContext, require_rclpy, stay_on_this_machine
+from skyloop.vehicles.ros2.options import Options, options_of
+from skyloop.vehicles.ros2.protocol import PERIOD_S, RobotSession
+from skyloop.vehicles.ros2.wire import stamp_of
 
 _MESSAGES = ("geometry_msgs.msg", "nav_msgs.msg", "sensor_msgs.msg", "std_srvs.srv")
 
@@ -51,3 +56,126 @@ class Ros2Driver(Driver):
         if link is None:
             raise DriverError(f"{self.uri} is not open")
         return link.session
+
+
+PURPOSE: Final = "a robot of ROS 2"
+
+
+class RobotLink:
+    """A node that subscribes to what a robot publishes, and publishes its ``cmd_vel``.
+
+    Images are subscribed to while somebody wants them, or where nothing else would show that the robot is there.
+
+    Args:
+        options: Of the address.
+        sink: The proxy's.
+
+    Raises:
+        MissingExtraError: rclpy or a package of messages is not installed.
+    """
+
+    def __init__(self, options: Options, sink: Sink) -> None:
+        self._options = options
+        self._sink = sink
+        stay_on_this_machine()
+        self._context = RosContext(PURPOSE, options.domain)
+        try:
+            self._node = self._context.node("skyloop_driver")
+            self._open()
+        except BaseException:
+            self._context.close()
+            raise
+
+    def _open(self) -> None:
+        from geometry_msgs.msg import Twist, TwistStamped
+        from nav_msgs.msg import Odometry
+        from rclpy.clock import Clock, ClockType
+        from rclpy.qos import qos_profile_sensor_data
+        from sensor_msgs.msg import BatteryState, CameraInfo
+        from std_srvs.srv import Trigger
+
+        options, node, quality = self._options, self._node, qos_profile_sensor_data
+        self.session = session = RobotSession(options, self._sink, self, monotonic_ns, time.time_ns)
+        self._images: Any = None
+        self._twists: Any = None
+        if options.cmd_vel:
+            self._twists = node.create_publisher(TwistStamped if options.stamped else Twist, options.cmd_vel, 1)
+        self._clients = {name: node.create_client(Trigger, name) for name in (options.takeoff, options.land) if name}
+        for kind, topic, callback in (
+            (Odometry, options.odom, session.on_odometry),
+            (BatteryState, options.battery, session.on_battery),
+            (CameraInfo, options.info, session.on_info),
+        ):
+            if topic:
+                node.create_subscription(kind, topic, callback, quality)
+        self._update_images()
+        node.create_timer(PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._context.spin([node], "ros2-robot")
+
+    def close(self) -> None:
+        """Stop the robot's motion, then end the threads and the node."""
+        self.session.close()
+        self._context.close()
+
+    # What the session commands ---------------------------------------------------------------------------------------
+
+    def send(self, velocity: Velocity) -> None:
+        """Publish a velocity in body axes."""
+        from geometry_msgs.msg import Twist, TwistStamped
+
+        twist = Twist()
+        twist.linear.x, twist.linear.y, twist.linear.z = velocity.forward, velocity.left, velocity.up
+        twist.angular.z = velocity.yaw_rate
+        if not self._options.stamped:
+            self._twists.publish(twist)
+            return
+        message = TwistStamped(twist=twist)
+        message.header.stamp.sec, message.header.stamp.nanosec = stamp_of(time.time_ns())
+        message.header.frame_id = "base_link"
+        self._twists.publish(message)
+
+    def missing(self) -> str:
+        """Return a service that the address names and nobody offers; empty: there is none."""
+        return next((name for name, client in self._clients.items() if not client.service_is_ready()), "")
+
+    def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
+        """Call a ``std_srvs/Trigger``, without waiting for the answer.
+
+        Raises:
+            DriverError: Nobody offers it.
+        """
+        from std_srvs.srv import Trigger
+
+        client = self._clients[service]
+        if not client.service_is_ready():
+            raise DriverError(f"nobody offers the service {service}: is the robot's node running?")
+
+        def done(future: Any) -> None:
+            error = future.exception()
+            if error is not None:
+                answered(False, str(error))
+            elif not future.cancelled():
+                answered(bool(future.result().success), str(future.result().message))
+
+        client.call_async(Trigger.Request()).add_done_callback(done)
+
+    # Inside ----------------------------------------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        self.session.tick()
+        self._update_images()
+
+    def _update_images(self) -> None:
+        from rclpy.qos import qos_profile_sensor_data
+        from sensor_msgs.msg import CompressedImage, Image
+
+        options = self._options
+        wanted = bool(options.image) and (not options.odom or self._sink.wants(options.camera))
+        if wanted and self._images is None:
+            kind = CompressedImage if options.compressed else Image
+            self._images = self._node.create_subscription(
+                kind, options.image, self.session.on_image, qos_profile_sensor_data
+            )
+        elif not wanted and self._images is not None:
+            self._node.destroy_subscription(self._images)
+            self._images = None

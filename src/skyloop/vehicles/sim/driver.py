@@ -15,24 +15,28 @@ from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError
 from skyloop.messages import (
     AnyAction,
+    Attitude,
     Capabilities,
     EventKind,
+    FlightState,
     Hover,
     Land,
     LinkState,
     Parameter,
     Severity,
+    Takeoff,
     Value,
+    Velocity,
 )
 from skyloop.messages.parameter import Diagnostic
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.parameters import LIMIT_RANGES, Limits
-from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.sim.reports import Occurrence, OccurrenceKind, VehicleFeedback
+from skyloop.sim.simulation import Simulation
 from skyloop.sim.world import Wind, World
 from skyloop.vehicles.sim import parameters as table
 from skyloop.vehicles.sim.options import firmware_options, options_of
-from skyloop.vehicles.sim.setpoints import SetpointController
 from skyloop.vehicles.sim.telemetry import feedback_of
 
 if TYPE_CHECKING:
@@ -322,3 +326,63 @@ class SimDriver(Driver):
         sink = self._sink
         if sink is not None:
             sink.event(EventKind.DRIVER_ERROR, f"the simulation failed: {error!r}", Severity.ERROR, where="simulation")
+
+
+LIFT_M_S: Final = 0.05  #: a climb of more than this starts the motors
+DOWN_M: Final = 0.08  #: so low and still descending is landed
+
+
+class SetpointController:
+    """Starts the motors when a set-point climbs, and stops them on the ground when one descends.
+
+    The simulated firmware takes set-points in the air only, so its own take-off to the least height stands in between.
+
+    Args:
+        simulation: Flies the drone.
+        drone: Its number.
+    """
+
+    def __init__(self, simulation: Simulation, drone: int) -> None:
+        self._simulation = simulation
+        self._drone = drone
+        self._lock = threading.Lock()
+        self._setpoint: Attitude | Velocity | None = None
+
+    def command(self, action: AnyAction) -> AnyAction:
+        """Command the drone as :meth:`Simulation.command` does, but accept set-points in every state.
+
+        Returns:
+            What is applied.
+        """
+        with self._lock:
+            if not isinstance(action, Attitude | Velocity):
+                self._setpoint = None
+                return self._simulation.command(self._drone, action)
+            self._setpoint = action
+            applied = self._follow(self._simulation.state(self._drone), self._simulation.feedback(self._drone))
+        return action if applied is None else applied
+
+    def on_feedback(self, believed: VehicleFeedback) -> None:
+        """Apply the set-point in force to the state that the drone reports now."""
+        with self._lock:
+            if self._setpoint is not None:
+                self._follow(believed.state, believed)
+
+    def reported_state(self, state: FlightState) -> FlightState:
+        """Return the state that such a vehicle reports: it knows neither hovering nor taking off nor landing."""
+        return FlightState.FLYING if state.airborne else state
+
+    def _follow(self, state: FlightState, believed: VehicleFeedback) -> AnyAction | None:
+        setpoint = self._setpoint
+        assert setpoint is not None
+        climb = setpoint.climb if isinstance(setpoint, Attitude) else setpoint.up
+        if state in (FlightState.LANDED, FlightState.LANDING):
+            if climb > LIFT_M_S:
+                self._simulation.command(self._drone, Takeoff())
+            return None
+        if state is FlightState.TAKING_OFF:
+            return None
+        if climb < 0 and believed.altitude_m < DOWN_M:
+            self._simulation.command(self._drone, Land())
+            return None
+        return self._simulation.command(self._drone, setpoint)

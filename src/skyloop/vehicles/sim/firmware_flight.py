@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -30,11 +31,11 @@ from skyloop.messages import (
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.sim.parameters import InstrumentParameters
 from skyloop.sim.rotor_dynamics import rotors_of
 from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
-from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
 from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind
-from skyloop.vehicles.sim.firmware.registry import make_firmware
+from skyloop.vehicles.sim.options import AutopilotKind
 from skyloop.vehicles.sim.telemetry import native_of as truth_of
 from skyloop.vehicles.sim.telemetry import truth_at
 
@@ -283,3 +284,34 @@ class _InnerSink:
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
         self._sink.event(kind, text, severity, **data)
+
+
+def make_firmware(
+    kind: AutopilotKind,
+    on_event: Callable[[FirmwareEvent], None],
+    *,
+    instruments: InstrumentParameters,
+    folder: Path | None = None,
+) -> CoupledFirmware:
+    """Return a firmware that is not yet started.
+
+    Args:
+        kind: Which.
+        on_event: Called with each event, on the simulation's thread or one of the program; must return quickly.
+        instruments: Of the vehicle that it is to fly.
+        folder: Where it runs and keeps its settings; None: a new one, removed at the end.
+
+    Raises:
+        MissingExtraError: A package that it needs is not installed.
+    """
+    if kind is AutopilotKind.ARDUPILOT:
+        from skyloop.vehicles.sim.firmware.ardupilot import ArduCopter
+
+        return ArduCopter(on_event, folder=folder)
+    if kind is AutopilotKind.PX4:
+        from skyloop.vehicles.sim.firmware.px4 import Px4
+
+        return Px4(on_event, folder=folder, instruments=instruments)
+    from skyloop.vehicles.sim.firmware.betaflight import Betaflight
+
+    return Betaflight(on_event, folder=folder)

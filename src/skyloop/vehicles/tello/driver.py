@@ -19,7 +19,7 @@ from skyloop.vehicles.tello.options import options_of
 from skyloop.vehicles.tello.parameters import DroneSettings
 from skyloop.vehicles.tello.protocol import TelloSession
 from skyloop.vehicles.tello.video import TelloVideo, VideoStream, cameras_of, intrinsics_for
-from skyloop.vehicles.tello.wire.video import AccessUnit
+from skyloop.vehicles.tello.wire import AccessUnit
 
 ACTIONS: Final = frozenset(
     {"idle", "takeoff", "hover", "land", "velocity", "attitude", "emergency_stop", "reset_emergency"}

@@ -12,7 +12,7 @@ from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.camera_options import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.vehicles.tello.wire.commands import PORT, STATE_PORT, VIDEO_PORT
+from skyloop.vehicles.tello.wire import PORT, STATE_PORT, VIDEO_PORT
 
 _HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:@-]{1,15}\Z")

@@ -15,8 +15,7 @@ from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.vehicles.tello.link import TelloLink
 from skyloop.vehicles.tello.setpoints import Scale
 from skyloop.vehicles.tello.video import BOTTOM, FRONT
-from skyloop.vehicles.tello.wire.commands import Sdk
-from skyloop.vehicles.tello.wire.replies import is_error
+from skyloop.vehicles.tello.wire import Sdk, is_error
 
 NO_FLIP: Final = "none"
 FLIPS: Final = {"left": "l", "right": "r", "forward": "f", "back": "b"}

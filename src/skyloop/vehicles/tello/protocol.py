@@ -23,9 +23,7 @@ from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.setpoints import SetpointController
 from skyloop.vehicles.tello.telemetry import Health, feedback_of, native_of
-from skyloop.vehicles.tello.wire.commands import ENTER, Sdk, decoded, ports
-from skyloop.vehicles.tello.wire.replies import Shape, answers, is_error, shape_of
-from skyloop.vehicles.tello.wire.state import parse
+from skyloop.vehicles.tello.wire import ENTER, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
 
 PATIENCE_NS: Final = nanoseconds(0.3)  #: real ones answer within 29 ms, over a good link
 TRIES: Final = 3

@@ -29,15 +29,15 @@ from skyloop.messages import (
 )
 from skyloop.messages.geometry import clamped
 from skyloop.vehicles.tello.telemetry import FlightWatch
-from skyloop.vehicles.tello.wire.commands import (
+from skyloop.vehicles.tello.wire import (
     FULL_CLIMB_M_S,
     FULL_SPEED_M_S,
     FULL_YAW_RATE_RAD_S,
     LEVEL,
     MAX_STICK,
     Stick,
+    is_error,
 )
-from skyloop.vehicles.tello.wire.replies import is_error
 
 FULL_TILT_RAD: Final = 0.2  #: the attitude that is taken for a full stick: as much as an AR.Drone tilts indoors
 

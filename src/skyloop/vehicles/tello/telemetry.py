@@ -16,7 +16,7 @@ from skyloop.messages import Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.options import VelocityAxes
-from skyloop.vehicles.tello.wire.state import GROUND_CM, Pad, State, Vector
+from skyloop.vehicles.tello.wire import GROUND_CM, Pad, State, Vector
 
 # Feedback in SI ------------------------------------------------------------------------------------------------------
 

@@ -24,7 +24,7 @@ from skyloop.messages.frame import H264
 from skyloop.pyav import new_decoder, require_pyav
 from skyloop.vehicles.tello.link import receiving_socket
 from skyloop.vehicles.tello.options import TelloOptions
-from skyloop.vehicles.tello.wire.video import AccessUnit, Assembly
+from skyloop.vehicles.tello.wire import AccessUnit, Assembly
 
 if TYPE_CHECKING:
     import av

@@ -16,8 +16,7 @@ On free ports of this machine, for a test::
 """
 
 from skyloop.faults import Faults
-from skyloop.vehicles.ardrone.emulator.emulator import ArdroneFirmware
-from skyloop.vehicles.ardrone.emulator.settings import with_ardrones
-from skyloop.vehicles.ardrone.wire.ports import Ports
+from skyloop.vehicles.ardrone.emulator.emulator import ArdroneFirmware, with_ardrones
+from skyloop.vehicles.ardrone.wire.navdata import Ports
 
 __all__ = ["ArdroneFirmware", "Faults", "Ports", "with_ardrones"]

@@ -6,8 +6,18 @@ import re
 from typing import Final
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.ardrone.wire.configuration import DEFAULT_ID, END_OF_DUMP, format_dump, parse_value
-from skyloop.vehicles.ardrone.wire.keys import Category, Key, Value, VideoChannel, VideoCodec, keys_of
+from skyloop.vehicles.ardrone.wire.configuration import (
+    DEFAULT_ID,
+    END_OF_DUMP,
+    Category,
+    Key,
+    Value,
+    VideoChannel,
+    VideoCodec,
+    format_dump,
+    keys_of,
+    parse_value,
+)
 
 MOST_CUSTOM: Final = 16  #: sessions, users and applications each; the drone's own number is not known
 

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.host import Report, SimHost
-from skyloop.vehicles.ardrone.emulator.clock import DroneClock
-from skyloop.vehicles.ardrone.emulator.listeners import Listeners
+from skyloop.sim.options import SimOptions
+from skyloop.sim.vehicles import AR_DRONE
 from skyloop.vehicles.ardrone.emulator.logic import ArdroneLogic, VideoSettings
-from skyloop.vehicles.ardrone.emulator.settings import Settings
-from skyloop.vehicles.ardrone.emulator.streams import Outlet, StreamPort
+from skyloop.vehicles.ardrone.emulator.streams import Listeners, Outlet, StreamPort
 from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, tags_of
-from skyloop.vehicles.ardrone.emulator.video import CAMERAS, PavePacker, UvlcPacker
+from skyloop.vehicles.ardrone.emulator.video import CAMERAS, DroneClock, PavePacker, UvlcPacker
 from skyloop.vehicles.ardrone.wire import navdata
-from skyloop.vehicles.ardrone.wire.ports import STANDARD, Ports
+from skyloop.vehicles.ardrone.wire.navdata import STANDARD, Ports
 from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
 from skyloop.vehicles.emulation.encoders import require_encoder
@@ -27,6 +26,29 @@ from skyloop.vehicles.emulation.video import Packer, Piece, VideoEncoding
 
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera
+
+REPORTS_HZ: Final = 125.0  #: as often as a world that keeps time reports
+
+
+def with_ardrones(options: SimOptions | None = None) -> SimOptions:
+    """Return options of a world whose drones are AR.Drones: their identified response, navdata as often as possible.
+
+    Cameras are the firmware's own, whatever the options say.
+    """
+    return replace(options or SimOptions(), parameters=AR_DRONE, rate_hz=REPORTS_HZ, cameras=())
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The arguments of :class:`skyloop.vehicles.ardrone.emulator.ArdroneFirmware`."""
+
+    version: int
+    bind: str
+    ports: Ports
+    faults: Faults
+    delay_s: float
+    header_size: int
+    torn_start: bool
 
 
 DEMO_HZ: Final = 15.0

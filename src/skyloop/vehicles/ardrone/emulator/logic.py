@@ -10,16 +10,39 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from skyloop.clock import Clock, seconds
+from skyloop.clock import Clock, nanoseconds, seconds
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.vehicles.ardrone.emulator.configuration import Configuration, Ids
-from skyloop.vehicles.ardrone.emulator.flight import LOST_AFTER_S, FlightControl
-from skyloop.vehicles.ardrone.emulator.sequence import CommandSequence
-from skyloop.vehicles.ardrone.emulator.setpoints import Progress, limits_of
-from skyloop.vehicles.ardrone.wire.at import AtCommand, Ctrl, parse_commands, to_float
-from skyloop.vehicles.ardrone.wire.keys import VideoChannel, VideoCodec
+from skyloop.vehicles.ardrone.emulator.flight import LOST_AFTER_S, FlightControl, Progress, limits_of
+from skyloop.vehicles.ardrone.wire.at import SILENCE_RESET_S, AtCommand, Ctrl, parse_commands, to_float
+from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.emulation.vehicle import Vehicle
+
+RESTART: Final = 1  #: the sequence number with which a client restarts
+
+
+class CommandSequence:
+    """Accepts a command only if its number is greater than that of the last one accepted, or 1, which restarts.
+
+    After two seconds without an accepted command any number greater than 0 is new again. The Developer Guide asks
+    clients to begin with 1; a drone that insisted on it would never again obey a client whose first datagram got lost,
+    so this one doesn't.
+    """
+
+    def __init__(self) -> None:
+        self._last = 0
+        self._taken_ns: int | None = None
+
+    def takes(self, number: int, now_ns: int) -> bool:
+        """Return whether the command with this number, received now, is to be executed."""
+        if self._taken_ns is not None and now_ns - self._taken_ns > nanoseconds(SILENCE_RESET_S):
+            self._last = 0
+        if number != RESTART and number <= self._last:
+            return False
+        self._last, self._taken_ns = number, now_ns
+        return True
+
 
 WATCHDOG_S: Final = 0.05  #: of silence: Developer Guide, 7.1.2
 

@@ -15,9 +15,9 @@ from typing import Any, Final
 from skyloop.messages import FlightState
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.reports import VehicleFeedback
-from skyloop.vehicles.ardrone.emulator.setpoints import NO_PROGRESS, Progress
+from skyloop.vehicles.ardrone.emulator.flight import NO_PROGRESS, Progress
 from skyloop.vehicles.ardrone.wire import options as o
-from skyloop.vehicles.ardrone.wire.keys import NAVDATA_OPTIONS_USUAL, VideoChannel
+from skyloop.vehicles.ardrone.wire.configuration import NAVDATA_OPTIONS_USUAL, VideoChannel
 from skyloop.vehicles.ardrone.wire.navdata import ControlState
 from skyloop.vehicles.emulation.video import NOTHING_SENT, VideoStatus
 
@@ -43,7 +43,7 @@ class Snapshot:
 
     believed: VehicleFeedback
     state: FlightState
-    time: int  #: as :meth:`skyloop.vehicles.ardrone.emulator.clock.DroneClock.navdata_time` gives it
+    time: int  #: as :meth:`skyloop.vehicles.ardrone.emulator.video.DroneClock.navdata_time` gives it
     thrust: float = 0.0  #: of the weight
     most_thrust: float = 1.9
     trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that count as level

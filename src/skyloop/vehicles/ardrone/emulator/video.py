@@ -1,23 +1,75 @@
-"""The AR.Drones' cameras, formats and codecs: from pictures to what goes out. Pure."""
+"""The AR.Drones' cameras, clock, formats and codecs: from pictures to what goes out. Pure.
+
+An AR.Drone 1 encodes in UVLC. The format, and what is known about it from where, stands at the decoder,
+:mod:`skyloop.vehicles.ardrone.wire.uvlc`, with which the encoder shares the tables and nothing else. As the Parrot
+SDK's encoder does, it sends complete pictures only, codes every macroblock, cuts levels towards zero, writes levels
+beyond 127, the last in the Developer Guide's table, by the rule of that table, and ends a picture with zeros up to a
+whole word.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.errors import UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
-from skyloop.vehicles.ardrone.emulator import uvlc
-from skyloop.vehicles.ardrone.emulator.clock import DroneClock
 from skyloop.vehicles.ardrone.emulator.logic import VideoSettings
-from skyloop.vehicles.ardrone.wire.keys import VideoCodec
+from skyloop.vehicles.ardrone.wire.configuration import VideoCodec
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, build_header
+from skyloop.vehicles.ardrone.wire.uvlc_codes import (
+    BLOCKS,
+    COARSEST_QUANT,
+    COEFFICIENTS,
+    DC_BITS,
+    END_OF_PICTURE,
+    FINEST_QUANT,
+    FORMAT_BITS,
+    INVERSE_TRANSFORM,
+    MACROBLOCK,
+    NUMBER_BITS,
+    QUANT_BITS,
+    RESOLUTION_BITS,
+    SIDE,
+    SIZES,
+    START_CODE_BITS,
+    STEPS,
+    TABLE_QUALITY,
+    TABLE_QUANT,
+    TYPE_BITS,
+    UVLC_START,
+    PictureType,
+)
 from skyloop.vehicles.emulation.encoders import Encoder, Format
 from skyloop.vehicles.emulation.video import Piece
+
+_NS_PER_US: Final = 1000
+_NS_PER_MS: Final = 1_000_000
+_US_PER_S: Final = 1_000_000
+_SECOND_BITS: Final = 11
+_MICROSECOND_BITS: Final = 21
+
+
+@dataclass(frozen=True, slots=True)
+class DroneClock:
+    """Counts from when the drone was switched on. Arguments are times of this host's monotonic clock [ns]."""
+
+    booted_ns: int
+
+    def navdata_time(self, at_ns: int) -> int:
+        """Return seconds in the upper 11 bits and microseconds in the lower 21: wraps after 2048 s."""
+        s, us = divmod((at_ns - self.booted_ns) // _NS_PER_US, _US_PER_S)
+        return s % (1 << _SECOND_BITS) << _MICROSECOND_BITS | us
+
+    def milliseconds(self, at_ns: int) -> int:
+        """Return milliseconds, as the video's headers have them."""
+        return (at_ns - self.booted_ns) // _NS_PER_MS
+
 
 _DIAGONAL_1_PX: Final = math.hypot(176, 144)
 _FOCAL_1_PX: Final = BOTTOM_CAMERA.fx * _DIAGONAL_1_PX / math.hypot(BOTTOM_CAMERA.width, BOTTOM_CAMERA.height)
@@ -118,4 +170,164 @@ class UvlcPacker:
     def pack(self, picture: NDArray[np.uint8], _settings: VideoSettings, _captured_ns: int) -> Piece | None:
         """Encode a picture."""
         self._number += 1
-        return Piece(uvlc.encode(picture, self._number & 0xFFFFFFFF), starts=True)
+        return Piece(encode(picture, self._number & 0xFFFFFFFF), starts=True)
+
+
+MAX_DATAGRAM: Final = 65_507  #: bytes of a UDP datagram over IPv4
+_COARSER: Final = (4, 8, 16, COARSEST_QUANT)  # quantisers to fall back on for a picture that is too busy
+_END_OF_BLOCK: Final = 0b101, 3  # run 0, then the code that is no level
+_CODES: Final = {size: code for code, size in SIZES.items()}
+
+# YCbCr of BGR: BT.601, full range.
+_LUMA: Final = np.array([0.114, 0.587, 0.299], np.float32)
+_CB: Final = 0.5 / (1 - 0.114)
+_CR: Final = 0.5 / (1 - 0.299)
+
+Ints = NDArray[np.int64]
+
+
+def encode(
+    picture: NDArray[np.uint8], number: int, *, quant: int = TABLE_QUANT, max_bytes: int = MAX_DATAGRAM
+) -> bytes:
+    """Return one datagram with a picture.
+
+    Macroblocks that would stand half outside are left out, as the format has it.
+
+    Args:
+        picture: BGR, uint8, shape (height, width, 3), of a size that the format has.
+        number: The picture's.
+        quant: 1 (finest) to 30, or 31, which is like 2 and what real drones send.
+        max_bytes: A picture that would take more is coded coarser.
+
+    Raises:
+        UsageError: Another size or type, a number or quantiser out of range, or a picture too busy even for the
+            coarsest.
+    """
+    _check(picture, number, quant)
+    height, width = picture.shape[:2]
+    coefficients = _coefficients(picture)
+    fineness = TABLE_QUALITY if quant == TABLE_QUANT else quant
+    for q in (quant, *(coarser for coarser in _COARSER if coarser > fineness)):
+        packet = _pack(_quantised(coefficients, q), _CODES[width, height], q, number)
+        if len(packet) <= max_bytes:
+            return packet
+    raise UsageError(f"a picture of {width}x{height} takes {len(packet)} bytes even at the coarsest, not {max_bytes}")
+
+
+def _check(picture: NDArray[np.uint8], number: int, quant: int) -> None:
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+        raise UsageError(f"a picture is uint8 (height, width, 3), not {picture.dtype} {picture.shape}")
+    if picture.shape[1::-1] not in _CODES:
+        sizes = ", ".join(f"{w}x{h}" for w, h in sorted(_CODES))
+        raise UsageError(f"UVLC has no pictures of {picture.shape[1]}x{picture.shape[0]}; it has {sizes}")
+    if not 0 <= number < 1 << NUMBER_BITS:
+        raise UsageError(f"a picture's number has {NUMBER_BITS} bits; {number} doesn't fit")
+    if not FINEST_QUANT <= quant <= TABLE_QUANT:
+        raise UsageError(f"a quantiser is {FINEST_QUANT} to {TABLE_QUANT}, not {quant}")
+
+
+def _coefficients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the transformed macroblocks of a picture in the order of the stream. Shape (groups, columns, 6, 64)."""
+    groups, columns = picture.shape[0] // MACROBLOCK, picture.shape[1] // MACROBLOCK
+    pixels = picture[: groups * MACROBLOCK, : columns * MACROBLOCK].astype(np.float32)
+    luma = pixels @ _LUMA
+    quads = pixels.reshape(groups * SIDE, 2, columns * SIDE, 2, 3)
+    blue, green, red = np.moveaxis(quads.mean(axis=(1, 3)), -1, 0)
+    small = _LUMA[0] * blue + _LUMA[1] * green + _LUMA[2] * red
+    samples = np.empty((groups, columns, BLOCKS, SIDE, SIDE), np.float32)
+    samples[:, :, :4] = (
+        luma.reshape(groups, 2, SIDE, columns, 2, SIDE)
+        .transpose(0, 3, 1, 4, 2, 5)
+        .reshape(groups, columns, 4, SIDE, SIDE)
+    )
+    for k, chroma in enumerate(((blue - small) * _CB, (red - small) * _CR), start=4):
+        samples[:, :, k] = (chroma + 128).reshape(groups, SIDE, columns, SIDE).transpose(0, 2, 1, 3)
+    flat = samples.reshape(-1, COEFFICIENTS) @ INVERSE_TRANSFORM.T
+    return flat.reshape(groups, columns, BLOCKS, COEFFICIENTS)
+
+
+def _quantised(coefficients: NDArray[np.float32], quant: int) -> Ints:
+    levels: Ints = (coefficients / STEPS[quant].astype(np.float32)).astype(np.int64)
+    # The mean is rounded, as cutting it would darken the picture; and never 0, as from the Parrot SDK.
+    mean = np.rint(coefficients[..., 0] / STEPS[quant][0])
+    levels[..., 0] = np.clip(mean, 1, (1 << DC_BITS) - 1)
+    return levels
+
+
+def _pack(levels: Ints, size_code: tuple[int, int], quant: int, number: int) -> bytes:
+    """Return the packet of quantised macroblocks (groups, columns, 6, 64)."""
+    start = [UVLC_START, *size_code, PictureType.INTRA, quant, number]
+    widths = [START_CODE_BITS, FORMAT_BITS, RESOLUTION_BITS, TYPE_BITS, QUANT_BITS, NUMBER_BITS]
+    bits = [_bits(np.array(start), np.array(widths))]
+    for group, macroblocks in enumerate(levels):
+        if group:
+            bits += [
+                _filling(bits, 8),
+                _bits(np.array([UVLC_START + group, quant]), np.array([START_CODE_BITS, QUANT_BITS])),
+            ]
+        bits.append(_bits(*_group_codes(macroblocks)))
+    bits += [_filling(bits, 8), _bits(np.array([END_OF_PICTURE]), np.array([START_CODE_BITS]))]
+    bits.append(_filling(bits, 32))
+    return np.packbits(np.concatenate(bits)).view(">u4").astype("<u4").tobytes()
+
+
+def _filling(bits: list[NDArray[np.uint8]], size: int) -> NDArray[np.uint8]:
+    """Return the zeros up to the next multiple of a number of bits."""
+    return np.zeros(-sum(map(len, bits)) % size, np.uint8)
+
+
+def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
+    """Return the codes of a group's macroblocks (columns, 6, 64) one after the other, and the bits of each."""
+    blocks = levels.reshape(-1, COEFFICIENTS)
+    values, widths, block_of_pair = _pair_codes(blocks)
+    pairs = np.bincount(block_of_pair, minlength=len(blocks))
+    described = 0x80 | ((pairs > 0).reshape(-1, BLOCKS) << np.arange(BLOCKS)).sum(axis=1)
+    # Where each block's mean stands: after its macroblock's description if it is the first of it, before its pairs.
+    is_first = np.arange(len(blocks)) % BLOCKS == 0
+    ends = np.cumsum(1 + is_first + pairs)
+    means = ends - pairs - 1
+    descriptions = means[is_first] - 1
+    is_pair = np.ones(ends[-1], bool)
+    is_pair[means] = is_pair[descriptions] = False
+    all_values, all_widths = np.empty((2, ends[-1]), np.int64)
+    all_values[descriptions], all_widths[descriptions] = described, 1 + 8  # after the bit for "coded", 0
+    all_values[means], all_widths[means] = blocks[:, 0], DC_BITS
+    all_values[is_pair], all_widths[is_pair] = values, widths
+    return all_values, all_widths
+
+
+def _pair_codes(blocks: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return the codes of the coefficients that aren't zero, the bits of each, and the block of each.
+
+    A code has the zeros before its coefficient, and the last one of a block has the block's end.
+    """
+    block, place = np.nonzero(blocks[:, 1:])
+    level = blocks[block, place + 1]
+    starts = np.diff(block, prepend=-1) != 0
+    ends = np.diff(block, append=-1) != 0
+    before = np.where(starts, -1, np.roll(place, 1))
+    run_value, run_width = _prefixed(place - before - 1)
+    level_value, level_width = _prefixed(np.abs(level))
+    # A level of 1 has no zero before its one, unlike a run of 1.
+    level_width -= np.abs(level) == 1
+    value = (run_value << level_width | level_value) << 1 | (level < 0)
+    width = run_width + level_width + 1
+    end, end_width = _END_OF_BLOCK
+    return np.where(ends, value << end_width | end, value), width + end_width * ends, block
+
+
+def _prefixed(number: Ints) -> tuple[Ints, Ints]:
+    """Return the codes of numbers, and the bits of each.
+
+    As many zeros as the number has bits and then those; a one for 0.
+    """
+    size = np.frexp(number.astype(np.float64))[1].astype(np.int64)
+    tail = np.maximum(size - 1, 0)
+    return np.where(number > 0, number, 1), size + 1 + tail
+
+
+def _bits(values: Ints, widths: Ints) -> NDArray[np.uint8]:
+    """Return the bits of numbers one after the other, each from its most significant on."""
+    ends = np.cumsum(widths)
+    down = np.repeat(ends, widths) - np.arange(ends[-1]) - 1
+    return (np.repeat(values, widths) >> down & 1).astype(np.uint8)

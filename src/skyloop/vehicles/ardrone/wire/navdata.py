@@ -14,6 +14,7 @@ from enum import IntEnum, IntFlag
 from typing import Any, Final, TypeVar, cast
 
 from skyloop.errors import DecodeError
+from skyloop.vehicles.ardrone.wire import at, configuration
 from skyloop.vehicles.ardrone.wire.options import BY_TAG_AND_SIZE, LAYOUTS, Option
 
 PORT: Final = 5554
@@ -139,3 +140,24 @@ def _decode_options(datagram: bytes | memoryview, end: int) -> tuple[dict[type[O
             options[layout.kind] = layout.unpack(datagram, at + _OPTION.size)
         at += size
     return options, unknown
+
+
+VIDEO: Final = 5555
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """The drone's; 0 stands for any free one, where there is a choice."""
+
+    navdata: int = PORT  #: UDP
+    video: int = VIDEO  #: UDP of an AR.Drone 1, TCP of an AR.Drone 2
+    at: int = at.PORT  #: UDP
+    control: int = configuration.PORT  #: TCP
+
+    @classmethod
+    def free(cls) -> Ports:
+        """Any free ones."""
+        return cls(0, 0, 0, 0)
+
+
+STANDARD: Final = Ports()

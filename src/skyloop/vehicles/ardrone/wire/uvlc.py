@@ -37,8 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.ardrone.wire.uvlc_codes import WINDOW, BlockWalker, bit_windows
-from skyloop.vehicles.ardrone.wire.uvlc_tables import (
+from skyloop.vehicles.ardrone.wire.uvlc_codes import (
     BLOCKS,
     COARSEST_QUANT,
     COEFFICIENTS,
@@ -60,7 +59,10 @@ from skyloop.vehicles.ardrone.wire.uvlc_tables import (
     TABLE_QUANT,
     TYPE_BITS,
     UVLC_START,
+    WINDOW,
+    BlockWalker,
     PictureType,
+    bit_windows,
 )
 
 MAX_PACKET: Final = 65_535  #: bytes; a picture is one datagram

@@ -15,6 +15,6 @@ What the two do differently is what was observed on the real ones; ``docs/mavlin
 
 from skyloop.faults import Faults
 from skyloop.vehicles.mavlink.emulator.emulator import MavlinkFirmware
-from skyloop.vehicles.mavlink.emulator.settings import Kind, Ports, with_multirotors
+from skyloop.vehicles.mavlink.emulator.links import Kind, Ports, with_multirotors
 
 __all__ = ["Faults", "Kind", "MavlinkFirmware", "Ports", "with_multirotors"]

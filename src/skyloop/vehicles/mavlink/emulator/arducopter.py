@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 from skyloop.messages.geometry import turned, wrap_angle
 from skyloop.vehicles.emulation.flight import GO_M_S, SINK_M_S, Speeds
 from skyloop.vehicles.emulation.vehicle import Vehicle
-from skyloop.vehicles.mavlink.emulator import parameters
+from skyloop.vehicles.mavlink.emulator import services
 from skyloop.vehicles.mavlink.emulator.autopilot import (
     ACCEPTED,
     CRITICAL,
@@ -21,9 +21,19 @@ from skyloop.vehicles.mavlink.emulator.autopilot import (
     whole,
 )
 from skyloop.vehicles.mavlink.emulator.links import Port
-from skyloop.vehicles.mavlink.emulator.manoeuvres import Turn
-from skyloop.vehicles.mavlink.emulator.parameters import ParameterTable
-from skyloop.vehicles.mavlink.emulator.places import geodetic
+from skyloop.vehicles.mavlink.emulator.manoeuvres import (
+    BODY,
+    BODY_OFFSET,
+    WORLD,
+    WORLD_OFFSET,
+    AttitudeTarget,
+    Target,
+    Turn,
+    attitude_target_of,
+    geodetic,
+    global_target_of,
+    target_of,
+)
 from skyloop.vehicles.mavlink.emulator.services import (
     MISSION_ACCEPTED,
     MISSION_ERROR,
@@ -32,18 +42,8 @@ from skyloop.vehicles.mavlink.emulator.services import (
     MISSION_INVALID_Z,
     MISSION_UNSUPPORTED,
     Mission,
+    ParameterTable,
     mission_ack,
-)
-from skyloop.vehicles.mavlink.emulator.setpoints import (
-    BODY,
-    BODY_OFFSET,
-    WORLD,
-    WORLD_OFFSET,
-    AttitudeTarget,
-    Target,
-    attitude_target_of,
-    global_target_of,
-    target_of,
 )
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Message
@@ -90,7 +90,7 @@ class ArduCopter(Autopilot):
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, system, boot_s, gps)
-        self.parameters = ParameterTable(parameters.ARDUCOPTER, bytewise=False)
+        self.parameters = ParameterTable(services.ARDUCOPTER, bytewise=False)
         self.mission = Mission()
         self.mode = "STABILIZE"
         self._rising = False

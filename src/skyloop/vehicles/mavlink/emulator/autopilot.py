@@ -14,18 +14,14 @@ from skyloop.messages import FlightState
 from skyloop.sim.host import Report
 from skyloop.vehicles.emulation.flight import FlightControl
 from skyloop.vehicles.emulation.vehicle import Vehicle
-from skyloop.vehicles.mavlink.emulator.links import Port
-from skyloop.vehicles.mavlink.emulator.manoeuvres import Manoeuvres
-from skyloop.vehicles.mavlink.emulator.parameters import ParameterTable
-from skyloop.vehicles.mavlink.emulator.places import ORIGIN, on_earth, place_of
-from skyloop.vehicles.mavlink.emulator.services import answers
-from skyloop.vehicles.mavlink.emulator.streams import MAX_INTERVAL_US
+from skyloop.vehicles.mavlink.emulator.links import MAX_INTERVAL_US, Port
+from skyloop.vehicles.mavlink.emulator.manoeuvres import ORIGIN, Manoeuvres, on_earth, place_of
+from skyloop.vehicles.mavlink.emulator.services import ParameterTable, answers
 from skyloop.vehicles.mavlink.emulator.telemetry import MAKERS
 from skyloop.vehicles.mavlink.wire.axes import Vector
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Message, chunks_of
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import ModeFlag, SystemState
-from skyloop.vehicles.mavlink.wire.texts import chunks_of
 
 ACCEPTED: Final = 0
 TEMPORARILY_REJECTED: Final = 1

@@ -7,7 +7,7 @@ from typing import ClassVar, Final
 
 from skyloop.vehicles.emulation.flight import USUAL, Speeds
 from skyloop.vehicles.emulation.vehicle import Vehicle
-from skyloop.vehicles.mavlink.emulator import parameters
+from skyloop.vehicles.mavlink.emulator import services
 from skyloop.vehicles.mavlink.emulator.autopilot import (
     ACCEPTED,
     CRITICAL,
@@ -21,17 +21,18 @@ from skyloop.vehicles.mavlink.emulator.autopilot import (
     whole,
 )
 from skyloop.vehicles.mavlink.emulator.links import Port
-from skyloop.vehicles.mavlink.emulator.parameters import ParameterTable
-from skyloop.vehicles.mavlink.emulator.places import ORIGIN, place_of
-from skyloop.vehicles.mavlink.emulator.setpoints import (
+from skyloop.vehicles.mavlink.emulator.manoeuvres import (
     BODY,
+    ORIGIN,
     WORLD,
     AttitudeTarget,
     Target,
     attitude_target_of,
     global_target_of,
+    place_of,
     target_of,
 )
+from skyloop.vehicles.mavlink.emulator.services import ParameterTable
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
@@ -89,7 +90,7 @@ class Px4(Autopilot):
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, system, boot_s, gps)
-        self.parameters = ParameterTable(parameters.PX4, bytewise=True)
+        self.parameters = ParameterTable(services.PX4, bytewise=True)
         self.mode = "AUTO.LOITER"
         self._intended = self.mode  # what the user asked for; kept under failsafes
         self._before = self.mode  # the mode before a manoeuvre

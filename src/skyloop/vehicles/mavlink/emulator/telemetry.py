@@ -11,7 +11,7 @@ from skyloop.messages.geometry import in_16_bits, quaternion_from_euler
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.vehicles.emulation.flight import FlightControl
-from skyloop.vehicles.mavlink.emulator.places import ORIGIN, geodetic
+from skyloop.vehicles.mavlink.emulator.manoeuvres import ORIGIN, geodetic
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m

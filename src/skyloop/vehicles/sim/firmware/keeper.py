@@ -2,7 +2,7 @@
 
 ``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …``: the
 firmware's process id is written to standard output; what the firmware writes is appended to LOG. With ``--prompt`` it
-is woken before others, with ``--apart`` it gets a network of its own (:mod:`skyloop.vehicles.sim.firmware.apart`).
+is woken before others, with ``--apart`` it gets a network of its own (:mod:`skyloop.vehicles.sim.firmware.ports`).
 Exits with the firmware's code, with 128 and the number of the signal that ended it, as a shell does.
 """
 
@@ -13,12 +13,33 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from skyloop.child_process import on_parent_end
-from skyloop.vehicles.sim.firmware import apart
-from skyloop.vehicles.sim.firmware.prompt import become_prompt
+from skyloop.vehicles.sim.firmware import ports
+
+LOW_PRIORITY: Final = 1  #: of those of the real-time scheduler: before all ordinary processes
+NICENESS: Final = -10  #: where only that is allowed
+SLACK_NS: Final = 1  #: by which the kernel may wake it late on purpose; 50 µs otherwise
+_PR_SET_TIMERSLACK: Final = 29  # linux/prctl.h
+
+
+def become_prompt() -> None:
+    """Have this process, and what it starts, woken on time: surely as root, less so else. Never raises.
+
+    Only Linux is told.
+    """
+    if sys.platform != "linux":
+        return
+    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, SLACK_NS)
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(LOW_PRIORITY))
+    except OSError:
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+
 
 TERMINATE_S: Final = 2.0  #: for the firmware to end by itself
 PROMPT: Final = "--prompt"
@@ -32,8 +53,8 @@ def main(arguments: list[str]) -> int:
     prompt = PROMPT in settings
     if prompt:
         settings.remove(PROMPT)
-    relays = [apart.Relay(setting) for setting in settings if setting.startswith(apart.OPTION)]
-    settings = [setting for setting in settings if not setting.startswith(apart.OPTION)]
+    relays = [ports.Relay(setting) for setting in settings if setting.startswith(ports.OPTION)]
+    settings = [setting for setting in settings if not setting.startswith(ports.OPTION)]
     environment = {**os.environ, **dict(setting.split("=", 1) for setting in settings)}
     libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 

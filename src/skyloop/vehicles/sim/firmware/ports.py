@@ -1,10 +1,25 @@
-"""Ports of several firmwares on one computer: which numbers are free."""
+"""Ports of several firmwares on one computer: which are free, and a network of its own for one whose ports are fixed.
+
+Such networks are Linux's only. A socket belongs to the network in which it was made, whoever has it. So the firmware's
+keeper leaves the computer's network before it starts the firmware, makes the socket that speaks to the firmware by
+datagrams, and passes it on. The bytes of the firmware's TCP port it carries itself, to and from a listener that it was
+given.
+
+``python -m skyloop.vehicles.sim.firmware.ports`` exits with 0 where a network of one's own can be had.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import fcntl
+import os
 import socket
+import struct
+import subprocess
+import sys
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import Final
 
 from skyloop.errors import UsageError
@@ -82,3 +97,125 @@ def release_instance(firmware: str, instance: int) -> None:
     """Give a number back that :func:`reserve_instance` returned."""
     with _lock:
         _reserved.discard((firmware, instance))
+
+
+OPTION: Final = "--apart="
+CONNECT_S: Final = 1.0
+MAX_READ: Final = 65536
+_CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000  # linux/sched.h
+_SIOCSIFFLAGS: Final = 0x8914  # linux/sockios.h
+_UP_AND_RUNNING: Final = 0x41  # linux/if.h
+
+
+class Apart:
+    """Our side: what a firmware in a network of its own is reached by.
+
+    Attributes:
+        port: TCP on this computer; what comes here reaches the firmware's TCP port.
+    """
+
+    def __init__(self, udp_port: int, tcp_port: int) -> None:
+        """Open what the keepers are given. ``udp_port`` is ours in the firmware's network, ``tcp_port`` its own."""
+        self._listener = socket.create_server((LOOPBACK, 0))
+        self._ours, self._keepers = socket.socketpair()
+        self._ours.setblocking(False)
+        self._ports = udp_port, tcp_port
+        self.port: int = self._listener.getsockname()[1]
+
+    @property
+    def descriptors(self) -> tuple[int, int]:
+        """What each keeper inherits."""
+        return self._listener.fileno(), self._keepers.fileno()
+
+    @property
+    def option(self) -> str:
+        """What each keeper is told."""
+        return OPTION + ",".join(map(str, (*self.descriptors, *self._ports)))
+
+    def receive_socket(self) -> socket.socket:
+        """Return the UDP socket that the newest keeper made; the caller closes it.
+
+        Raises:
+            OSError: There is no new one.
+        """
+        newest = None
+        with suppress(BlockingIOError):
+            while descriptors := socket.recv_fds(self._ours, 1, 1)[1]:
+                if newest is not None:
+                    newest.close()
+                newest = socket.socket(fileno=descriptors[0])
+        if newest is None:
+            raise OSError("its keeper made no socket")
+        return newest
+
+    def close(self) -> None:
+        """Close everything; the sockets that were received stay. Idempotent."""
+        for each in (self._listener, self._ours, self._keepers):
+            each.close()
+
+
+class Relay:
+    """The keeper's side. Made while there is but one thread: this process leaves the computer's network.
+
+    Raises:
+        OSError: That is not allowed.
+    """
+
+    def __init__(self, option: str) -> None:
+        listener, channel, udp_port, self._tcp_port = map(int, option.removeprefix(OPTION).split(","))
+        self._listener = socket.socket(fileno=listener)
+        leave_network()
+        with socket.socket(fileno=channel) as keepers, bound(socket.SOCK_DGRAM, udp_port) as made:
+            socket.send_fds(keepers, [b"."], [made.fileno()])
+
+    def start(self) -> None:
+        """Carry bytes from now on, on threads."""
+        threading.Thread(target=self._serve, name="skyloop-relay", daemon=True).start()
+
+    def _serve(self) -> None:
+        while True:
+            outside, _ = self._listener.accept()
+            try:
+                inside = socket.create_connection((LOOPBACK, self._tcp_port), CONNECT_S)
+            except OSError:
+                outside.close()  # nobody listens yet
+                continue
+            inside.settimeout(None)
+            for ends in ((outside, inside), (inside, outside)):
+                ends[0].setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                threading.Thread(target=_carry, args=ends, name="skyloop-relay", daemon=True).start()
+
+
+def _carry(source: socket.socket, sink: socket.socket) -> None:
+    with suppress(OSError):
+        while data := source.recv(MAX_READ):
+            sink.sendall(data)
+    for end in (source, sink):
+        with suppress(OSError):
+            end.shutdown(socket.SHUT_RDWR)
+
+
+def leave_network() -> None:
+    """Move this process into a new network that has nothing but a loopback.
+
+    Raises:
+        OSError: That is not allowed: it takes root, or a kernel that lets everybody make user namespaces.
+    """
+    if sys.platform != "linux":
+        raise OSError("there are networks of one's own on Linux only")
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.unshare(_CLONE_NEWNET) and libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET):
+        error = ctypes.get_errno()
+        raise OSError(error, os.strerror(error))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        fcntl.ioctl(any_socket, _SIOCSIFFLAGS, struct.pack("16sh14x", b"lo", _UP_AND_RUNNING))
+
+
+def is_possible() -> bool:
+    """Whether a network of one's own can be had here. Asks another process, which takes a moment."""
+    command: Sequence[str] = (sys.executable, "-m", "skyloop.vehicles.sim.firmware.ports")
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+if __name__ == "__main__":
+    leave_network()

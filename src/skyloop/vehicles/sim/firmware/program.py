@@ -18,8 +18,8 @@ from typing import Final
 
 from skyloop.child_process import ChildProcess
 from skyloop.errors import SkyloopError, UsageError
-from skyloop.vehicles.sim.firmware.apart import Apart
 from skyloop.vehicles.sim.firmware.keeper import PROMPT
+from skyloop.vehicles.sim.firmware.ports import Apart
 
 RESTART_S: Final = 1.0  #: from the firmware's death to its next start; doubled each time that it dies soon
 LONGEST_RESTART_S: Final = 30.0
@@ -60,7 +60,7 @@ class Launch:
     command: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)  #: what it has besides this process's
     prompt: bool = (
-        False  #: whether it must be woken on time; see :func:`~skyloop.vehicles.sim.firmware.prompt.become_prompt`
+        False  #: whether it must be woken on time; see :func:`~skyloop.vehicles.sim.firmware.keeper.become_prompt`
     )
     apart: Apart | None = None  #: of one in a network of its own
 

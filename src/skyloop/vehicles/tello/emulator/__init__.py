@@ -16,7 +16,6 @@ State and video go to ports 8890 and 11111 of the sender of ``command``, or to t
 """
 
 from skyloop.faults import Faults
-from skyloop.vehicles.tello.emulator.emulator import TelloFirmware
-from skyloop.vehicles.tello.emulator.settings import with_tellos
+from skyloop.vehicles.tello.emulator.emulator import TelloFirmware, with_tellos
 
 __all__ = ["Faults", "TelloFirmware", "with_tellos"]

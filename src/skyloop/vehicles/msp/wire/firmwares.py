@@ -1,10 +1,144 @@
-"""Names of what keeps a flight controller from arming, and of modes. Pure."""
+"""How far a stick has to be moved: the firmware's rate curves and their inverse. Pure.
+
+Betaflight's five kinds of rates, as its documentation plots them; from version 4.5 on ANGLE mode leans along the same
+curve, earlier in proportion to the stick. INAV has one cubic for roll and pitch and one for yaw.
+"""
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
+from skyloop.errors import DecodeError
 from skyloop.vehicles.msp.wire.messages import INAV
+
+Curve = Callable[[float], float]  #: from a stick, 0 to 1, to a rate [degrees/s] or a share; grows
+
+_KINDS: Final = ("betaflight", "raceflight", "kiss", "actual", "quick")
+_STEPS: Final = 24
+
+
+@dataclass(frozen=True, slots=True)
+class AxisRates:
+    """The three numbers of an axis, 0 to 255 as the firmware keeps them."""
+
+    centre: int
+    expo: int
+    most: int
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Rates of the axes. ``kind``: one of ``betaflight``, ``raceflight``, ``kiss``, ``actual``, ``quick``."""
+
+    kind: str
+    roll: AxisRates
+    pitch: AxisRates
+    yaw: AxisRates
+
+
+def betaflight_rates(payload: bytes) -> Rates:
+    """Read Betaflight's ``RC_TUNING``, from API 1.43 on with the kind of rates.
+
+    Raises:
+        DecodeError: It is too short.
+    """
+    if len(payload) < 14:
+        raise DecodeError(f"RC_TUNING of {len(payload)} bytes: 14 are the least")
+    number = payload[22] if len(payload) > 22 else 0
+    return Rates(
+        _KINDS[number] if number < len(_KINDS) else "unknown",
+        roll=AxisRates(payload[0], payload[1], payload[2]),
+        pitch=AxisRates(payload[12], payload[13], payload[3]),
+        yaw=AxisRates(payload[11], payload[10], payload[4]),
+    )
+
+
+def pack_betaflight_rates(rates: Rates) -> bytes:
+    """Return the payload of Betaflight's ``RC_TUNING``, API 1.46."""
+    roll, pitch, yaw = rates.roll, rates.pitch, rates.yaw
+    made = struct.pack("<BBBBBBBBH", roll.centre, roll.expo, roll.most, pitch.most, yaw.most, 0, 50, 0, 0)
+    made += bytes((yaw.expo, yaw.centre, pitch.centre, pitch.expo, 0, 100))
+    return made + struct.pack("<HHHB", 1998, 1998, 1998, _KINDS.index(rates.kind))
+
+
+def rate_curve(kind: str, rates: AxisRates) -> Curve:
+    """Return how fast a stick turns [degrees/s]; for an unknown kind a straight line to 200."""
+    makers = {"betaflight": _betaflight, "raceflight": _raceflight, "kiss": _kiss, "actual": _actual, "quick": _quick}
+    return makers[kind](rates) if kind in makers else lambda stick: 200.0 * stick
+
+
+def _bent(stick: float, expo: float, power: int) -> float:
+    return stick * (1 - expo) + expo * stick**power
+
+
+def _super(stick: float, share: float) -> float:
+    return 1 / min(1.0, max(0.01, 1 - stick * share))
+
+
+def _betaflight(rates: AxisRates) -> Curve:
+    centre, expo, most = rates.centre / 100, rates.expo / 100, rates.most / 100
+    if centre > 2:
+        centre += 14.54 * (centre - 2)
+    return lambda stick: 200 * centre * _bent(stick, expo, 4) * _super(stick, most)
+
+
+def _raceflight(rates: AxisRates) -> Curve:
+    expo, most = rates.expo / 100, rates.most / 100
+    return lambda stick: 10 * rates.centre * _bent(stick, expo, 3) * (1 + stick * most)
+
+
+def _kiss(rates: AxisRates) -> Curve:
+    expo, most = rates.expo / 100, rates.most / 100
+    return lambda stick: min(1998.0, 2 * rates.centre * _bent(stick, expo, 3) * _super(stick, most))
+
+
+def _actual(rates: AxisRates) -> Curve:
+    centre, expo = rates.centre * 10, rates.expo / 100
+    rest = max(0, rates.most * 10 - centre)
+    return lambda stick: stick * centre + rest * stick * _bent(stick, expo, 5)
+
+
+def _quick(rates: AxisRates) -> Curve:
+    centre, expo = max(1, rates.centre * 2), rates.expo / 100
+    share = 1 - centre / max(centre, rates.most * 10)
+    return lambda stick: min(1998.0, stick * centre * _super(_bent(stick, expo, 3), share))
+
+
+def inav_curve(expo: int, full: float) -> Curve:
+    """Return INAV's curve: what a stick comes to.
+
+    Args:
+        expo: 0 to 100.
+        full: What a full stick comes to, in any unit.
+    """
+    return lambda stick: full * _bent(stick, expo / 100, 3)
+
+
+def share_of(curve: Curve) -> Curve:
+    """Return the curve as a share of what a full stick comes to."""
+    full = curve(1.0)
+    return lambda stick: curve(stick) / full if full > 0 else stick
+
+
+def stick_for(curve: Curve, wanted: float) -> float:
+    """Return the stick, -1 to 1, that comes to a value; a full one if none does."""
+    size = abs(wanted)
+    low, high = 0.0, 1.0
+    if curve(1.0) <= size:
+        low = 1.0
+    else:
+        for _ in range(_STEPS):
+            middle = (low + high) / 2
+            if curve(middle) < size:
+                low = middle
+            else:
+                high = middle
+    stick = (low + high) / 2
+    return -stick if wanted < 0 else stick
+
 
 #: Betaflight 4.1 (API 1.42) on, from bit 0; ARM_SWITCH is always the last of those that a version has.
 BETAFLIGHT_FLAGS: Final = (
