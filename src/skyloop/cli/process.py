@@ -17,8 +17,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 import msgspec
 import typer
 
-from skyloop.cli.completion import drone_names
-from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
+from skyloop.cli.naming import (
+    AnyNameArgument,
+    DroneOption,
+    KeysOption,
+    NetworkOption,
+    drone_names,
+    join_network,
+    one_drone,
+)
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.annotation import Polyline, Shape, Text
 from skyloop.processing.worker import Output
