@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-import typer
-from skyloop.cli.network import ConnectOption, KeysOption, ListenOption, MetricsOption, MulticastOption, ServeOption, key_changes, metrics_beside, server_ends, settings_of, warn_if_open
 from typing import TYPE_CHECKING, Annotated
+
 import msgspec
-from skyloop.cli.network import MetricsOption
+import typer
+
+from skyloop.cli.network import (
+    ConnectOption,
+    KeysOption,
+    ListenOption,
+    MetricsOption,
+    MulticastOption,
+    ServeOption,
+    key_changes,
+    metrics_beside,
+    server_ends,
+    settings_of,
+    warn_if_open,
+)
 from skyloop.cli.text import columns
 from skyloop.errors import UsageError
 
