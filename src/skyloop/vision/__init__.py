@@ -6,7 +6,6 @@ Needs the extra ``vision``, detectors ``detect``; OpenCV and ONNX Runtime are im
 from skyloop.vision.board import Board, BoardFinder, BoardView
 from skyloop.vision.calibrating import Collector, calibrate
 from skyloop.vision.colour import BlobDetector, BlobSighting
-from skyloop.vision.correlation import CorrelationTracker
 from skyloop.vision.detection import Detection, ObjectDetector
 from skyloop.vision.detector_layouts import Layout
 from skyloop.vision.flow import GroundTracker
@@ -21,6 +20,7 @@ from skyloop.vision.onnx_detector import OnnxDetector
 from skyloop.vision.planar import PlanarSighting
 from skyloop.vision.poles import PoleDetector, PoleSighting
 from skyloop.vision.simulated import simulated_detector
+from skyloop.vision.trackers import CorrelationTracker
 from skyloop.vision.tracking import Tracker, TrackResult
 
 __all__ = [

@@ -10,8 +10,7 @@ import numpy as np
 
 from skyloop.messages.geometry import within
 from skyloop.vision.opencv import opencv
-from skyloop.vision.patches import Floats, features, patch
-from skyloop.vision.tracking import Box, Image, overlap
+from skyloop.vision.tracking import Box, Floats, Image, features, overlap, patch
 
 _PLACES: Final = 5  # across a box, at which its colours are taken
 _ASIDE: Final = 0.12  # of its width, from one to the next

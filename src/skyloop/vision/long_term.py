@@ -14,9 +14,9 @@ import numpy as np
 
 from skyloop.errors import UsageError
 from skyloop.vision.appearance import Candidate, TargetMemory
-from skyloop.vision.correlation import CorrelationTracker
 from skyloop.vision.opencv import opencv
 from skyloop.vision.planar import pixels_of
+from skyloop.vision.trackers import CorrelationTracker
 from skyloop.vision.tracking import LEAST_PX, Box, Image, Tracker, TrackResult, checked_box
 
 _VERIFIED: Final = 0.45  # similarity to the memory from which a tracked box is the target's

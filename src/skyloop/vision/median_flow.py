@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.vision.opencv import opencv
-from skyloop.vision.patches import Floats
-from skyloop.vision.tracking import Box, Image, Tracker, TrackResult, overlap_area
+from skyloop.vision.tracking import Box, Floats, Image, Tracker, TrackResult, overlap_area
 
 _GRID: Final = 10  # points along each side
 _WINDOW: Final = (11, 11)

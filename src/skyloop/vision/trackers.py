@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from skyloop.messages.geometry import within
 from skyloop.vision.opencv import opencv
-from skyloop.vision.patches import CELL, Floats, features, patch
-from skyloop.vision.tracking import Box, Image, Tracker, TrackResult
+from skyloop.vision.tracking import CELL, Box, Floats, Image, Tracker, TrackResult, features, patch
 
 Spectrum = NDArray[np.complex64]
 
