@@ -33,7 +33,7 @@ from skyloop.processing.worker import Output
 if TYPE_CHECKING:
     from skyloop.client import Frame
     from skyloop.processing import Settings, Status
-    from skyloop.vision.detection import Detection, ObjectDetector
+    from skyloop.vision.object_tracks import Detection, ObjectDetector
 
 LINE_EVERY_S: Final = 1.0
 _LOOK_S: Final = 0.1
@@ -234,7 +234,7 @@ def detect(
     """
     from skyloop.processing import Settings
     from skyloop.vision import OnnxDetector
-    from skyloop.vision.simulated import SIMULATED_WEIGHTS
+    from skyloop.vision.onnx_detector import SIMULATED_WEIGHTS
 
     join_network(network, keys)
     drone = one_drone(on, None)
