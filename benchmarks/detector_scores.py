@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.vision.detection import overlaps
+from skyloop.vision.object_tracks import overlaps
 
 Floats = NDArray[np.float64]
 

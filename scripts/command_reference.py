@@ -11,9 +11,8 @@ from typing import Any, Final
 
 from typer.main import get_command
 
-from skyloop.cli.app import build
+from skyloop.cli.app import build, described
 from skyloop.cli.commands import COMMANDS, Task
-from skyloop.cli.plain_help import described
 
 _HELP: Final = ("--help", "-h, --help")  # every command has it
 _OPTION: Final = re.compile(r"(?<![\w-])(--?[a-zA-Z][\w-]*)")

@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from skyloop.cli.app import run
-from skyloop.cli.demo_parts import PagePort, drone_and_page, land
+from skyloop.cli.demo import PagePort, drone_and_page, land
 from skyloop.cli.fly_follow import status_line
 from skyloop.errors import MissingExtraError, UsageError, install_command
 

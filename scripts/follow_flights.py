@@ -21,7 +21,7 @@ from skyloop.control.target_estimate import Traits
 from skyloop.messages import Feedback
 from skyloop.sim.world_file import load_world
 from skyloop.stepping.rehearsal import Radio, rehearse
-from skyloop.vision.detection import ObjectDetector
+from skyloop.vision.object_tracks import ObjectDetector
 from skyloop.vision.tracking import Box
 
 FLIGHT_S: Final = 40.0

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from skyloop.cli.demo_report import channel_rows
+from skyloop.cli.demo import channel_rows
 from skyloop.client import ChannelStats, Frame
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.messages import Feedback

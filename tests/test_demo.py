@@ -18,7 +18,7 @@ from typing import Self
 import pytest
 from rich.console import Console
 
-from skyloop.cli.demo_report import DemoReport, Spread, true_range
+from skyloop.cli.demo import DemoReport, Spread, true_range
 from skyloop.client import ChannelStats, Distribution
 
 DEMO = [sys.executable, "-m", "skyloop", "demo"]

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from benchmarks.one_command import one_command
 from skyloop.cli.app import run
-from skyloop.cli.demo_parts import PagePort, drone_and_page, land
+from skyloop.cli.demo import PagePort, drone_and_page, land
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.tracking_street import KNOTS, fitted, reliability, scored, street
-from skyloop.vision.long_term import confidence
+from skyloop.vision.appearance import confidence
 
 PAIRS = st.lists(st.tuples(st.floats(0.45, 1.0), st.booleans()), max_size=60)
 

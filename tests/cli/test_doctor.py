@@ -12,7 +12,7 @@ from types import ModuleType
 import pytest
 
 from skyloop.cli import doctor, main
-from skyloop.cli.findings import Finding, Health, as_text
+from skyloop.cli.doctor import Finding, Health, as_text
 from skyloop.errors import MissingExtraError
 from tests.cli.conftest import Run
 

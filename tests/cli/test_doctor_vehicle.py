@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.cli import checkup
+from skyloop.cli import doctor
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
@@ -43,7 +43,7 @@ def test_a_vehicle_that_is_not_there(run: Run) -> None:
 
 
 def test_a_vehicle_that_has_not_been_looked_for_long_enough(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checkup, "ANSWER_S", 0.05)
+    monkeypatch.setattr(doctor, "ANSWER_S", 0.05)
     ended = run("doctor", f"mavlink://udpin:127.0.0.1:{Ports.free(Kind.PX4).remote}")
     assert ended.code == 1
     assert "✗ vehicle: its link is connecting" in ended.out

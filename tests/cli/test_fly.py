@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.cli.flight import what_failed
-from skyloop.cli.fly import make
+from skyloop.cli.fly import make, what_failed
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from tests.cli.conftest import Run

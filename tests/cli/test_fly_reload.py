@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.cli.flight import Flight
+from skyloop.cli.fly import Flight
 from skyloop.client import Drone
 from skyloop.control import Controller
 from skyloop.messages import Applied, Feedback, FlightState, Hover, Velocity

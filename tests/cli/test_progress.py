@@ -15,8 +15,8 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from skyloop.cli import bench, completion, doctor, flight_progress
-from skyloop.cli.findings import Health
+from skyloop.cli import bench, doctor, fly, naming
+from skyloop.cli.doctor import Health
 from skyloop.cli.install import EXTRAS
 from skyloop.cli.text import console as skyloop_console
 from skyloop.cli.text import named
@@ -41,7 +41,7 @@ def test_a_flight_shows_its_progress_line_by_line_in_a_pipe(
     run: Run, alpha: Process, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert alpha.pid
-    monkeypatch.setattr(flight_progress, "LINE_EVERY_S", 0.1)
+    monkeypatch.setattr(fly, "LINE_EVERY_S", 0.1)
     (tmp_path / "mine.py").write_text(HOVER)
     ended = run("fly", str(tmp_path / "mine.py"), "alpha", "--seconds", "0.6")
     assert ended.code == 0, ended.err
@@ -148,8 +148,8 @@ def test_names_of_drones_parameters_and_files_complete(tmp_path: Path, monkeypat
     assert complete("skyloop fly m") == {"mine.py"}
     assert complete("skyloop log info f") == {"flight.mcap", "folder/"}
     monkeypatch.chdir(tmp_path)
-    assert completion.python_files("folder") == ["folder/"]
-    assert completion.network_places("mu") == ["multicast"]
+    assert naming.python_files("folder") == ["folder/"]
+    assert naming.network_places("mu") == ["multicast"]
 
 
 # tables ----------------------------------------------------------------------------------------------------------

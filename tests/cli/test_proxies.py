@@ -165,7 +165,7 @@ def test_a_watched_reader_that_goes_away_is_no_error(alpha: Process) -> None:
 def test_a_proxy_that_can_not_be_says_why_in_one_line(
     run: Run, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
 ) -> None:
-    monkeypatch.setattr("skyloop.cli.simulating.settle", lambda options: None)
+    monkeypatch.setattr("skyloop.cli.network.settle", lambda options: None)
     ended = run("proxy", *words)
     assert (ended.code, ended.out) == (2, "")
     assert said in ended.err
@@ -174,7 +174,7 @@ def test_a_proxy_that_can_not_be_says_why_in_one_line(
 
 def test_a_process_that_simulates_makes_room_for_commands(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[object] = []
-    monkeypatch.setattr("skyloop.cli.simulating.settle", lambda options: done.append(options.world))
+    monkeypatch.setattr("skyloop.cli.network.settle", lambda options: done.append(options.world))
     monkeypatch.setattr("skyloop.proxy.serve.serve", lambda *given, **options: done.append(given))
     monkeypatch.setattr("skyloop.proxy.serve.run", lambda proxies, **_: done.append([proxy.name for proxy in proxies]))
     run("proxy", "sim://?world=gates", "--name", "beta")
@@ -187,7 +187,7 @@ def test_a_process_that_simulates_makes_room_for_commands(run: Run, monkeypatch:
 @pytest.mark.parametrize(("cameras", "cores"), [("front", "1"), ("none", "OpenCV is not imported")])
 def test_it_does_so_by_the_lock_and_by_opencv(cameras: str, cores: str) -> None:
     code = (
-        "import sys; from skyloop.cli.simulating import settle; from skyloop.vehicles.sim.options import options_of;"
+        "import sys; from skyloop.cli.network import settle; from skyloop.vehicles.sim.options import options_of;"
         "from skyloop.drivers.uri import parse_uri;"
         f"settle(options_of(parse_uri('sim://?cameras={cameras}')));"
         "print(sys.getswitchinterval());"

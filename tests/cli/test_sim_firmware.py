@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 
-from skyloop.cli.firmware import address_from, ports_from
+from skyloop.cli.sim import address_from, ports_from
 from skyloop.errors import UsageError
 from skyloop.vehicles.ardrone.emulator import Ports
 from tests.cli.conftest import Run

@@ -39,7 +39,7 @@ from skyloop.messages import (
 from skyloop.sim.camera import FRONT_CAMERA
 from skyloop.stepping.rehearsal import rehearse
 from skyloop.vision import simulated_detector
-from skyloop.vision.detection import Detection
+from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import Box
 from tests.control.target_world import PERIOD_S, box_of, camera_at
 

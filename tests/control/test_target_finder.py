@@ -15,7 +15,7 @@ from skyloop.control.target_finder import Sighting, TargetFinder
 from skyloop.control.target_range import RangeEstimator
 from skyloop.control.target_view import Camera
 from skyloop.errors import UsageError
-from skyloop.vision.detection import Detection
+from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import Box, Image, TrackResult, overlap
 from tests.control.target_world import PERIOD_S, SIZE, Path, box_of, camera_at, walk
 

@@ -14,8 +14,7 @@ from queue import Empty, Queue
 
 import pytest
 
-from skyloop.cli.checkup import examine_vehicle
-from skyloop.cli.findings import Health
+from skyloop.cli.doctor import Health, examine_vehicle
 from skyloop.cli.listing import describe, lines
 
 PATIENCE_S = 10.0

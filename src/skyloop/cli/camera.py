@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from skyloop.calibration import Calibration
-    from skyloop.vision.board import Board, BoardFinder, BoardView
-    from skyloop.vision.calibrating import Collector
+    from skyloop.vision.calibrating import Board, BoardFinder, BoardView, Collector
 
     Picture = tuple[str, NDArray[np.uint8]]  # its name, and its pixels
 
@@ -108,7 +107,7 @@ def calibrate(
     Show the board near and far, in all corners of the picture, and tilted. Views that differ are taken by
     themselves; Ctrl-C ends that early.
     """
-    from skyloop.vision.board import BoardFinder
+    from skyloop.vision.calibrating import BoardFinder
     from skyloop.vision.calibrating import calibrate as fit
 
     join_network(network, keys)
@@ -189,7 +188,7 @@ class _Search:
 
 
 def _board(columns: int, rows: int, square_mm: float, kind: Kind, dictionary: str) -> Board:
-    from skyloop.vision.board import Board
+    from skyloop.vision.calibrating import Board
 
     return Board(columns, rows, square_mm / 1000, kind.value, dictionary)
 

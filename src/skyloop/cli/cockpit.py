@@ -7,8 +7,15 @@ from typing import Annotated
 
 import typer
 
-from skyloop.cli.completion import drone_names
-from skyloop.cli.naming import DronesOption, KeysOption, NetworkOption, drones, join_network, keys_directory
+from skyloop.cli.naming import (
+    DronesOption,
+    KeysOption,
+    NetworkOption,
+    drone_names,
+    drones,
+    join_network,
+    keys_directory,
+)
 from skyloop.cli.network import MetricsOption
 from skyloop.messages import Role
 

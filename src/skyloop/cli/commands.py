@@ -67,14 +67,14 @@ COMMANDS: Final = {
     ),
     "stop": Entry(Task.FLY, "ending", "stop", "Emergency stop: cut a drone's motors, or --all", "stop alpha"),
     "preflight": Entry(
-        Task.FLY, "preflight", "preflight", "What speaks against a flight, and what to do about it", "preflight alpha"
+        Task.FLY, "doctor", "preflight", "What speaks against a flight, and what to do about it", "preflight alpha"
     ),
     "list": Entry(Task.SEE, "listing", "list_proxies", "The running proxies and who flies", "list"),
     "watch": Entry(Task.SEE, "watch", "watch", "What a drone does, live in the terminal", "watch alpha"),
     "cockpit": Entry(
         Task.SEE, "cockpit", "cockpit", "A page in the browser to watch and fly drones", "cockpit --port 8000"
     ),
-    "view": Entry(Task.SEE, "view", "view", "Show drones live in Foxglove or Rerun", "view alpha --foxglove"),
+    "view": Entry(Task.SEE, "record", "view", "Show drones live in Foxglove or Rerun", "view alpha --foxglove"),
     "process": Entry(
         Task.SEE,
         "process",
@@ -89,7 +89,7 @@ COMMANDS: Final = {
         "Detect with your ONNX file in a drone's frames, drawn live",
         "detect my.onnx --on alpha",
     ),
-    "proxy": Entry(Task.SHARE, "proxy", "proxy", "Serve one vehicle under a name", "proxy sim:// --name alpha"),
+    "proxy": Entry(Task.SHARE, "host", "proxy", "Serve one vehicle under a name", "proxy sim:// --name alpha"),
     "host": Entry(
         Task.SHARE,
         "host",
@@ -117,7 +117,7 @@ COMMANDS: Final = {
         "keys issue jane --role pilot",
     ),
     "ros": Entry(Task.SHARE, "ros", "ros", "Drones as nodes of ROS 2", "ros --drone alpha --priority 16"),
-    "audit": Entry(Task.SHARE, "audit", "audit", "Who flew which drone when", "audit alpha --last 20"),
+    "audit": Entry(Task.SHARE, "listing", "audit", "Who flew which drone when", "audit alpha --last 20"),
     "record": Entry(Task.RECORD, "record", "record", "Record drones to an MCAP file", "record alpha -o flight.mcap"),
     "log": Entry(Task.RECORD, "log", "log", "Inspect, export, compare and repair recordings", "log info flight.mcap"),
     "doctor": Entry(

@@ -1,4 +1,8 @@
-"""``skyloop doctor``: what of this machine works with Skyloop, and what to install for the rest; or one vehicle."""
+"""Check-ups: ``skyloop doctor`` of this machine or of one vehicle, ``skyloop preflight`` before a flight.
+
+``skyloop doctor`` lists what works and what to install for the rest; ``skyloop doctor ADDRESS`` connects to one vehicle
+and lists which of its settings need attention. None of them flies anything.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +15,26 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import Annotated, Final
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 import typer
 from rich.console import Console
+from rich.text import Text
 
-from skyloop.cli.findings import Finding, Health, as_text
 from skyloop.cli.install import EXTRAS
-from skyloop.errors import install_command
+from skyloop.cli.naming import DroneOption, KeysOption, NameArgument, NetworkOption, join_network, one_drone
+from skyloop.client.preflight import Level, PreflightFinding
+from skyloop.errors import NoAnswerError, install_command
+from skyloop.messages import EventKind, LinkState, Severity
+
+if TYPE_CHECKING:
+    from skyloop.drivers.base import Driver
+    from skyloop.drivers.recording_sink import RecordingSink
+    from skyloop.messages.parameter import Diagnostic
 
 IMPORT_BUDGET_S: Final = 0.3
 
@@ -32,6 +47,40 @@ PORTS: Final = (
     ("UDP", 5554, "AR.Drone's navdata"),
     ("TCP", 7447, "routers"),
 )
+ANSWER_S: Final = 3.5  #: for a vehicle to answer; the user gets a result within 5 s
+PATIENCE_S: Final = 40.0  #: for one that answers to be read
+FEEDBACK_S: Final = 3.0
+SETTLE_S: Final = 2.0  #: for faults that end with our first messages, such as a receiver without sticks
+LOOK_S: Final = 0.1
+_MARKS = {Level.OK: ("✓", "green"), Level.WARN: ("!", "yellow"), Level.FAIL: ("✗", "red")}
+STATE_S = 2.0
+VIDEO_S = 5.0  #: a vehicle that was just started, such as a Tello, sends its first picture after some seconds
+
+
+class Health(StrEnum):
+    GOOD = "good"
+    MISSING = "missing"  #: works without it
+    BAD = "bad"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the report, and one of advice where there is any."""
+
+    what: str
+    health: Health
+    detail: str
+    advice: str = ""
+
+
+MARKS: Final = {Health.GOOD: ("✓", "green"), Health.MISSING: ("–", "yellow"), Health.BAD: ("✗", "red")}
+
+
+def as_text(finding: Finding) -> Text:
+    """Return a finding as text for people."""
+    mark, colour = MARKS[finding.health]
+    text = Text.assemble((mark, colour), f" {finding.what}: {finding.detail}")
+    return text.append(f"\n  → {finding.advice}", "bold") if finding.advice else text
 
 
 def doctor(
@@ -45,8 +94,6 @@ def doctor(
     Marks: ✓ works, – optional and not there, or a vehicle's safety net that is off, ✗ broken. The exit code is 1 if
     something is broken.
     """
-    from skyloop.cli.checkup import examine_vehicle
-
     console = Console(soft_wrap=True)
     findings = []
     for finding in examine_vehicle(address) if address else examine():
@@ -249,3 +296,95 @@ def _proxies() -> Iterator[Finding]:
             yield Finding(f"proxy {row.name}", Health.BAD, row.problem, advice)
         else:
             yield Finding(f"proxy {row.name}", Health.GOOD, f"{row.uri}, {row.state}")
+
+
+def examine_vehicle(address: str) -> Iterator[Finding]:
+    """Return what is found, in the order to be read.
+
+    Raises:
+        SkyloopError: The address is not valid.
+    """
+    from skyloop.drivers.recording_sink import RecordingSink
+    from skyloop.drivers.registry import make_driver
+
+    driver, sink = make_driver(address), RecordingSink(watch=set())
+    driver.open(sink)
+    try:
+        sink.wait(lambda: sink.link_state not in (None, LinkState.CONNECTING), ANSWER_S)
+        if sink.link_state not in (LinkState.UP, LinkState.DEGRADED):
+            yield _unreachable(sink)
+            return
+        if sink.link_state is LinkState.DEGRADED:
+            yield Finding("vehicle", Health.GOOD, f"it answers: {sink.links[-1][1] or 'being read'}")
+        if sink.wait(lambda: sink.link_state is LinkState.UP, PATIENCE_S):
+            sink.wait(lambda: sink.newest is not None and sink.newest.battery is not None, FEEDBACK_S)
+        else:
+            yield _unreachable(sink)
+        newest = sink.newest
+        if newest is not None:
+            battery = "unknown" if newest.battery is None else f"{newest.battery:.0%}"
+            yield Finding("vehicle", Health.GOOD, f"{newest.state.value}, battery {battery}")
+        for event in sink.events:
+            if event.kind is EventKind.DRIVER_ERROR or event.severity is Severity.ERROR:
+                yield Finding("vehicle", Health.MISSING, event.text)
+        for diagnostic in _settled(driver):
+            health = Health.GOOD if diagnostic.good else Health.MISSING
+            yield Finding(diagnostic.what, health, diagnostic.detail, diagnostic.advice)
+    finally:
+        driver.close()
+
+
+def _settled(driver: Driver) -> list[Diagnostic]:
+    end = time.monotonic() + SETTLE_S
+    while True:
+        found = driver.checkup()
+        if time.monotonic() >= end or all(each.good or not each.severe for each in found):
+            return found
+        time.sleep(LOOK_S)
+
+
+def _unreachable(sink: RecordingSink) -> Finding:
+    state, reason = sink.links[-1] if sink.links else (LinkState.CONNECTING, "nothing is known")
+    advice = sink.remedy or "check power, cable, address"
+    return Finding("vehicle", Health.BAD, f"its link is {state.value}: {reason}", advice)
+
+
+def preflight(
+    name: NameArgument = None,
+    drone: DroneOption = None,
+    folder: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Where recordings are to go, to see whether there is room")
+    ] = Path("recordings"),
+    json: Annotated[bool, typer.Option("--json", help="For programs: a JSON array of findings")] = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
+) -> None:
+    """Check a drone before it flies: link, battery, position, zones, video, its own failsafes. It flies nothing.
+
+    Marks: ✓ as it should be, ! it can fly without, ✗ it would not fly, or not safely. The exit code is 1 with any ✗.
+    """
+    from contextlib import suppress
+
+    from skyloop.client import connect
+
+    join_network(network, keys)
+    with connect(one_drone(name, drone), access="observe", name="skyloop preflight") as checked:
+        with suppress(NoAnswerError):
+            checked.next_feedback(STATE_S)
+        findings = checked.preflight(video_s=VIDEO_S, folder=folder)
+    if json:
+        typer.echo(msgspec.json.encode([asdict(finding) for finding in findings]).decode())
+    else:
+        console = Console(soft_wrap=True)
+        for finding in findings:
+            console.print(_line(finding))
+    if any(finding.level is Level.FAIL for finding in findings):
+        raise typer.Exit(1)
+
+
+def _line(finding: PreflightFinding) -> Text:
+    mark, colour = _MARKS[finding.level]
+    text = Text.assemble((mark, colour), f" {finding.check}: {finding.detail}")
+    if finding.why:
+        text.append(f"\n  {finding.why}")
+    return text.append(f"\n  → {finding.remedy}", "bold") if finding.remedy else text

@@ -1,32 +1,51 @@
-"""``skyloop fly``: flies a controller from a file."""
+"""``skyloop fly``: flies a controller from a file, and says how the flight goes and what happens when it fails."""
 
 from __future__ import annotations
 
 import inspect
+import math
 import signal
 import sys
+import sysconfig
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, Self
 
 import typer
 
-from skyloop.cli.completion import python_files
-from skyloop.cli.flight import Flight
-from skyloop.cli.flight_progress import FlightProgress
-from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, OptionalNameArgument, join_network, one_drone
+from skyloop.cli.naming import (
+    DroneOption,
+    KeysOption,
+    NetworkOption,
+    OptionalNameArgument,
+    join_network,
+    one_drone,
+    python_files,
+)
 from skyloop.cli.text import coloured
-from skyloop.errors import UsageError
-from skyloop.extend import end_flight
+from skyloop.errors import SkyloopError, UsageError
+from skyloop.extend import Known, end_flight, let_go
+from skyloop.messages import Failsafe, ReturnPhase
 
 if TYPE_CHECKING:
+    from rich.live import Live
+
     from skyloop.client import Drone
+    from skyloop.client.channels import Listener
     from skyloop.control import Controller
     from skyloop.control.loading import Reloader
 
 ADVICE = (
     "wait in the queue with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
 )
+Make = Callable[[type["Controller"]], "Controller"]
+_LOOK_S: Final = 0.1  #: how often a flight that waits for a mended file looks whether the drone is still there
+REFRESH_HZ: Final = 4
+LINE_EVERY_S: Final = 5.0  #: where standard error is no terminal
 
 
 def fly(
@@ -66,7 +85,7 @@ def fly(
 
     Ctrl-C lands too, and so does an error in the controller without --reload.
     """
-    from skyloop.cli.piloting import connect_pilot
+    from skyloop.cli.naming import connect_pilot
     from skyloop.client import Authority
     from skyloop.control.loading import Reloader, load_controller
 
@@ -171,3 +190,216 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG00
 def say(text: str) -> None:
     """Print a line on standard error."""
     typer.echo("\n".join(coloured(line, sys.stderr) for line in text.splitlines()), err=True)
+
+
+class Flight:
+    """Runs a controller to its end, and what takes its place when its file is saved. Use once.
+
+    Args:
+        drone: Connected, and in the air if the controller expects that.
+        controller: Of that drone.
+        report: Shows a line to the user.
+    """
+
+    def __init__(self, drone: Drone, controller: Controller, report: Callable[[str], None]) -> None:
+        self._drone = drone
+        self._controller = controller
+        self._report = report
+
+    def run(self, seconds: float | None) -> bool:
+        """Run the controller; what it raises is shown, and leaves the vehicle hovering.
+
+        Args:
+            seconds: For how long; None until it ends by itself.
+
+        Returns:
+            Whether it ended without an error.
+        """
+        try:
+            summary = self._controller.run(seconds=seconds)
+        except Exception as error:  # noqa: BLE001  the user's code may raise anything
+            self._report(what_failed(error))
+            self._report("the controller failed")
+            return False
+        self._report(str(summary))
+        return True
+
+    def report_notes(self) -> None:
+        """Show what looks like a mistake in the run, for one that ended without a summary."""
+        checks = self._controller._checks
+        for note in () if checks is None else checks.notes():
+            self._report(f"note: {note}")
+
+    def run_reloading(self, seconds: float | None, reloader: Reloader, make: Make) -> bool:
+        """Run the controller; a saved file takes over in flight, and one that failed hovers until it is saved again.
+
+        Args:
+            seconds: For how long; None until it ends by itself.
+            reloader: Watches the file.
+            make: Makes a controller of the loaded class.
+
+        Returns:
+            Whether it ended without an error.
+        """
+        deadline = math.inf if seconds is None else time.monotonic() + seconds
+        while True:
+            try:
+                left = None if seconds is None else max(0.0, deadline - time.monotonic())
+                summary = self._controller.run(seconds=left, until=lambda: reloader.waiting)
+            except Exception as error:  # noqa: BLE001  the user's code may raise anything
+                self._cancel(Known(self._drone).listeners)  # they would fly on
+                let_go(self._drone, "the controller failed")
+                self._report(what_failed(error))
+                self._report("the controller failed: hovering; save the file to continue, Ctrl-C lands")
+                if not self._await_mended(reloader, make, deadline):
+                    return False
+                continue
+            if summary.reason != "until":
+                self._report(str(summary))
+                return True
+            if not self._take(reloader, make):
+                self._report("the saved file is not flown: the one before keeps flying")
+
+    def _await_mended(self, reloader: Reloader, make: Make, deadline: float) -> bool:
+        """Hover until a file was saved that can be flown; False if the time is over or the drone gone before."""
+        while not (reloader.waiting and self._take(reloader, make)):
+            if self._drone.closed or time.monotonic() >= deadline:
+                return False
+            time.sleep(_LOOK_S)
+        return True
+
+    def _take(self, reloader: Reloader, make: Make) -> bool:
+        """Put what was loaded in the place of the present controller, if it can be; whichever goes commands no more."""
+        found, known = reloader.take(), Known(self._drone)
+        older = known.listeners
+        try:
+            if found is None or isinstance(found, SkyloopError):
+                raise found or SkyloopError("nothing was loaded")
+            after = make(found)
+            after.on_reload(self._controller)
+        except Exception as error:  # noqa: BLE001  the user's code may raise anything
+            self._cancel([one for one in known.listeners if one not in older])
+            self._report(what_failed(error))
+            return False
+        self._cancel(older)
+        self._controller = after
+        self._report(f"reloaded {type(after).__name__}, {reloader.age_s:.2f} s after it was seen to be saved")
+        return True
+
+    @staticmethod
+    def _cancel(listeners: Iterable[Listener[Any]]) -> None:
+        for one in list(listeners):
+            one.cancel()
+
+
+def what_failed(error: Exception) -> str:
+    """Return what a person needs to mend an error: their own line, then the traceback without Skyloop's lines.
+
+    An error that Skyloop raised on purpose with no line of the user in it is one line; any other is shown in full.
+    """
+    home = str(Path(__file__).parents[1])
+    trace = traceback.TracebackException.from_exception(error)
+    if all(line.filename.startswith(home) for line in trace.stack):
+        return f"skyloop: {error}" if isinstance(error, SkyloopError) else "".join(trace.format()).rstrip()
+    own = _own_line(trace.stack, home)
+    part: traceback.TracebackException | None = trace
+    while part is not None:
+        theirs = [line for line in part.stack if not line.filename.startswith(home)]
+        part.stack = traceback.StackSummary.from_list(theirs)
+        part = part.__cause__ or part.__context__
+    where = f"{Path(own.filename).name}, line {own.lineno}, in {own.name}: {own.line or ''}".rstrip(": ")
+    return f"{where}\n  {''.join(trace.format_exception_only()).rstrip()}\n\n{''.join(trace.format()).rstrip()}"
+
+
+def _own_line(stack: Iterable[traceback.FrameSummary], home: str) -> traceback.FrameSummary:
+    """Return the innermost line that is neither Skyloop's nor a library's, or else the innermost not Skyloop's."""
+    theirs = [line for line in stack if not line.filename.startswith(home)]
+    libraries = tuple({sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")})
+    return next((line for line in reversed(theirs) if not line.filename.startswith(libraries)), theirs[-1])
+
+
+class FlightProgress:
+    """Shows a flight's progress on standard error for as long as its ``with`` block lasts.
+
+    Args:
+        drone: Who flies.
+        live: Whether to keep one line up to date; None: if standard error is a terminal.
+        what: Returns what comes first in the line: how that which flies goes.
+        every_s: How often to print a line where standard error is no terminal; None: :data:`LINE_EVERY_S`.
+    """
+
+    def __init__(
+        self,
+        drone: Drone,
+        *,
+        live: bool | None = None,
+        what: Callable[[], str] | None = None,
+        every_s: float | None = None,
+    ) -> None:
+        self._drone = drone
+        self._what = what
+        self._every_s = LINE_EVERY_S if every_s is None else every_s
+        self._begun_s = time.monotonic()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._lines, name="skyloop-progress", daemon=True)
+        self._live: Live | None = None
+        if sys.stderr.isatty() if live is None else live:
+            from rich.console import Console
+            from rich.live import Live
+            from rich.text import Text
+
+            self._live = Live(
+                get_renderable=lambda: Text(self.line(), "cyan", no_wrap=True, overflow="ellipsis"),
+                console=Console(stderr=True),
+                refresh_per_second=REFRESH_HZ,
+                transient=True,
+                redirect_stdout=sys.stdout.isatty(),  # what the controller prints appears above the line
+            )
+
+    def line(self) -> str:
+        """Return the progress now, what matters most first: a narrow terminal cuts the end."""
+        line = flight_line(self._drone, time.monotonic() - self._begun_s)
+        return line if self._what is None else f"{self._what()}  {line}"
+
+    def __enter__(self) -> Self:
+        self._begun_s = time.monotonic()
+        if self._live is not None:
+            self._live.start()
+        else:
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        if self._live is not None:
+            self._live.stop()
+        else:
+            self._thread.join()
+
+    def _lines(self) -> None:
+        while not self._ended.wait(self._every_s):
+            print(self.line(), file=sys.stderr, flush=True)
+
+
+def flight_line(drone: Drone, flown_s: float) -> str:
+    """Return how a flight goes in one line.
+
+    Args:
+        drone: Who flies.
+        flown_s: For how long [s].
+    """
+    feedback, video = drone.feedback(), [value for name, value in drone.stats.items() if name.startswith("video")]
+    rate, dropped = sum(channel.rate_hz for channel in video), sum(channel.dropped for channel in video)
+    parts = [
+        feedback.state.value,
+        f"{flown_s:.0f} s",
+        "" if feedback.failsafe is Failsafe.NONE else f"failsafe {feedback.failsafe.value}",
+        "" if feedback.return_phase is ReturnPhase.NONE else f"return {feedback.return_phase}",
+        "" if feedback.altitude_m is None else f"altitude {feedback.altitude_m:.2f} m",
+        "" if feedback.battery is None else f"battery {feedback.battery:.0%}",
+        f"{rate:.1f} frames/s" if video else "",
+        f"{dropped} dropped" if video else "",
+    ]
+    return "  ".join(part for part in parts if part)

@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from skyloop.cli.completion import drone_names
-from skyloop.cli.flight import Flight
-from skyloop.cli.flight_progress import FlightProgress
-from skyloop.cli.fly import ADVICE, interrupt_by_signals, land, run, say
-from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, join_network, one_drone
+from skyloop.cli.fly import ADVICE, Flight, FlightProgress, interrupt_by_signals, land, run, say
+from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, drone_names, join_network, one_drone
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
@@ -81,7 +78,7 @@ def fly_follow(
 
     A line each second on standard error shows how it goes. Ctrl-C lands. Exit code 1 if the target was lost for good.
     """
-    from skyloop.cli.piloting import connect_pilot
+    from skyloop.cli.naming import connect_pilot
     from skyloop.client import Authority
     from skyloop.control import ChaseSettings, FollowMode, FollowTarget
 

@@ -1,4 +1,4 @@
-"""``skyloop host``: many vehicles from one process, and what adds, removes and shows them."""
+"""``skyloop proxy`` turns one vehicle into a node, ``skyloop host`` serves many from one process."""
 
 from __future__ import annotations
 
@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from skyloop.cli.network import MetricsOption
+from skyloop.cli.network import (
+    ConnectOption,
+    KeysOption,
+    ListenOption,
+    MetricsOption,
+    MulticastOption,
+    ServeOption,
+    key_changes,
+    metrics_beside,
+    server_ends,
+    settings_of,
+    warn_if_open,
+)
 from skyloop.cli.text import columns
 from skyloop.errors import UsageError
 
@@ -25,6 +37,50 @@ HostOption = Annotated[
     str | None, typer.Option("--host", metavar="NAME", help="Which host, where several run [the one that runs]")
 ]
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="The vehicle's, as skyloop host status shows it")]
+
+
+def proxy(
+    uri: Annotated[str, typer.Argument(metavar="URI", help="The vehicle, e.g. sim:// or video://flight.mp4")],
+    name: Annotated[str, typer.Option(metavar="NAME", help="What applications connect to")] = "alpha",
+    group: Annotated[
+        str | None, typer.Option(metavar="GROUP", help="A group of users whose members may connect too")
+    ] = None,
+    network: ServeOption = None,
+    listen: ListenOption = None,
+    connect: ConnectOption = None,
+    multicast: MulticastOption = True,
+    keys: KeysOption = None,
+    audit: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Where who flew when is written [the user's directory of state]")
+    ] = None,
+    metrics: MetricsOption = None,
+    parent_fd: Annotated[int | None, typer.Option(hidden=True)] = None,
+) -> None:
+    """Serve one vehicle to applications, until Ctrl-C, which lands it first.
+
+    Applications are of this host, and with --network of others too.
+    """
+    from skyloop.child_process import handed_over
+    from skyloop.drivers.uri import parse_uri
+    from skyloop.proxy.serve import serve
+
+    settings = settings_of(network, listen, connect, multicast, keys)
+    vehicle = parse_uri((handed_over() if parent_fd is not None else None) or uri)
+    if vehicle.scheme == "sim":
+        from skyloop.cli.network import settle
+        from skyloop.vehicles.sim.options import options_of
+
+        settle(options_of(vehicle))
+    warn_if_open(settings, [name])
+    serve(
+        vehicle,
+        name,
+        make_end=server_ends(settings, group),
+        parent_fd=parent_fd,
+        look=key_changes(settings),
+        audit=audit,
+        beside=metrics_beside(metrics),
+    )
 
 
 def host(fleet: FleetArgument, group: GroupOption = None, metrics: MetricsOption = None) -> None:
@@ -147,8 +203,7 @@ def _ask(request: Request, host: str | None, group: str | None) -> Answer:
 
 def _prepare(fleet: Fleet) -> None:
     """Warn of an open network, and make room for the threads of simulators in this process."""
-    from skyloop.cli.network import warn_if_open
-    from skyloop.cli.simulating import settle
+    from skyloop.cli.network import settle, warn_if_open
     from skyloop.host.vehicle import network_of
     from skyloop.vehicles.sim.options import options_of
 

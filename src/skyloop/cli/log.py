@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from rich.console import Console
 
-from skyloop.cli.completion import recordings
+from skyloop.cli.naming import recordings
 from skyloop.cli.text import console
 from skyloop.errors import FileFormatError, UsageError
 

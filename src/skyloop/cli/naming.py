@@ -1,4 +1,4 @@
-"""How a command line names drones and the network: the same words and the same help for every command.
+"""How a command line names drones and the network: the same words, help and completion for every command.
 
 A drone is named by NAME; ``--drone NAME`` means the same everywhere. The network is ``--network WHERE``.
 """
@@ -6,18 +6,74 @@ A drone is named by NAME; ``--drone NAME`` means the same everywhere. The networ
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Unpack
 
 import typer
 
-from skyloop.cli.completion import drone_names, network_places
-from skyloop.errors import UsageError
+from skyloop.client import Drone, connect
+from skyloop.client.connect import ConnectOptions
+from skyloop.errors import AuthorityError, UsageError
 
+ANSWER_WITHIN_S: Final = 2.0
 MULTICAST: Final = "multicast"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
+
+
+def drone_names(incomplete: str) -> list[str]:
+    """Return the names of proxies that run on this host, sorted. Their sockets are read, nobody is asked."""
+    with suppress(Exception):  # a shell that completes shows no errors
+        from skyloop.transport.local import list_names
+
+        return sorted(proxy.name for proxy in list_names() if proxy.name.startswith(incomplete))
+    return []
+
+
+def parameter_names(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Return the parameters of the drone that the command line names already."""
+    name = ctx.params.get("name") or ctx.params.get("drone")
+    if not name:
+        return []
+    with suppress(Exception):
+        from skyloop.client import connect
+
+        with connect(name, access="observe", name="skyloop completion", timeout_s=ANSWER_WITHIN_S) as drone:
+            return [each.name for each in drone.config.parameters() if each.name.startswith(incomplete)]
+    return []
+
+
+def network_places(incomplete: str) -> list[str]:
+    """Return the place that needs no address."""
+    return [place for place in ("multicast",) if place.startswith(incomplete)]
+
+
+def recordings(incomplete: str) -> list[str]:
+    """Return recordings, and folders that may hold some."""
+    return files_ending(incomplete, {".mcap"})
+
+
+def python_files(incomplete: str) -> list[str]:
+    """Return Python files, and folders that may hold some."""
+    return files_ending(incomplete, {".py"})
+
+
+def files_ending(incomplete: str, endings: Iterable[str]) -> list[str]:
+    """Return files with these endings, and folders, that begin with what was typed."""
+    folder, _, start = incomplete.rpartition("/")
+    wanted, found = set(endings), []
+    with suppress(OSError):
+        for path in sorted(Path(folder or ("/" if incomplete.startswith("/") else ".")).iterdir()):
+            if not path.name.startswith(start) or (path.name.startswith(".") and not start):
+                continue
+            shown = f"{folder}/{path.name}" if "/" in incomplete else path.name
+            if path.is_dir():
+                found.append(f"{shown}/")
+            elif path.suffix in wanted:
+                found.append(shown)
+    return found
 
 
 def _name(metavar: str, what: str) -> Any:
@@ -130,3 +186,16 @@ def with_place(arguments: Sequence[str]) -> list[str]:
         if word == "--network" and (following.startswith("-") or "://" in following):
             words.append(MULTICAST)
     return words
+
+
+def connect_pilot(target: str, advice: str, **options: Unpack[ConnectOptions]) -> Drone:
+    """Connect as :func:`skyloop.connect` does; where another client flies, the error names it and says what to do."""
+    try:
+        return connect(target, **options)
+    except AuthorityError as error:
+        if error.code != "busy":
+            raise
+        from skyloop.cli.listing import describe
+
+        holder = describe(target).owner or "another application"
+        raise AuthorityError(f"{holder} holds the authority over {target}: {advice}", code=error.code) from error

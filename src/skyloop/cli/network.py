@@ -1,20 +1,21 @@
-"""The options of commands that serve vehicles to the network, and the transport servers that they ask for."""
+"""What commands that serve vehicles share: their options of the network, its servers, and settings of the process."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from skyloop.cli.completion import network_places
-from skyloop.cli.naming import MULTICAST
+from skyloop.cli.naming import MULTICAST, network_places
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
     from skyloop.proxy.serve import Beside
+    from skyloop.sim.options import SimOptions
     from skyloop.transport.base import TransportServer
 
 MetricsOption = Annotated[
@@ -56,6 +57,7 @@ OPEN: Final = (
 
 #: Makes the transport server of a proxy: of its name and its vehicle's address.
 MakeEnd = Callable[[str, str], "TransportServer"]
+SWITCH_INTERVAL_S: Final = 0.001
 
 
 def settings_of(
@@ -142,3 +144,19 @@ def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:
         typer.echo(
             OPEN.format(names=" and ".join(names) if len(names) < 4 else f"these {len(names)} vehicles"), err=True
         )
+
+
+def settle(options: SimOptions) -> None:
+    """Make room, in this whole process, for the threads that pass commands on beside those that step and draw.
+
+    The interpreter lock is handed over after a millisecond, not five, and OpenCV keeps to one core. Do not call it in
+    the user's process.
+
+    Raises:
+        MissingExtraError: Cameras are wanted, and what draws them is not installed.
+    """
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    if options.cameras:
+        from skyloop.sim.render import use_one_core
+
+        use_one_core()

@@ -7,8 +7,15 @@ from typing import Annotated, Final
 import msgspec
 import typer
 
-from skyloop.cli.completion import parameter_names
-from skyloop.cli.naming import DroneOption, KeysOption, NameArgument, NetworkOption, join_network, one_drone
+from skyloop.cli.naming import (
+    DroneOption,
+    KeysOption,
+    NameArgument,
+    NetworkOption,
+    join_network,
+    one_drone,
+    parameter_names,
+)
 from skyloop.cli.text import columns
 from skyloop.errors import UsageError
 from skyloop.messages import Parameter, ParameterType, Value
@@ -75,7 +82,7 @@ def _read(name: str, key: str | None) -> list[Parameter]:
 
 
 def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
-    from skyloop.cli.piloting import connect_pilot
+    from skyloop.cli.naming import connect_pilot
     from skyloop.client import Authority
 
     authority = Authority(priority=priority)

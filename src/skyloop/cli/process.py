@@ -17,8 +17,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 import msgspec
 import typer
 
-from skyloop.cli.completion import drone_names
-from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
+from skyloop.cli.naming import (
+    AnyNameArgument,
+    DroneOption,
+    KeysOption,
+    NetworkOption,
+    drone_names,
+    join_network,
+    one_drone,
+)
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.relayed import Polyline, Shape, Text
 from skyloop.processing.worker import Output
@@ -26,7 +33,7 @@ from skyloop.processing.worker import Output
 if TYPE_CHECKING:
     from skyloop.client import Frame
     from skyloop.processing import Settings, Status
-    from skyloop.vision.detection import Detection, ObjectDetector
+    from skyloop.vision.object_tracks import Detection, ObjectDetector
 
 LINE_EVERY_S: Final = 1.0
 _LOOK_S: Final = 0.1
@@ -227,7 +234,7 @@ def detect(
     """
     from skyloop.processing import Settings
     from skyloop.vision import OnnxDetector
-    from skyloop.vision.simulated import SIMULATED_WEIGHTS
+    from skyloop.vision.onnx_detector import SIMULATED_WEIGHTS
 
     join_network(network, keys)
     drone = one_drone(on, None)

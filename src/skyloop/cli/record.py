@@ -1,4 +1,4 @@
-"""``skyloop record``: everything that drones send, into a file."""
+"""``skyloop record``: everything that drones send, into a file; ``skyloop view``: live in Foxglove or Rerun."""
 
 from __future__ import annotations
 
@@ -7,21 +7,25 @@ import signal
 import sys
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn, cast
 
 import typer
 
 from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
-from skyloop.errors import SkyloopError
+from skyloop.errors import SkyloopError, UsageError
 
 if TYPE_CHECKING:
+    from skyloop.client import Drone
     from skyloop.recording import Recorder, Status
     from skyloop.recording.options import VideoEncoding
+    from skyloop.recording.view import Screen, View
 
 REFRESH_S: Final = 0.25  # on a terminal
 LINE_EVERY_S: Final = 1.0  # in a pipe
+_LOOK_S: Final = 0.5
 
 
 def record(
@@ -132,3 +136,94 @@ def _conclude(recorder: Recorder) -> None:
     )
     if status.state.value == "failed":
         raise SkyloopError(f"the recording is not complete: {status.reason}")
+
+
+def view(
+    names: NamesArgument = None,
+    drone: DronesOption = None,
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove, on this machine alone")] = False,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Show them in Rerun's viewer, which is started")] = False,
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="To listen on; beyond loopback whoever reaches it sees the drones")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int | None,
+        typer.Option(metavar="PORT", min=0, max=65535, help="Of Foxglove [8765] or Rerun [9876]; 0: any free one"),
+    ] = None,
+    write: Annotated[
+        bool, typer.Option("--write", help="Let Foxglove write parameters, under a lease that is held for that moment")
+    ] = False,
+    priority: Annotated[
+        int, typer.Option(metavar="P", min=0, max=31, help="Of who writes: 0 is the highest, 31 the lowest")
+    ] = 31,
+    connect: Annotated[
+        str | None, typer.Option(metavar="URL", help="Of a Rerun viewer that runs: rerun+http://HOST:PORT/proxy")
+    ] = None,
+    save: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="With --rerun: into this .rrd file, and no viewer")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="How long; else until Ctrl-C")] = None,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
+) -> None:
+    """Show drones live in Foxglove or Rerun until Ctrl-C. It only looks on: any application may fly meanwhile.
+
+    Foxglove connects to the address that is shown. A viewer that is slow or stands still slows nobody.
+    """
+    _refuse(foxglove, rerun, write, connect, save, port)
+    join_network(network, keys)
+    chosen = drones(names, drone)
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _interrupt)
+    with ExitStack() as stack, suppress(KeyboardInterrupt):  # how it is meant to end
+        from skyloop.client import connect as connect_to
+        from skyloop.recording.view import View, give_way
+
+        give_way()
+        known = [stack.enter_context(connect_to(name, access="observe", name="skyloop view")) for name in chosen]
+        screen: Screen
+        if foxglove:
+            screen = _foxglove(known, host, port, priority if write else None)
+        else:
+            screen = _rerun(known, host, port, connect, save)
+        _watch(stack.enter_context(View(known, screen)), math.inf if seconds is None else seconds)
+
+
+def _foxglove(known: Sequence[Drone], host: str, port: int | None, priority: int | None) -> Screen:
+    from skyloop.recording.foxglove_server import PORT, FoxgloveServer, is_loopback
+
+    server = FoxgloveServer(known, host=host, port=PORT if port is None else port, priority=priority)
+    typer.echo(f"In Foxglove: Open connection, Foxglove WebSocket, {server.url}")
+    if not is_loopback(host):
+        typer.echo(f"WARNING: whoever reaches {host} sees the drones: Foxglove's protocol knows no passwords", err=True)
+    return server
+
+
+def _rerun(known: Sequence[Drone], host: str, port: int | None, connect: str | None, save: Path | None) -> Screen:
+    from skyloop.recording.rerun_viewer import RerunViewer
+
+    viewer = RerunViewer(known, host=host, port=port, connect=connect, save=save)
+    typer.echo(f"Rerun: {viewer.target}")
+    return viewer
+
+
+def _refuse(foxglove: bool, rerun: bool, write: bool, connect: str | None, save: Path | None, port: int | None) -> None:
+    if foxglove == rerun:
+        raise UsageError("give one of --foxglove and --rerun: what the drones are to be shown in")
+    if foxglove and (connect is not None or save is not None):
+        raise UsageError("--connect and --save are of --rerun: leave them out, or choose --rerun")
+    if rerun and write:
+        raise UsageError("--write is of --foxglove: Rerun writes no parameters")
+    if connect is not None and (save is not None or port is not None):
+        raise UsageError("--connect names where the viewer is: leave out --save and --port")
+
+
+def _watch(view: View, seconds: float) -> None:
+    """Print what is subscribed to, each time that it changes."""
+    end = time.monotonic() + seconds
+    before: dict[str, list[str]] = {}
+    while (left := end - time.monotonic()) > 0:
+        time.sleep(min(_LOOK_S, left))
+        if (now := view.subscribed) != before:
+            before = now
+            typer.echo("; ".join(f"{name}: {', '.join(channels)}" for name, channels in now.items()) or "nobody looks")

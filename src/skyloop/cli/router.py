@@ -10,8 +10,7 @@ from typing import Annotated
 
 import typer
 
-from skyloop.cli.completion import network_places
-from skyloop.cli.naming import MULTICAST
+from skyloop.cli.naming import MULTICAST, network_places
 from skyloop.cli.network import (
     ConnectOption,
     KeysOption,

@@ -14,7 +14,7 @@ from skyloop.control.target_estimate import Traits
 from skyloop.control.target_follower import FollowStatus, TargetFollower
 from skyloop.errors import UsageError
 from skyloop.messages.relayed import Shape
-from skyloop.vision.detection import Detection, ObjectDetector
+from skyloop.vision.object_tracks import Detection, ObjectDetector
 from skyloop.vision.tracking import Box
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
 from skyloop.vision import LongTermTracker
 from skyloop.vision.appearance import colours
-from skyloop.vision.detection import Detection
+from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap, overlap_area
 
 _SAME: Final = 0.4  # overlap of two boxes of one thing

@@ -26,7 +26,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
 from skyloop.messages.relayed import Colour, Shape
 from skyloop.poses import mounting_rotation
-from skyloop.vision.detection import Detection, ObjectDetector
+from skyloop.vision.object_tracks import Detection, ObjectDetector
 from skyloop.vision.tracking import Box, outline
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from skyloop.clock import seconds
 from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, Traits
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.estimation import assignment
-from skyloop.vision.detection import Detection
+from skyloop.vision.object_tracks import Detection
 
 Floats = NDArray[np.float32]
 

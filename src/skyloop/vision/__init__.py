@@ -3,24 +3,17 @@
 Needs the extra ``vision``, detectors ``detect``; OpenCV and ONNX Runtime are imported when they are first used.
 """
 
-from skyloop.vision.board import Board, BoardFinder, BoardView
-from skyloop.vision.calibrating import Collector, calibrate
-from skyloop.vision.colour import BlobDetector, BlobSighting
-from skyloop.vision.correlation import CorrelationTracker
-from skyloop.vision.detection import Detection, ObjectDetector
+from skyloop.vision.appearance import LongTermTracker
+from skyloop.vision.calibrating import Board, BoardFinder, BoardView, Collector, calibrate
 from skyloop.vision.detector_layouts import Layout
 from skyloop.vision.flow import GroundTracker
-from skyloop.vision.gates import GateDetector, GateSighting
-from skyloop.vision.learned import LearnedTracker
+from skyloop.vision.gates import BlobDetector, BlobSighting, GateDetector, GateSighting, PoleDetector, PoleSighting
 from skyloop.vision.lens import project, undistort, unproject
-from skyloop.vision.long_term import LongTermTracker
 from skyloop.vision.markers import MarkerDetector, MarkerSighting
-from skyloop.vision.median_flow import MedianFlowTracker
-from skyloop.vision.object_tracks import ObjectTracks, TrackedObject
-from skyloop.vision.onnx_detector import OnnxDetector
+from skyloop.vision.object_tracks import Detection, ObjectDetector, ObjectTracks, TrackedObject
+from skyloop.vision.onnx_detector import OnnxDetector, simulated_detector
 from skyloop.vision.planar import PlanarSighting
-from skyloop.vision.poles import PoleDetector, PoleSighting
-from skyloop.vision.simulated import simulated_detector
+from skyloop.vision.trackers import CorrelationTracker, LearnedTracker, MedianFlowTracker
 from skyloop.vision.tracking import Tracker, TrackResult
 
 __all__ = [

@@ -1,24 +1,35 @@
-"""Calibration of a camera from views of a board.
+"""Calibration of a camera from views of a board, and the boards: printed, and detected in images.
 
-Zhang, "A Flexible New Technique for Camera Calibration", IEEE PAMI 22(11), 2000, as implemented by OpenCV for both
-models. Outliers among the views (a wrong corner, a blurred or bent board) are removed one by one, worst first.
+ChArUco: a chessboard with a marker in each white square, so that every corner has a number and a part of the board is
+enough (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion",
+Pattern Recognition 47(6), 2014; detection is OpenCV's). A chessboard must be seen as a whole (Duda and Frese, "Accurate
+Detection and Localization of Checkerboard Corners for Calibration", BMVC 2018).
+
+Calibration: Zhang, "A Flexible New Technique for Camera Calibration", IEEE PAMI 22(11), 2000, as implemented by OpenCV
+for both models. Outliers among the views (a wrong corner, a blurred or bent board) are removed one by one, worst first.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.calibration import Calibration
-from skyloop.errors import UsageError
-from skyloop.vision.board import BoardView
-from skyloop.vision.opencv import opencv
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.files import replacing
+from skyloop.vision.opencv import marker_dictionary, opencv
 
 Array = NDArray[np.float64]
+Kind = Literal["charuco", "chessboard"]
+MM_PER_INCH = 25.4
+_MARKER_SHARE = 0.74  # of a square's side
+_LEAST_CORNERS = 8  # of a ChArUco board in an image
 Model = Literal["pinhole", "fisheye"]
 
 LEAST_VIEWS: Final = 6
@@ -27,6 +38,178 @@ _WORST_SHARE: Final = 2.5  # a view whose error is more than so many times the m
 _WORST_PX: Final = 0.3  # if it is larger than this
 _NEW_SHARE: Final = 0.08  # of the image's width: a view whose corners moved less than this is no new one
 _STEPS: Final = (60, 1e-8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardView:
+    """The corners of a board in one image."""
+
+    points: Array  #: (n, 3) on the board [m]
+    pixels: Array  #: (n, 2) in the image
+    name: str = ""  #: of the image, for messages
+
+    @property
+    def centre(self) -> Array:
+        """Mean of the corners, (2,) [px]."""
+        return np.asarray(self.pixels.mean(axis=0))
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A board of ``columns`` × ``rows`` squares.
+
+    Raises:
+        UsageError: A number is out of its range, or the kind is unknown.
+    """
+
+    columns: int = 7
+    rows: int = 5
+    square_m: float = 0.033  #: side of a square as it was printed: measure it
+    kind: Kind = "charuco"
+    dictionary: str = "4x4_50"  #: of a ChArUco board's markers
+
+    def __post_init__(self) -> None:
+        for name, least in (("columns", 3), ("rows", 3)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 40:
+                raise UsageError(f"{name} is {value!r} and must be a whole number from {least} to 40")
+        if not 0.0 < self.square_m < math.inf:
+            raise UsageError(f"square_m is {self.square_m!r} and must be the side of a square in metres, above 0")
+        if self.kind not in ("charuco", "chessboard"):
+            raise UsageError(f"kind is {self.kind!r} and must be 'charuco' or 'chessboard'")
+
+    @property
+    def corners(self) -> int:
+        """The number of inner corners."""
+        return (self.columns - 1) * (self.rows - 1)
+
+    def picture(self, square_px: int = 100) -> NDArray[np.uint8]:
+        """Draw the board with a margin of half a square of white.
+
+        Args:
+            square_px: Side of a square.
+
+        Returns:
+            Grey image, shape (h, w), uint8.
+
+        Raises:
+            UsageError: The dictionary has fewer markers than the board needs.
+            UnknownNameError: OpenCV has no such dictionary.
+            MissingExtraError: OpenCV is not installed.
+        """
+        cv = opencv("drawing a board")
+        if self.kind == "charuco":
+            size = (self.columns * square_px, self.rows * square_px)
+            inner = np.asarray(self._charuco(cv).generateImage(size, marginSize=0), dtype=np.uint8)
+        else:
+            row, column = np.indices((self.rows, self.columns))
+            squares = np.where((row + column) % 2, 255, 0).astype(np.uint8)
+            inner = np.kron(squares, np.ones((square_px, square_px), np.uint8))
+        return np.pad(inner, square_px // 2, constant_values=255)
+
+    def save(self, path: str | Path, dpi: int = 300) -> None:
+        """Write the board at its true size for printing.
+
+        Args:
+            path: A file name that ends in ``.png`` or ``.pdf``.
+            dpi: Resolution; it is adapted slightly so that a square has a whole number of pixels.
+
+        Raises:
+            UsageError: The ending is another one, or a square would not have 20 to 2000 pixels.
+            MissingExtraError: Pillow or OpenCV is not installed.
+        """
+        file = Path(path)
+        if file.suffix.lower() not in (".png", ".pdf"):
+            raise UsageError(f"{file} must end with .png or .pdf")
+        try:
+            from PIL import Image
+        except ImportError as error:
+            raise MissingExtraError("writing a board", "vision", cause=str(error)) from error
+        square_px = round(self.square_m * 1000 / MM_PER_INCH * dpi)
+        if not 20 <= square_px <= 2000:
+            raise UsageError(
+                f"squares of {self.square_m * 1000:g} mm at {dpi} dpi are {square_px} pixels, not 20 to 2000"
+            )
+        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # makes a square exactly its size
+        with replacing(file) as part:
+            if file.suffix.lower() == ".pdf":
+                Image.fromarray(self.picture(square_px)).save(part, resolution=true_dpi)
+            else:
+                Image.fromarray(self.picture(square_px)).save(part, dpi=(true_dpi, true_dpi))
+
+    def _charuco(self, cv: Any) -> Any:
+        markers = marker_dictionary(cv, self.dictionary)
+        needed, there = self.columns * self.rows // 2, markers.bytesList.shape[0]
+        if needed > there:
+            raise UsageError(
+                f"a board of {self.columns}x{self.rows} squares needs {needed} markers, and there are {there}"
+            )
+        side = self.square_m * _MARKER_SHARE
+        return cv.aruco.CharucoBoard((self.columns, self.rows), self.square_m, side, markers)
+
+
+class BoardFinder:
+    """Detects one board in images. Holds OpenCV's scratch memory: use one finder per thread.
+
+    Attributes:
+        board: The board that is detected.
+    """
+
+    def __init__(self, board: Board) -> None:
+        """Prepare the detector.
+
+        Raises:
+            UsageError: The dictionary has fewer markers than the board needs.
+            UnknownNameError: OpenCV has no such dictionary.
+            MissingExtraError: OpenCV is not installed.
+        """
+        self.board = board
+        self._cv = opencv("finding a board")
+        self._charuco = self._detector = None
+        if board.kind == "charuco":
+            self._charuco = board._charuco(self._cv)
+            self._detector = self._cv.aruco.CharucoDetector(self._charuco)
+
+    def find(self, image: NDArray[np.uint8], name: str = "") -> BoardView | None:
+        """Detect the board.
+
+        Args:
+            image: (h, w, 3) BGR or (h, w) grey, uint8.
+            name: Of the image; the view keeps it.
+
+        Returns:
+            The board's corners; None if it is not seen well enough.
+
+        Raises:
+            UsageError: The array has another shape or type, or is empty.
+        """
+        pixels = np.asarray(image)
+        if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.size == 0:
+            raise UsageError(f"the image must be uint8, (h, w, 3) or (h, w), got {pixels.dtype} {pixels.shape}")
+        grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else np.ascontiguousarray(pixels)
+        return self._find_charuco(grey, name) if self._detector is not None else self._find_chessboard(grey, name)
+
+    def _find_charuco(self, grey: NDArray[np.uint8], name: str) -> BoardView | None:
+        assert self._detector is not None
+        assert self._charuco is not None
+        corners, ids, _, _ = self._detector.detectBoard(grey)
+        if ids is None or len(ids) < _LEAST_CORNERS:
+            return None
+        points = np.asarray(self._charuco.getChessboardCorners(), dtype=np.float64)[np.ravel(ids)]
+        if np.linalg.matrix_rank(points[:, :2] - points[0, :2], tol=1e-6) < 2:
+            return None  # collinear corners do not define a plane
+        return BoardView(points, np.asarray(corners, dtype=np.float64).reshape(-1, 2), name)
+
+    def _find_chessboard(self, grey: NDArray[np.uint8], name: str) -> BoardView | None:
+        board = self.board
+        inner = (board.columns - 1, board.rows - 1)
+        found, corners = self._cv.findChessboardCornersSB(grey, inner, flags=self._cv.CALIB_CB_ACCURACY)
+        if not found:
+            return None
+        row, column = np.indices((inner[1], inner[0]))
+        places = np.column_stack([column.ravel(), row.ravel(), np.zeros(row.size)]).astype(np.float64)
+        points: Array = places * board.square_m
+        return BoardView(points, np.asarray(corners, dtype=np.float64).reshape(-1, 2), name)
 
 
 class Collector:

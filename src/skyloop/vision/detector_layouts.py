@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, UsageError
-from skyloop.vision.detection import Floats
+from skyloop.vision.object_tracks import Floats
 
 
 class Layout(StrEnum):

@@ -1,4 +1,4 @@
-"""Detection of gates of a known colour and size, and their poses.
+"""Detection of things of one colour in an image, of gates of a known size with their poses, and of upright poles.
 
 A gate is a frame of one colour around an opening. Of what has that colour, a hole that is bounded by four straight
 sides is an opening. The sides are fitted to the hole's edge after the lens distortion is removed (OpenCV's ``fitLine``
@@ -16,17 +16,128 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
-from skyloop.messages import Intrinsics
-from skyloop.vision.colour import ColourMask, Rgb
+from skyloop.messages import CameraInfo, Intrinsics
 from skyloop.vision.lens import normalised, project
 from skyloop.vision.opencv import opencv
 from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, rectangle
 
+Rgb = tuple[int, int, int]
+
+_HUE_DEG: Final = 16.0  # on each side of the colour's own
+_SATURATION: Final = 0.5  # of the colour's own: paint in the light and in the shade
+_LEAST_SATURATION: Final = 80  # of 255: a colour with less is too grey to be distinguished from others
+_LEAST_VALUE: Final = 35  # of 255: darker pixels have no hue worth the name
 _LEAST_AREA_PX: Final = 150.0  # smaller openings say little about the distance
 _FARTHEST_M: Final = 8.0  # a farther one is more likely a patch of the same colour
 _SIDE_SHARE: Final = 0.15  # of each side, at both ends, that is not fitted: the corners are round
 _FILLED: Final = 0.6  # of the four-sided hull: something of the same colour behind the gate may reach into the hole
 _OFF_PX: Final = 1.5  # the edge's root mean square distance from its four sides
+_LEAST_HEIGHT_PX: Final = 20
+_SLIM: Final = 3.0  # so much higher than wide
+_ABOVE_PX: Final = 6
+_COLOURFUL: Final = 100  # of 255
+_LEAST_SHARE: Final = 0.8  # of the rows in its middle where it is one piece: two behind each other aren't
+
+
+class ColourMask:
+    """Selects pixels by their colour: by the hue, with enough saturation, at any brightness."""
+
+    def __init__(self, colour: Rgb) -> None:
+        """Prepare the mask.
+
+        Args:
+            colour: Red, green, blue, 0 to 255.
+
+        Raises:
+            UsageError: That is no colour, or too grey to have a hue.
+            MissingExtraError: OpenCV is not installed.
+        """
+        if len(colour) != 3 or not all(isinstance(part, int) and 0 <= part <= 255 for part in colour):
+            raise UsageError(f"colour is {colour!r} and must be red, green and blue, each from 0 to 255")
+        self._cv = opencv("finding a colour")
+        hue, saturation, _ = self._cv.cvtColor(np.array([[colour[::-1]]], np.uint8), self._cv.COLOR_BGR2HSV)[0, 0]
+        if saturation < _LEAST_SATURATION:
+            raise UsageError(f"colour {colour!r} is too grey to be distinguished from its surroundings")
+        self._hue, self._saturation = int(hue), int(saturation * _SATURATION)
+
+    def of(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the mask of a BGR image (h, w, 3): 255 where it has the colour, 0 elsewhere, (h, w), uint8."""
+        cv = self._cv
+        hsv = cv.cvtColor(cv.GaussianBlur(pixels, (3, 3), 0), cv.COLOR_BGR2HSV)
+        reach = round(_HUE_DEG / 2)  # OpenCV's hue goes round in 180 steps
+        turned = hsv.copy()
+        turned[..., 0] = (hsv[..., 0].astype(np.int16) - self._hue + 90) % 180
+        mask = cv.inRange(turned, (90 - reach, self._saturation, _LEAST_VALUE), (90 + reach, 255, 255))
+        return np.asarray(cv.morphologyEx(mask, cv.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class BlobSighting:
+    """One thing of a colour in one image."""
+
+    box: tuple[float, float, float, float]  #: left, top, right, bottom [px]
+    left_rad: float  #: its left edge, from the optical axis, positive to the left
+    right_rad: float  #: its right edge, the same way: less than the left one
+
+    @property
+    def bearing_rad(self) -> float:
+        """Angle of its middle from the optical axis, positive to the left."""
+        return (self.left_rad + self.right_rad) / 2
+
+    @property
+    def width_rad(self) -> float:
+        """Its apparent width."""
+        return self.left_rad - self.right_rad
+
+    @property
+    def outline(self) -> tuple[tuple[float, float], ...]:
+        """The corners of its box, for annotations."""
+        left, top, right, bottom = self.box
+        return (left, top), (right, top), (right, bottom), (left, bottom)
+
+
+class BlobDetector:
+    """Detects connected areas of a colour that are large enough."""
+
+    def __init__(self, colour: Rgb, least_px: int = 12) -> None:
+        """Prepare the detector.
+
+        Args:
+            colour: Red, green, blue, 0 to 255.
+            least_px: Narrower or lower areas are left out.
+
+        Raises:
+            UsageError: That is no colour, or too grey to have a hue.
+            MissingExtraError: OpenCV is not installed.
+        """
+        self._mask = ColourMask(colour)
+        self._cv = opencv("finding a colour")
+        self._least_px = least_px
+
+    def detect(self, image: NDArray[np.uint8], intrinsics: Intrinsics | None = None) -> list[BlobSighting]:
+        """Detect everything of the colour.
+
+        Args:
+            image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
+            intrinsics: Of the camera; None takes the frame's.
+
+        Returns:
+            The sightings, the widest first.
+
+        Raises:
+            UsageError: The array has another shape or type, or there are no intrinsics.
+        """
+        pixels, intrinsics = checked(image, intrinsics, colour=True)
+        count, _, boxes, _ = self._cv.connectedComponentsWithStats(self._mask.of(pixels))
+        found = []
+        for x, y, width, height, _ in boxes[1:count].tolist():
+            if width < self._least_px or height < self._least_px:
+                continue
+            middle = y + height / 2
+            edges = np.array([[x, middle], [x + width - 1, middle]], np.float64)
+            left, right = np.arctan(-normalised(edges, intrinsics)[:, 0]).tolist()
+            found.append(BlobSighting((x, y, x + width, y + height), left, right))
+        return sorted(found, key=lambda one: -one.width_rad)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -156,3 +267,93 @@ def _along(edge: Array, begin: Array, end: Array) -> Array:
     near = aside < max(2.0, 0.03 * length)
     kept: Array = edge[near & (ahead > _SIDE_SHARE) & (ahead < 1.0 - _SIDE_SHARE)]
     return kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoleSighting:
+    """One pole in one image.
+
+    Attributes:
+        top: The middle of its upper end, (2,) pixels.
+        ray: Through that, in optical axes, (3,), z = 1.
+        width_px: In the middle of its height.
+    """
+
+    top: Array
+    ray: Array
+    width_px: float
+
+    def ray_in_body(self, camera: CameraInfo) -> Array:
+        """Return the ray in body axes, (3,)."""
+        turned: Array = np.asarray(camera.rotation, dtype=np.float64).reshape(3, 3) @ self.ray
+        return turned
+
+
+class PoleDetector:
+    """Detects poles of one colour, in images that are upright within about 30°."""
+
+    def __init__(self, colour: Rgb) -> None:
+        """Prepare the detector.
+
+        Args:
+            colour: Red, green, blue, 0 to 255.
+
+        Raises:
+            UsageError: That is no colour, or too grey to have a hue.
+            MissingExtraError: OpenCV is not installed.
+        """
+        self._cv = opencv("pole detection")
+        self._mask = ColourMask(colour)
+
+    def detect(self, image: NDArray[np.uint8], intrinsics: Intrinsics | None = None) -> list[PoleSighting]:
+        """Detect all poles in an image.
+
+        Args:
+            image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
+            intrinsics: Of the camera; None takes the frame's.
+
+        Returns:
+            The sightings, the widest first.
+
+        Raises:
+            UsageError: The array has another shape or type, or there are no intrinsics.
+        """
+        pixels, intrinsics = checked(image, intrinsics, colour=True)
+        count, labels, boxes, _ = self._cv.connectedComponentsWithStats(self._mask.of(pixels))
+        found = []
+        for label, (x, y, width, height, area) in enumerate(boxes[:count].tolist()):
+            if label == 0 or height < _LEAST_HEIGHT_PX or area * _SLIM > height * height:
+                continue
+            if x == 0 or y == 0 or x + width == pixels.shape[1]:  # not the whole of it is seen, nor its top
+                continue
+            line = _line(labels[y : y + height, x : x + width] == label)
+            if line is None:
+                continue
+            middle, width_px = line
+            if self._hidden(pixels, x + middle, y):
+                continue
+            top = np.array([x + middle, y - 0.5])
+            flat = normalised(top[None], intrinsics)[0]
+            if np.isfinite(flat).all():
+                found.append(PoleSighting(top, np.array([*flat, 1.0]), width_px))
+        return sorted(found, key=lambda one: -one.width_px)
+
+    def _hidden(self, pixels: NDArray[np.uint8], x: float, y: int) -> bool:
+        """Return whether something colourful is right above: a gate's bar that hides the top, more likely than not."""
+        column = min(max(round(x), 0), pixels.shape[1] - 1)
+        above = pixels[max(0, y - _ABOVE_PX) : max(1, y - 1), column : column + 1]
+        return bool((self._cv.cvtColor(above, self._cv.COLOR_BGR2HSV)[..., 1] > _COLOURFUL).any())
+
+
+def _line(shape: NDArray[np.bool_]) -> tuple[float, float] | None:
+    """Return where a leaning pole ends at the top, from the left, and its width; None for what is not one piece."""
+    rows = np.arange(len(shape))
+    first, last = shape.argmax(axis=1), shape.shape[1] - 1 - shape[:, ::-1].argmax(axis=1)
+    whole = shape.any(axis=1) & (shape.sum(axis=1) == last - first + 1)
+    if whole.mean() < _LEAST_SHARE:
+        return None
+    upper = whole & (rows <= len(shape) // 2)
+    if upper.sum() < 2:
+        return None
+    middle = float(np.polyval(np.polyfit(rows[upper], (first + last)[upper] / 2, 1), 0.0))
+    return middle, float(np.median((last - first + 1)[whole]))

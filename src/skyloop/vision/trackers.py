@@ -1,0 +1,375 @@
+"""Trackers of a box from one image to the next: by a correlation filter, by the flow of points, and learned ones.
+
+**Correlation.** A filter is learned whose correlation with the patch around the target is a narrow peak at its middle.
+It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using adaptive
+correlation filters", CVPR 2010), over several channels of gradients and colours and a patch larger than the target
+(Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation filters", TPAMI 37, 2015; its
+linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17 sizes (Danelljan, Häger, Khan
+and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
+
+**Median flow.** Kalal, Mikolajczyk and Matas, "Forward-backward error: automatic detection of tracking failures", ICPR
+2010: a grid of points is tracked to the next image and back by pyramidal Lucas-Kanade. The half that comes back nearest
+to where it began, of those the half whose surroundings look most alike, give the motion by the median of their
+displacements, and the scale by the median of how their distances changed.
+
+**Learned.** ViTTrack (``cv2.TrackerVit``) is one ONNX file, NanoTrack (``cv2.TrackerNano``) two: backbone, and neck and
+head.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import FileFormatError, UnsupportedError, UsageError
+from skyloop.messages.geometry import within
+from skyloop.vision import onnx
+from skyloop.vision.opencv import opencv
+from skyloop.vision.tracking import CELL, Box, Floats, Image, Tracker, TrackResult, features, overlap_area, patch
+
+Spectrum = NDArray[np.complex64]
+
+_AREA_PX: Final = 128.0**2  # of the patch around the target, sampled
+_CONTEXT: Final = 1.5  # times the root of the target's area, added to its width and height
+_RATE: Final = 0.02  # how much of each image is learned
+_SCALE_RATE: Final = 0.02
+_REGULARISATION: Final = 0.02  # of the mean energy of the spectrum
+_SPREAD: Final = 0.08  # of the peak, of the target's size
+_SCALES: Final = 17
+_SCALE_STEP: Final = 1.03
+_SCALE_SPREAD: Final = 1.0  # steps
+_SCALE_AREA_PX: Final = 32.0**2
+_SMALLEST: Final = 0.2  # times the size at the start
+_LARGEST: Final = 6.0  # times the size at the start
+_LEAST_PX: Final = 4.0
+_GRID: Final = 10  # points along each side
+_WINDOW: Final = (11, 11)
+_LEVELS: Final = 3
+_AROUND: Final = (9, 9)  # pixels of a point's surroundings that are compared
+_ENOUGH: Final = 6  # points
+_RETURN_PX: Final = 5.0  # a median that comes back farther away is a failure
+_SPREAD_PX: Final = 0.35  # of the box's smaller side: more disagreement among the displacements is a failure
+_SMALLEST_PX: Final = 6.0
+
+
+class _Filter:
+    """A ridge regression in the Fourier domain, with all channels sharing one denominator."""
+
+    def __init__(self, wanted: Spectrum, rate: float) -> None:
+        self._wanted = wanted
+        self._rate = rate
+        self._above: Spectrum | None = None
+        self._below: Floats | None = None
+
+    def learn(self, spectrum: Spectrum) -> None:
+        """Learn from a patch's spectrum, channels first: the first one wholly, the others a little."""
+        above = np.conj(self._wanted) * spectrum
+        below = np.sum(spectrum.real**2 + spectrum.imag**2, axis=0)
+        if self._above is None or self._below is None:
+            self._above, self._below = above, below
+        else:
+            self._above += self._rate * (above - self._above)
+            self._below += self._rate * (below - self._below)
+
+    def response(self, spectrum: Spectrum) -> Spectrum:
+        """Return the spectrum of the response."""
+        assert self._above is not None
+        assert self._below is not None
+        below = self._below + _REGULARISATION * self._below.mean()
+        return np.asarray(np.sum(np.conj(self._above) * spectrum, axis=0) / below, np.complex64)
+
+
+class CorrelationTracker(Tracker):
+    """Tracks place and size of a target by correlation filters: fast, and the default.
+
+    It follows what changes slowly, and moves by less than half of its size from image to image. The score is the height
+    of the correlation peak: about 1 on the image that it was learned from, and below ``lost_below`` the target counts
+    as lost. While it is lost it is looked for where it was last. For loss, memory and search, see
+    :class:`LongTermTracker`.
+    """
+
+    def __init__(self, *, lost_below: float = 0.3, learn_above: float = 0.4) -> None:
+        """Prepare the tracker.
+
+        Args:
+            lost_below: Score below which the target is lost.
+            learn_above: Score below which nothing is learned.
+
+        Raises:
+            MissingExtraError: OpenCV is not installed.
+        """
+        self._cv: Any = opencv("tracking")
+        self._lost_below, self._learn_above = lost_below, learn_above
+        self._centre: NDArray[np.float64] = np.zeros(2)  # of the target [px]
+
+    def shift(self, right: float, down: float) -> None:
+        """Look for the target so much farther right and down in the next image [px]; it was started before."""
+        self._centre = np.add(self._centre, (right, down))
+
+    def _start(self, image: Image, box: Box) -> None:
+        x, y, width, height = box
+        self._centre = np.array([x + width / 2, y + height / 2])
+        self._size = np.array([width, height])
+        self._scale = 1.0
+        extra = _CONTEXT * math.sqrt(width * height)
+        self._around = self._size + extra  # the patch in the image, at scale 1
+        self._sampled = _in_cells(self._around, _AREA_PX)
+        self._scale_sampled = _in_cells(self._size, _SCALE_AREA_PX)
+        columns, rows = self._sampled[0] // CELL, self._sampled[1] // CELL
+        self._window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(columns + 2)[1:-1]).astype(np.float32)
+        cells = np.array([columns, rows]) * self._size / self._around  # of the target
+        wanted = np.outer(_peak(rows, _SPREAD * cells[1] + 0.5), _peak(columns, _SPREAD * cells[0] + 0.5))
+        self._filter = _Filter(np.asarray(np.fft.rfft2(wanted), np.complex64), _RATE)
+        self._steps = _SCALE_STEP ** (np.arange(_SCALES) - _SCALES // 2)
+        self._scale_window = np.hanning(_SCALES + 2)[1:-1].astype(np.float32)
+        self._scale_filter = _Filter(np.asarray(np.fft.rfft(_peak(_SCALES, _SCALE_SPREAD)), np.complex64), _SCALE_RATE)
+        self._learn(image)
+
+    def _update(self, image: Image) -> TrackResult:
+        response = np.fft.irfft2(self._filter.response(self._spectrum(image)), s=self._window.shape)
+        row, column = np.unravel_index(int(np.argmax(response)), response.shape)
+        score = within(float(response[row, column]), 0.0, 1.0)
+        rows, columns = response.shape
+        moved = np.array(
+            [
+                _signed(_refined(response[row, :], int(column)), columns),
+                _signed(_refined(response[:, column], int(row)), rows),
+            ]
+        )
+        centre = self._centre + moved * self._around * self._scale / (columns, rows)
+        inside = bool((centre >= 0).all() and centre[0] < image.shape[1] and centre[1] < image.shape[0])
+        if score < self._lost_below or not inside:
+            return TrackResult(None, score)
+        self._centre = centre
+        self._rescale(image)
+        if score >= self._learn_above:
+            self._learn(image)
+        return TrackResult(self._box(self._size * self._scale), score)
+
+    def _rescale(self, image: Image) -> None:
+        response = np.fft.irfft(self._scale_filter.response(self._scale_spectrum(image)), n=_SCALES)
+        step = _signed(_refined(response, int(np.argmax(response))), _SCALES)
+        scale = self._scale * _SCALE_STEP ** float(step)
+        most = min(_LARGEST, float(min(np.array(image.shape[1::-1]) / self._size)) * 1.2)
+        least = max(_SMALLEST, _LEAST_PX / float(min(self._size)))
+        self._scale = min(max(scale, min(least, 1.0)), max(most, 1.0))
+
+    def _learn(self, image: Image) -> None:
+        self._filter.learn(self._spectrum(image))
+        self._scale_filter.learn(self._scale_spectrum(image))
+
+    def _box(self, size: NDArray[np.float64]) -> Box:
+        x, y = (self._centre - size / 2).tolist()
+        return x, y, float(size[0]), float(size[1])
+
+    def _spectrum(self, image: Image) -> Spectrum:
+        pixels = patch(self._cv, image, self._box(self._around * self._scale), self._sampled)
+        return np.asarray(np.fft.rfft2(features(self._cv, pixels) * self._window), np.complex64)
+
+    def _scale_spectrum(self, image: Image) -> Spectrum:
+        """The spectrum over the sizes of each feature of the target, (features, _SCALES // 2 + 1)."""
+        width, height = self._scale_sampled
+        largest = float(self._steps[-1])
+        finer = (round(width * largest * 1.5), round(height * largest * 1.5))
+        whole = patch(self._cv, image, self._box(self._size * self._scale * largest), finer)
+        sizes = []
+        for step in self._steps / largest:
+            part = (finer[0] * (1 - step) / 2, finer[1] * (1 - step) / 2, finer[0] * step, finer[1] * step)
+            sizes.append(patch(self._cv, whole, part, self._scale_sampled))
+        cells = features(self._cv, np.concatenate(sizes))  # all sizes one below the other
+        each = cells.reshape(len(cells), _SCALES, -1).transpose(0, 2, 1).reshape(-1, _SCALES)
+        return np.asarray(np.fft.rfft(each * self._scale_window, axis=1), np.complex64)
+
+
+def _in_cells(size: NDArray[np.float64], area_px: float) -> tuple[int, int]:
+    """Return width and height with about this area and the shape of a size, in whole cells, an even number of them."""
+    share = math.sqrt(area_px / float(size[0] * size[1]))
+    width, height = (max(2, round(float(side) * share / CELL / 2) * 2) * CELL for side in size)
+    return width, height
+
+
+def _peak(count: int, spread: float) -> NDArray[np.float64]:
+    """Return a Gaussian whose middle is the first of a ring of values."""
+    away = np.minimum(np.arange(count), count - np.arange(count))
+    return np.asarray(np.exp(-0.5 * (away / spread) ** 2))
+
+
+def _signed(place: float, count: int) -> float:
+    return place - count if place > count / 2 else place
+
+
+def _refined(values: NDArray[np.floating[Any]], at: int) -> float:
+    """Return the place of a peak between the values of a ring, from the parabola through it and its neighbours."""
+    before, here, after = float(values[at - 1]), float(values[at]), float(values[(at + 1) % len(values)])
+    bend = before - 2 * here + after
+    return at if bend >= 0 else at + 0.5 * (before - after) / bend
+
+
+class MedianFlowTracker(Tracker):
+    """Tracks place and size of a target from each image to the next, and remembers no appearance.
+
+    It is exact while the target is in view and moves smoothly, and notices at once when that fails. Then it stays lost
+    until it is started again. It drifts, as it never compares with the beginning. The score says how many points came
+    back, and how near.
+    """
+
+    def __init__(self) -> None:
+        """Prepare the tracker.
+
+        Raises:
+            MissingExtraError: OpenCV is not installed.
+        """
+        self._cv: Any = opencv("tracking")
+        self._box: Box | None = None
+
+    def _start(self, image: Image, box: Box) -> None:
+        self._grey, self._box = self._grey_of(image), box
+
+    def _update(self, image: Image) -> TrackResult:
+        if self._box is None:
+            return TrackResult(None, 0.0)
+        grey = self._grey_of(image)
+        self._box, score = self._follow(grey, self._box)
+        self._grey = grey
+        return TrackResult(self._box, score)
+
+    def _grey_of(self, image: Image) -> Image:
+        grey = self._cv.cvtColor(image, self._cv.COLOR_BGR2GRAY) if image.ndim == 3 else image.copy()
+        return np.asarray(grey, np.uint8)
+
+    def _follow(self, grey: Image, box: Box) -> tuple[Box | None, float]:
+        before = _grid(box)
+        after, off, good = self._there_and_back(grey, before)
+        rows, columns = grey.shape
+        good &= (after >= 0).all(axis=1) & (after[:, 0] <= columns - 1) & (after[:, 1] <= rows - 1)
+        good &= (before >= 0).all(axis=1) & (before[:, 0] <= columns - 1) & (before[:, 1] <= rows - 1)
+        if np.count_nonzero(good) < _ENOUGH:
+            return None, 0.0
+        back = float(np.median(off[good]))
+        nearest = good & (off <= back)
+        alike = np.full(len(before), -1.0)
+        alike[nearest] = self._similarity(grey, before[nearest], after[nearest])
+        kept = nearest & (alike >= np.median(alike[nearest]))
+        before, after = before[kept], after[kept]
+        moved = after - before
+        shift = np.median(moved, axis=0)
+        spread = float(np.median(np.linalg.norm(moved - shift, axis=1)))
+        if back > _RETURN_PX or spread > _SPREAD_PX * min(box[2:]) or len(before) < 2:
+            return None, 0.0
+        scale = _stretch(before, after)
+        width, height = box[2] * scale, box[3] * scale
+        x = box[0] + float(shift[0]) - (width - box[2]) / 2
+        y = box[1] + float(shift[1]) - (height - box[3]) / 2
+        found = (x, y, width, height)
+        if min(width, height) < _SMALLEST_PX or overlap_area(found, (0.0, 0.0, columns, rows)) < 0.25 * width * height:
+            return None, 0.0
+        score = float(np.count_nonzero(good & (off < 1.0)) / len(off)) * max(0.0, float(np.median(alike[kept])))
+        return found, min(score, 1.0)
+
+    def _there_and_back(self, grey: Image, before: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Return where the points are now, how far from their start they come back, and which could be tracked."""
+        cv = self._cv
+        points = before.reshape(-1, 1, 2)
+        after, forth, _ = cv.calcOpticalFlowPyrLK(self._grey, grey, points, None, winSize=_WINDOW, maxLevel=_LEVELS)
+        again, back, _ = cv.calcOpticalFlowPyrLK(grey, self._grey, after, None, winSize=_WINDOW, maxLevel=_LEVELS)
+        off = np.linalg.norm((again - points).reshape(-1, 2), axis=1)
+        return after.reshape(-1, 2), off, (forth.ravel() == 1) & (back.ravel() == 1)
+
+    def _similarity(self, grey: Image, before: Floats, after: Floats) -> Floats:
+        """Return the normalised cross-correlation of the points' surroundings, −1 to 1."""
+        cut = self._cv.getRectSubPix
+        old = np.stack([cut(self._grey, _AROUND, (float(x), float(y))) for x, y in before]).astype(np.float32)
+        new = np.stack([cut(grey, _AROUND, (float(x), float(y))) for x, y in after]).astype(np.float32)
+        old -= old.mean(axis=(1, 2), keepdims=True)
+        new -= new.mean(axis=(1, 2), keepdims=True)
+        energy = np.sqrt((old**2).sum(axis=(1, 2)) * (new**2).sum(axis=(1, 2)))
+        return np.asarray((old * new).sum(axis=(1, 2)) / np.maximum(energy, 1e-3), np.float32)
+
+
+def _grid(box: Box) -> Floats:
+    """Return points in the box, evenly spaced and not at its edge, (n, 2) pixels."""
+    x, y, width, height = box
+    share = (np.arange(_GRID) + 0.5) / _GRID
+    across, down = np.meshgrid(x + width * share - 0.5, y + height * share - 0.5)
+    return np.stack([across.ravel(), down.ravel()], axis=1).astype(np.float32)
+
+
+def _stretch(before: Floats, after: Floats) -> float:
+    """Return by how much the distances between the points grew: the median over all pairs."""
+    one, other = np.triu_indices(len(before), k=1)
+    old = np.linalg.norm(before[one] - before[other], axis=1)
+    new = np.linalg.norm(after[one] - after[other], axis=1)
+    return float(np.median(new / np.maximum(old, 1e-6)))
+
+
+class LearnedTracker(Tracker):
+    """Tracks by a neural network, through OpenCV, on the processor. The score is the network's own.
+
+    The weights are not part of Skyloop: the OpenCV Zoo offers ``object_tracking_vittrack_2023sep.onnx``, the repository
+    of NanoTrack its two files.
+    """
+
+    def __init__(self, weights: Path | str, head: Path | str | None = None, *, lost_below: float = 0.3) -> None:
+        """Load the weights.
+
+        Args:
+            weights: ONNX file of ViTTrack or, with ``head``, of NanoTrack's backbone.
+            head: ONNX file of NanoTrack's neck and head.
+            lost_below: Score below which the target is lost.
+
+        Raises:
+            MissingExtraError: OpenCV is not installed.
+            UnsupportedError: This OpenCV was built without that tracker.
+            UsageError: A file is not there.
+            FileFormatError: A file is not the weights of that tracker, or takes too much to load (tried in a child
+                process, as in :func:`skyloop.vision.onnx.load_network`).
+        """
+        self._cv: Any = opencv("tracking")
+        self._lost_below = lost_below
+        name = "TrackerVit" if head is None else "TrackerNano"
+        if not (hasattr(self._cv, f"{name}_create") and hasattr(self._cv, f"{name}_Params")):
+            raise UnsupportedError(
+                f"this OpenCV, {self._cv.__version__}, has no {name}: install opencv-python-headless 4.10 or newer"
+            )
+        self._name, files = name, [_existing(path) for path in (weights, head) if path is not None]
+        self._given = ", ".join(files)
+        onnx.try_alone(*files, tracker=name)
+        try:
+            self._tracker: Any = onnx.load_tracker(self._cv, name, files)
+        except self._cv.error as error:
+            raise FileFormatError(
+                f"{self._given} can't be loaded as the weights of {name}: {onnx.reason(error)}"
+            ) from error
+
+    def _start(self, image: Image, box: Box) -> None:
+        x, y, width, height = (round(part) for part in box)
+        self._call("init", self._coloured(image), (x, y, width, height))
+
+    def _update(self, image: Image) -> TrackResult:
+        _, found = self._call("update", self._coloured(image))
+        score = within(float(self._tracker.getTrackingScore()), 0.0, 1.0)
+        x, y, width, height = (float(part) for part in found)
+        lost = score < self._lost_below or width <= 0 or height <= 0
+        return TrackResult(None if lost else (x, y, width, height), score)
+
+    def _call(self, method: str, *arguments: Any) -> Any:
+        """Call OpenCV's tracker; a file with another network often loads, and fails here."""
+        try:
+            return getattr(self._tracker, method)(*arguments)
+        except self._cv.error as error:
+            raise FileFormatError(
+                f"{self._given} does not work as the weights of {self._name}: {onnx.reason(error)}"
+            ) from error
+
+    def _coloured(self, image: Image) -> Any:
+        return image if image.ndim == 3 else self._cv.cvtColor(image, self._cv.COLOR_GRAY2BGR)
+
+
+def _existing(path: Path | str) -> str:
+    if not Path(path).is_file():
+        raise UsageError(f"there is no file {path}: give the ONNX file with the tracker's weights")
+    return str(path)
