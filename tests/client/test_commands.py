@@ -362,11 +362,42 @@ def test_a_reason_is_no_older_than_the_last_change_of_what_it_speaks_of(proxy: S
     thread.join(WAIT_S)
 
 
-def test_a_take_off_that_a_failsafe_ended_is_not_asked_for_anew(proxy: ScriptedProxy, drone: Drone) -> None:
-    taking_off = background(lambda: failsafe(proxy, proxy.until_commanded(Takeoff())))
-    with pytest.raises(NoAnswerError, match="takeoff was not completed"):
-        drone.takeoff(timeout_s=0.5)
+@pytest.mark.parametrize(
+    ("ending", "why"),
+    [
+        (failsafe, "a failsafe took over"),
+        (not_fresh, "the authority was granted anew, lost or given back"),
+        (lost_link, "the application's own was lost"),
+        (lost_lease, "the authority was granted anew, lost or given back"),
+    ],
+)
+@pytest.mark.parametrize("state", [FlightState.LANDED, FlightState.LANDING, FlightState.HOVERING])
+def test_a_take_off_that_a_failsafe_or_a_new_lease_ended_raises_at_once_and_is_not_asked_for_anew(
+    proxy: ScriptedProxy,
+    drone: Drone,
+    ending: Callable[[ScriptedProxy, Command], None],
+    why: str,
+    state: FlightState,
+) -> None:
+    """It waited for its whole time-out."""
+
+    def vehicle() -> None:
+        first = proxy.until_commanded(Takeoff())
+        if state is not FlightState.LANDED:
+            proxy.state = FlightState.TAKING_OFF
+            drone.wait(lambda feedback: feedback.state is FlightState.TAKING_OFF, WAIT_S)
+        ending(proxy, first)
+        proxy.state = state
+
+    taking_off = background(vehicle)
+    if state is FlightState.HOVERING:
+        drone.takeoff(timeout_s=100.0)  # what rose by then ends in a hover, which is what was asked for
+    else:
+        with pytest.raises(RefusedError, match=f"takeoff was ended on the way, as .*{why}: take off again") as raised:
+            drone.takeoff(timeout_s=100.0)
+        assert raised.value.code == "not_fresh"
     taking_off.join(WAIT_S)
+    proxy.from_now_on(Idle())
     assert len({command.intent for command in proxy.commands if command.action == Takeoff()}) == 1
 
 

@@ -24,9 +24,9 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.proxy.core.flight import BELIEF_NS
+from skyloop.proxy.core.flight import BELIEF_NS, Whose
 from skyloop.transport.testing import wait_until
-from tests.proxy.fake import App, Bench
+from tests.proxy.fake import ALL, App, Bench
 
 
 def steps(app: App) -> list[tuple[object, object]]:
@@ -229,6 +229,47 @@ def test_a_landing_that_is_under_way_outlives_a_broken_link_for_a_minute(bench: 
     assert Land() not in bench.driver.told
     (event,) = bench.published(EventKind.VEHICLE_MESSAGE)
     assert event.data["reason"] == "landing_given_up"
+
+
+@pytest.mark.parametrize("native", [ALL, ALL - {"land"}], ids=["native", "software"])
+@pytest.mark.parametrize("found", ["flying", "landed"])
+def test_the_failsafes_own_landing_is_given_up_after_a_minute_in_which_nothing_was_heard(
+    native: frozenset[str], found: str
+) -> None:
+    """It asked for ever: somebody else's vehicle that was found minutes later was landed."""
+    with Bench(native) as bench:
+        pilot, witness = bench.airborne(), bench.join("witness")
+        bench.driver.answers = False
+        bench.driver.report(state=FlightState.FLYING)
+        bench.driver.link(LinkState.LOST, "a dead downlink")
+        pilot.end.close()
+        wait_until(lambda: bench.proxy.handler.authority.holder is None, "its end is noticed")
+
+        def told() -> list[str]:
+            return [str(event.data["reason"]) for event in witness.told(EventKind.VEHICLE_MESSAGE)]
+
+        def pass_time(seconds: int) -> None:
+            for _ in range(seconds):
+                bench.clock.advance(1.0)
+                bench.tick()
+
+        pass_time(64)
+        assert "landing_given_up" not in told()
+        sinks = Land() if "land" in native else bench.driver.told[-1]
+        assert bench.driver.told[-1] == sinks
+        assert steps(witness)[-1][0] == "land"
+        pass_time(2)
+        assert told().count("landing_given_up") == 1
+        bench.driver.told.clear()
+        pass_time(5)
+        bench.driver.link(LinkState.UP)
+        bench.driver.report(state=FlightState.FLYING if found == "flying" else FlightState.LANDED)
+        bench.run(10.0, lambda: bench.driver.report())
+        assert bench.driver.told == [], "whose it is by now, nobody here knows"
+        assert told().count("landing_given_up") == 1
+        assert steps(witness)[-1][0] == "none"
+        if found == "flying":
+            assert bench.proxy.handler.flight.whose is Whose.OTHERS
 
 
 def test_one_that_only_the_software_can_fly_is_given_up_as_well() -> None:

@@ -37,6 +37,7 @@ from skyloop.messages import (
 from skyloop.messages.command import SET_POINTS
 from skyloop.messages.feedback import is_on_earth
 from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.intent import ENDINGS
 
 AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
 #: Where the proxy does not tell: feedback received sooner after a command may be older than it.
@@ -361,8 +362,15 @@ class ActionWait:
             if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
                 self._again()
             return None
-        if outcome.fate in OUTDONE or outcome.fate in OVERRULED:
+        if outcome.fate in OUTDONE:
             return None  # what has begun ends by itself
+        if outcome.fate in OVERRULED:
+            newest = self._state.newest
+            rose = newest is not None and newest.state.airborne and newest.state is not FlightState.LANDING
+            if rose or not self._commands.may_ask:  # what rose by then hovers in the end, and it is done
+                return None
+            text = f"takeoff was ended on the way, as {ENDINGS[outcome.fate]}: take off again"
+            return RefusedError(text, code=Refusal.NOT_FRESH)
         return _refused(outcome)
 
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:

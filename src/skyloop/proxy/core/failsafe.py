@@ -185,7 +185,7 @@ class FailsafeLadder:
 
     def hand_over(self, now_ns: int) -> None:
         """The authority changes hands: hover in between, unless the vehicle is landing for a reason."""
-        if not isinstance(self._wanted, Land | ReturnToStart):
+        if not self.lands:
             self._want(Hover(), now_ns)
 
     @property
@@ -193,9 +193,14 @@ class FailsafeLadder:
         """Whether it goes on with a pilot's landing."""
         return isinstance(self._wanted, Land) and self.step is Failsafe.NONE
 
+    @property
+    def lands(self) -> bool:
+        """Whether it makes the vehicle land, here or at its start, by whoever's wish."""
+        return isinstance(self._wanted, Land | ReturnToStart)
+
     def land_on(self, now_ns: int) -> None:
         """Go on with a landing that is under way: its pilot leaves, or the link to the vehicle is lost."""
-        if not isinstance(self._wanted, Land | ReturnToStart):
+        if not self.lands:
             self._want(Land(), now_ns)
 
     def give_up_landing(self) -> None:

@@ -160,14 +160,20 @@ class Flight:
         """Note that an application's new intent was carried out: whatever flies is ours from here on."""
         self.whose, self.left_to = Whose.OURS, ""
 
+    def forget(self) -> bool:
+        """Note that what is found in the air from now on may be another flight; return whether it may."""
+        if self.ours and self._shared:
+            self.whose = Whose.NOBODYS
+        return self._shared
+
     def slept(self, ns: int) -> None:
         """Note that the computer slept for so long, which its clock does not count: it may be another flight by now."""
         if self._believed_until_ns is not None:
             self._believed_until_ns -= ns
         if self._claimed_until_ns is not None:
             self._claimed_until_ns -= ns
-        if ns >= BELIEF_NS and self.ours:
-            self.whose = Whose.NOBODYS
+        if ns >= BELIEF_NS:
+            self.forget()
 
     def observe(
         self, reported: FlightState, left_to: str, now_ns: int, feedback: Feedback | None = None
