@@ -34,10 +34,9 @@ from skyloop.messages import (
     ReturnToStart,
     Takeoff,
 )
-from skyloop.messages.command import SET_POINTS
+from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.feedback import is_on_earth
 from skyloop.messages.geometry import wrap_angle
-from skyloop.messages.intent import ENDINGS
 
 AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
 #: Where the proxy does not tell: feedback received sooner after a command may be older than it.
