@@ -10,12 +10,13 @@ PIP    := $(BIN)/python -m pip install --disable-pip-version-check $(if $(LOCKED
 # Where Python is told to keep nothing that it compiled, each process of the tests compiles the tests and the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test test-all test-core explore check chaos docs fuzz format stubs coverage package page pictures lock clean
+.PHONY: help demo test test-all test-core test-room explore check chaos docs fuzz format stubs coverage package page pictures lock clean
 help:
 	@echo "make demo [ARGS='--seconds 30 --headless']   a simulated drone that flies by its camera"
 	@echo "make test [ARGS='-k authority']              the tests of every day, some 10 minutes; with ARGS, those that they select of all"
 	@echo "make test-all                                all tests"
 	@echo "make test-core                               the core's tests, without all that plugs into it, in 1 minute"
+	@echo "make test-room ROOM=client                   the tests of one room that start no processes"
 	@echo "make explore [SECONDS=3600]                  new examples for the tests of properties, for a minute"
 	@echo "make check                                   lint, format, types, import contracts, budgets"
 	@echo "make chaos [ARGS='--seconds 180']            drones flown while processes die, stall, starve and are flooded"
@@ -52,6 +53,9 @@ test-all: $(VENV)/.installed-dev
 # In an environment of its own, in build/core.
 test-core:
 	PYTHON=$(PYTHON) scripts/core_alone.sh --numprocesses auto $(ARGS)
+
+test-room: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest --numprocesses auto -m "not process and not slow" tests/$(or $(ROOM),$(error name a folder of tests/: make test-room ROOM=client)) $(ARGS)
 
 # New examples for the tests of properties, for a minute by default: make explore SECONDS=3600.
 SECONDS ?= 60
