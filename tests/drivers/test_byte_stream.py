@@ -1,4 +1,4 @@
-"""Streams never wait: what finds no room is dropped, what was sent in part is an error, a slow line is paced."""
+"""Streams never wait: what finds no room is dropped, what was cut is discarded, a slow line is paced."""
 
 from __future__ import annotations
 
@@ -69,11 +69,61 @@ def test_a_serial_port_whose_other_end_does_not_read_drops_and_never_waits(line:
             stream.write(b"set-point")
 
 
-def test_a_serial_port_that_takes_half_a_frame_says_so(line: tuple[int, str]) -> None:
-    """What follows half a frame would be noise to the vehicle."""
+def test_a_frame_that_is_cut_by_a_full_port_is_discarded_by_the_vehicle_and_the_next_one_is_not(
+    line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A port that is full for a moment cuts one frame in some hundred. That broke the connection, and it hovered."""
     pytest.importorskip("serial")
-    with closing(SerialStream(line[1], 10_000_000, "x", "mavlink")) as stream, pytest.raises(OSError, match="reads"):
-        stream.write(bytes(1 << 20))
+    far, device = line
+    station, vehicle = Codec(255, 190), FlightControllerParser()
+    old = m.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1.0, 0.0, 0.0, 0.0], 0.1, 0.2, 0.3, 0.5)
+    new = m.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    write = os.write
+    with closing(SerialStream(device, 10_000_000, "x", "mavlink", ManualClock())) as stream:
+        for cut in range(1, len(station.encode(old))):
+            with monkeypatch.context() as full:
+                full.setattr("skyloop.drivers.byte_stream.os.write", lambda fd, data, cut=cut: write(fd, data[:cut]))
+                stream.write(station.encode(old))
+                full.setattr("skyloop.drivers.byte_stream.os.write", lambda fd, data: write(fd, data[:1]))
+                stream.write(station.encode(old))
+            stream.write(station.encode(new))
+            came: list[Message] = []
+            while not came:
+                assert select.select([far], [], [], 5.0)[0]
+                came = vehicle.feed(os.read(far, 65_536))
+            assert [message.get_type() for message in came] == ["HEARTBEAT"], cut
+        assert stream.dropped == 2 * cut
+
+
+def test_a_stop_that_is_cut_is_sent_again_whole(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("serial")
+    far, device = line
+    write = os.write
+    with closing(SerialStream(device, 10_000_000, "x", "msp", ManualClock())) as stream:
+        monkeypatch.setattr(SerialStream, "_discard", lambda _: False)
+        with monkeypatch.context() as full:
+            full.setattr("skyloop.drivers.byte_stream.os.write", lambda fd, data: write(fd, data[:2]))
+            stream.write(b"stop", Rank.STOP)
+        stream.write(b"STOP", Rank.STOP)
+        came = b""
+        while not came.endswith(b"STOP"):
+            assert select.select([far], [], [], 5.0)[0]
+            came += os.read(far, 65_536)
+        assert b"sto" in came
+        assert b"stop" not in came
+
+
+def test_a_port_that_takes_only_parts_of_frames_for_half_a_second_is_not_read(
+    line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("serial")
+    clock, write = ManualClock(), os.write
+    with closing(SerialStream(line[1], 10_000_000, "x", "mavlink", clock)) as stream:
+        monkeypatch.setattr("skyloop.drivers.byte_stream.os.write", lambda fd, data: write(fd, data[:1]))
+        stream.write(b"set-point")
+        clock.advance(STUCK_NS / 1e9)
+        with pytest.raises(OSError, match="no longer reads"):
+            stream.write(b"set-point")
 
 
 class Uart:

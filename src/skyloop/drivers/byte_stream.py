@@ -110,6 +110,7 @@ class ByteStream(ABC):
         self._stuck_ns = STUCK_NS
         self._full_ns: int | None = None  # since when there is no room, or the line is stalled
         self._whole = _LONGEST  # bytes written since a frame may have been cut
+        self._rest = b""  # of a frame of which only the beginning found room; it makes the receiver discard that frame
         self._cleared = False  # a full buffer was emptied for a stop, and nothing shows whether it is read since
         self._after_stop = 1 << 62  # bytes written since a stop: where more than that wait, it is among them
 
@@ -133,34 +134,43 @@ class ByteStream(ABC):
             rank: Its importance.
 
         Raises:
-            OSError: It can't be sent, or only in part so that what follows would be noise, or nothing could be sent for
-                :data:`STUCK_NS`.
+            OSError: It can't be sent, or no whole packet could be for :data:`STUCK_NS`.
         """
         now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
         self._pace.on_waiting(waiting, now_ns)
         if stop and _LONGEST < waiting <= self._after_stop:  # less is sent no later than what fills up a cut frame
             self._discard()
         stalled = self._cleared or self._pace.stalled(now_ns)
-        sent = 0
+        sent, whole = 0, False
         if not stalled or rank <= Rank.COMMAND:
             if not self._pace.admits(rank, now_ns):
                 self.dropped += 1
                 return
-            packet = self._filled(data) if stop else data
+            packet = self._rest + (self._filled(data) if stop else data)
             sent = self._attempt(packet)
             if stop and sent < len(packet) and self._discard():
                 packet = self._filled(data)
                 sent = self._attempt(packet)
                 self._cleared = stalled = not self._waiting()
-            if 0 < sent < len(packet):
-                self._full_ns = now_ns if self._full_ns is None else self._full_ns
-                raise ConnectionError(_NOT_READ)
+            whole = sent == len(packet)
+            self._rest = self._left_of(packet, sent)
         if sent:
             self._pace.on_written(sent, now_ns)
             self._whole += sent
-            self._after_stop = 0 if stop else self._after_stop + sent
-        self.dropped += not sent
-        self._check_room(now_ns, room=bool(sent) and not stalled)
+            self._after_stop = 0 if stop and whole else self._after_stop + sent
+        self.dropped += not whole
+        self._check_room(now_ns, room=whole and not stalled)
+
+    def _left_of(self, packet: bytes, sent: int) -> bytes:
+        """Return what is to be written before the next packet: the end of a frame of which the beginning was sent.
+
+        By then the frame is old. Its last byte, of a checksum, is inverted, and the receiver discards it; without its
+        end, the receiver would take the next packet for that. (A vehicle that ignores signatures carries out a signed
+        frame that was cut within its signature.)
+        """
+        if sent <= len(self._rest):
+            return self._rest[sent:]
+        return packet[sent:-1] + bytes([packet[-1] ^ 0xFF]) if sent < len(packet) else b""
 
     def _filled(self, data: bytes) -> bytes:
         return bytes(max(0, _LONGEST - self._whole)) + data
@@ -322,7 +332,7 @@ class SerialStream(ByteStream):
         with suppress(Exception):  # the error of a terminal is no OSError
             self._port.reset_output_buffer()
             if not before or self._waiting() < before:  # not every driver can empty it
-                self._whole = 0
+                self._whole, self._rest = 0, b""
                 return True
         return False
 
