@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from skyloop.client import Drone, Frame
-from skyloop.client.channels import checked_age
+from skyloop.client.channels import checked_age, checked_name
 from skyloop.client.frame import Arrival
-from skyloop.client.results import checked_name
 from skyloop.errors import UsageError
 from skyloop.extend import join_processor
 from skyloop.messages import Severity
