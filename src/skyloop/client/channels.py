@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import threading
 import time
 from _thread import LockType, allocate_lock
@@ -16,6 +17,7 @@ from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
 from skyloop.errors import ClosedError, SkyloopError, UsageError
 from skyloop.messages import EventKind, Severity
+from skyloop.messages.relayed import PROCESSOR_NAME
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Channel[Any]")
@@ -416,6 +418,17 @@ class Notifier:
         finally:
             with suppress(ValueError):  # the notifying thread has removed it
                 self._waiting.remove(lock)
+
+
+def checked_name(processor: str) -> str:
+    """Return ``processor`` if it can be the name of a processor.
+
+    Raises:
+        UsageError: If it can't.
+    """
+    if not isinstance(processor, str) or not re.fullmatch(PROCESSOR_NAME, processor):
+        raise UsageError(f"the name of a processor has 1 to 64 letters, digits and any of _ . -, not {processor!r:.80}")
+    return processor
 
 
 def checked_age(max_age_s: float | None) -> float | None:

@@ -13,13 +13,13 @@ from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 from skyloop.child_process import leave_to_parent
 from skyloop.client.actions import ActionWait
 from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
-from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, checked_age
+from skyloop.client.channels import JOIN_S, C, FollowingChannel, Listener, checked_age, checked_name
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.parameters import Config, Restorer
 from skyloop.client.publishing import Logbook, Membership
-from skyloop.client.results import ResultChannel, checked_name
+from skyloop.client.results import ResultChannel
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
 from skyloop.client.video import StreamChannel, StreamOptions, VideoChannel, VideoOptions
 from skyloop.errors import (

@@ -1,4 +1,4 @@
-"""What the times at which things arrive tell: the state of the hop to the proxy, its clock, and statistics. Pure."""
+"""Judgements from the times at which things arrive: state of the hop to the proxy, its clock, statistics. Pure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The checks before a flight: what is asked of a drone; then, pure, what is wrong, why it matters, and what to do."""
+"""The checks before a flight, pure, and :func:`inspect`, which gathers the state of a drone for them."""
 
 from __future__ import annotations
 

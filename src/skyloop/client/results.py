@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 from collections import Counter
@@ -15,9 +14,9 @@ from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.frame import FeedbackHistory
 from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
-from skyloop.errors import DecodeError, UsageError
+from skyloop.errors import DecodeError
 from skyloop.messages import Feedback, ProcessorResult
-from skyloop.messages.relayed import PROCESSOR_NAME, unpack
+from skyloop.messages.relayed import unpack
 from skyloop.transport.base import RESULTS, results
 
 T = TypeVar("T")
@@ -325,17 +324,6 @@ class ResultChannels:
 def _captured_ns(mailbox: Mailbox[Result]) -> int:
     newest = mailbox.peek()
     return 0 if newest is None else newest.captured_ns
-
-
-def checked_name(processor: str) -> str:
-    """Return ``processor`` if it can be the name of a processor.
-
-    Raises:
-        UsageError: If it can't.
-    """
-    if not isinstance(processor, str) or not re.fullmatch(PROCESSOR_NAME, processor):
-        raise UsageError(f"the name of a processor has 1 to 64 letters, digits and any of _ . -, not {processor!r:.80}")
-    return processor
 
 
 def silence(processor: str, timeout_s: float, expired: int) -> str:

@@ -187,7 +187,7 @@ class ProxySession:
         self._pinged = False  # and not answered yet
         self._trips = OffsetEstimator()
         self._video_users: dict[str, set[str]] = {}  # topic of the transport: the topics that it serves
-        self._handlers = {**handler.samples, Reply: self._reply}
+        self._handlers: dict[type, Callable[..., None]] = {**handler.samples, Reply: self._reply}
         self._take_feedback = handler.feedback
         self._feedback = PLAIN  # how feedback comes in this session
         self._only_plain = False  # the proxy sends no other form

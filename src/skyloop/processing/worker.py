@@ -15,10 +15,9 @@ from typing import Any, Final, Self
 import msgspec
 
 from skyloop.client import Drone, Frame
-from skyloop.client.channels import Mailbox, checked_age
+from skyloop.client.channels import Mailbox, checked_age, checked_name
 from skyloop.client.frame import Arrival
 from skyloop.client.publishing import Membership
-from skyloop.client.results import checked_name
 from skyloop.client.video import VideoChannel
 from skyloop.clock import NS_PER_S, Clock
 from skyloop.errors import UsageError
