@@ -161,8 +161,10 @@ def check(parameter: Parameter, value: Value) -> Value:
     if parameter.read_only:
         raise ParameterError(f"{parameter.name} can only be read", code=Refusal.READ_ONLY)
     kind, is_bool = parameter.type, isinstance(value, bool)
-    is_number = isinstance(value, int if kind is ParameterType.INT else int | float) and not is_bool
-    if kind in (ParameterType.FLOAT, ParameterType.INT) and is_number:
+    if not is_bool and (
+        (kind is ParameterType.FLOAT and isinstance(value, int | float))
+        or (kind is ParameterType.INT and isinstance(value, int))
+    ):
         value = _number(parameter, value)
     elif kind is ParameterType.VECTOR and isinstance(value, tuple):
         length = len(parameter.value) if isinstance(parameter.value, tuple) else len(value)
@@ -305,7 +307,7 @@ class Parameters:
                 value = value if isinstance(value, bool) else own
             else:  # a driver with another notion of this name: the proxy keeps its own
                 value = float(value) if isinstance(value, int | float) and math.isfinite(value) else own
-            if name == "warm.period_s" and value:
+            if name == "warm.period_s" and isinstance(value, float) and value:
                 value = max(value, SHORTEST_S)
             if self._in_force.get(name) != value:
                 self._in_force[name] = value
