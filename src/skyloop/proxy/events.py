@@ -122,9 +122,12 @@ class EventPublisher:
     def _number(self, draft: EventDraft, text: str, **count: int) -> None:
         self._seq += 1
         kind, severity, app = draft.kind, draft.severity, draft.app
-        data = {name: self._scrub(value) if isinstance(value, str) else value for name, value in draft.data.items()}
+        data: dict[str, Value] = {**draft.data, **count}
+        for name, value in data.items():
+            if isinstance(value, str):
+                data[name] = self._scrub(value)
         text = shortened(self._scrub(text), MAX_TEXT)
-        event = Event(kind, text, self._clock(), severity, self._seq, app, {**data, **count})
+        event = Event(kind, text, self._clock(), severity, self._seq, app, data)
         try:
             packet = encode(event)
         except (ValueError, TypeError, OverflowError) as error:  # a driver's data may be anything

@@ -162,7 +162,7 @@ class CommandHandler:
         self.authority.last_command_ns = now_ns
 
     def configure(self, settings: FlightSettings) -> None:
-        """Let new values of the parameters take effect; what is the same object as before did not change."""
+        """Let new values of the parameters take effect. Unchanged settings are the same object as before."""
         with self._lock:
             airspace, space = self.checks.airspace, settings.airspace.space
             if space is not airspace.settings.space:

@@ -150,8 +150,10 @@ def check(parameter: Parameter, value: Value) -> Value:
     if parameter.read_only:
         raise ParameterError(f"{parameter.name} can only be read", code=Refusal.READ_ONLY)
     kind, is_bool = parameter.type, isinstance(value, bool)
-    is_number = isinstance(value, int if kind is ParameterType.INT else int | float) and not is_bool
-    if kind in (ParameterType.FLOAT, ParameterType.INT) and is_number:
+    if not is_bool and (
+        (kind is ParameterType.FLOAT and isinstance(value, int | float))
+        or (kind is ParameterType.INT and isinstance(value, int))
+    ):
         value = _number(parameter, value)
     elif kind is ParameterType.VECTOR and isinstance(value, tuple):
         length = len(parameter.value) if isinstance(parameter.value, tuple) else len(value)
@@ -175,7 +177,7 @@ def check(parameter: Parameter, value: Value) -> Value:
 
 
 def _number(parameter: Parameter, number: float) -> float:
-    """Return a number as it may be written, or as part of what is: finite, and within the range."""
+    """Return a number that may be written, alone or in a vector: finite and within the range."""
     if parameter.type is not ParameterType.INT:
         try:
             number = float(number)
@@ -230,8 +232,8 @@ class Parameters:
         self._driver: dict[str, Parameter] = {}
         self._presets: dict[str, Value] = {}  # that the driver has not taken yet
         self.left_out: tuple[str, ...] = ()  #: driver's parameters that are too large to be sent
-        self._in_force: dict[str, Any] = {}  # the values that the proxy obeys, of its own parameters
-        self._changed: set[str] = set()  # how the names begin of those that the settings don't have yet
+        self._in_force: dict[str, Any] = {}  # the values of the proxy's own parameters
+        self._changed: set[str] = set()  # first parts of the names that the settings lack
         self._settings = FlightSettings()
         self._apply(OWN)
 

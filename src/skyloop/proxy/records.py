@@ -1,4 +1,4 @@
-"""What a proxy writes to disk, on threads of their own: the audit trail, and the note of its flight.
+"""Files that a proxy writes, each on its own thread: the audit trail, and the note of its flight.
 
 The audit trail says who flew when, one JSON object a line, only ever appended to. ``docs/sharing.md`` describes it.
 :func:`entry_of` and :func:`tenures` are pure: events to lines, and lines to a table.
@@ -32,7 +32,7 @@ FOLDER: Final = "audit"
 SUFFIX: Final = ".jsonl"
 _MODE: Final = 0o600
 
-#: How long a note is believed: a supervisor starts a proxy again within seconds, and nobody changes the pilot then.
+#: How long a note is believed: a supervisor restarts a proxy within seconds, before anybody changes the pilot.
 LIFE_S: Final = seconds(BELIEF_NS)
 KEEP_S: Final = 2.0  #: how often it is made young
 MAX_BYTES: Final = 4096  #: of an address; a longer file is none of ours
@@ -179,7 +179,7 @@ class AuditTrail:
             self._queue.put(entry)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining lines, for :data:`CLOSE_S` at most."""
         self._queue.put(None)
         self._thread.join(CLOSE_S)
 

@@ -1,6 +1,6 @@
-"""What a proxy publishes, and to whom: the topics there are, and those that are published only as somebody asks.
+"""The topics of a proxy: which exist, feedback at fewer samples a second, and the overview.
 
-No others can be subscribed to, so that made-up names cost nothing.
+No other topic can be subscribed to, so that made-up names cost nothing.
 """
 
 from __future__ import annotations
@@ -71,11 +71,11 @@ def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
     return "" if camera in known else UnknownNameError("camera of this vehicle", camera[:64], known).message
 
 
-# Feedback at fewer samples a second, and what it has in common with encoded video ----------------------------------
+# Forms of samples, and feedback at fewer samples a second ----------------------------------------------------------
 
 
 class Form(Protocol):
-    """A form in which samples are asked for: what is published on one topic."""
+    """A form of samples, published on one topic."""
 
     topic: str
     asked_ns: int  #: when somebody asked for it last

@@ -130,7 +130,7 @@ class FlightSettings:
     authority_ask_ns: int = 0
 
     def updated(self, value: Mapping[str, Any], changed: Collection[str]) -> FlightSettings:
-        """Return them with new values; made anew is only what those that changed concern, all else is the same object.
+        """Return the settings with new values; parts that no changed parameter concerns stay the same object.
 
         Args:
             value: The values in force, by the parameter's name.
