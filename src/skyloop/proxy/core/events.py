@@ -112,6 +112,15 @@ def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
+def drift_event(drifts: bool) -> EventDraft:
+    """The software autopilot does not know the vehicle's velocity, or knows it again."""
+    if not drifts:
+        text = "the vehicle's velocity is known again: it is held against its drift"
+        return EventDraft(EventKind.VEHICLE_MESSAGE, text, data={"reason": "drift", "active": False})
+    text = "the vehicle's velocity is not known: it is held level, which does not brake it, and drifts with the wind"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "drift", "active": True})
+
+
 def landing_given_up_event() -> EventDraft:
     """A pilot's landing is given up because the vehicle was not heard."""
     text = f"the landing is given up: {UNHEARD}: land it again when it is heard"
