@@ -24,7 +24,7 @@ from skyloop.vehicles.msp.setpoints import PASSING, Phase, Report, SetpointContr
 from skyloop.vehicles.msp.telemetry import Reported, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
-from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, Sensor
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
 from skyloop.vehicles.msp.wire.names import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
 
 DEGRADED_NS: Final = nanoseconds(0.4)
@@ -499,7 +499,7 @@ class MspSession(VehicleSession):
 
 
 def _told(setup: Setup) -> tuple[bool, bool]:
-    return bool(setup.ranges_of(ARM)), setup.sticks != USUAL_MAP
+    return bool(setup.arm_ranges), setup.sticks_told
 
 
 def _has_height(status: msp.Status) -> bool:
