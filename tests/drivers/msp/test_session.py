@@ -14,7 +14,7 @@ from skyloop.drivers.base import ExternalPose
 from skyloop.errors import DriverError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, Hover, Idle, LinkState, ResetEmergency
 from skyloop.vehicles.msp.emulator.board import bit
-from skyloop.vehicles.msp.emulator.settings import BoardSettings
+from skyloop.vehicles.msp.emulator.settings import EMPTY_WRITES, BoardSettings
 from skyloop.vehicles.msp.firmware import Setup
 from skyloop.vehicles.msp.motion import Motion
 from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
@@ -810,3 +810,17 @@ def test_one_that_was_started_just_now_says_what_it_waits_for() -> None:
     stays = Bench(BoardSettings(boot_s=5.0, flags=bit("MSP")))
     stays.until(lambda: stays.sink.newest is not None, 2.0)
     assert stays.sink.links[-1] == (LinkState.UP, ""), "what keeps it from being armed does not pass by itself"
+
+
+# Beside a real one ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", sorted(EMPTY_WRITES))
+def test_an_empty_write_is_acknowledged_as_by_a_real_one_and_changes_nothing(number: int) -> None:
+    """A configurator was told that its write was refused. Compared with Betaflight 4.6.0's own simulation."""
+    bench = Bench()
+    reply = bench.board.answer(Frame(number, b""), bench.clock.now_ns)
+    assert reply == Frame(number, b"", Direction.REPLY)
+    written = bench.board.answer(Frame(number, b"\0"), bench.clock.now_ns)
+    assert written is not None
+    assert written.direction is Direction.ERROR, "what is written is not kept"

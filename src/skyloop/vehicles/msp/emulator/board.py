@@ -18,6 +18,7 @@ from skyloop.vehicles.msp.emulator.settings import (
     BOXES,
     CELLS,
     CHANNELS,
+    EMPTY_WRITES,
     HOVER_THROTTLE,
     RECORDED,
     THRUST_POWER,
@@ -113,6 +114,8 @@ class Board:
                 part = self._state(function, now_ns) or b""
                 made += bytes((len(part),)) + part
             return made
+        if frame.function in EMPTY_WRITES and not frame.payload:
+            return b""
         return self._state(frame.function, now_ns)
 
     def _take_sticks(self, widths: list[int], now_ns: int) -> bytes | None:
