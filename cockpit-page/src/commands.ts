@@ -60,7 +60,7 @@ export interface CommandListener {
   /** Any other message of the cockpit. */
   received(message: Answer): void;
   /** A command will not be executed: refused by the cockpit, or given up by this page. */
-  refused(command: string, why: string): void;
+  refused(command: string, why: string, n: number): void;
   /** The outcome of a command is known, or is no longer shown. */
   changed(): void;
 }
@@ -70,6 +70,7 @@ export class CommandSender {
   round_trip_s: number | null = null;
   private readonly socket: CommandSocket;
   private number = 0;
+  private sent = 0;
   private pinged_ms = Number.NEGATIVE_INFINITY;
   private answered_s: number | null = null;
   private readonly pings = new Map<number, number>();
@@ -103,6 +104,11 @@ export class CommandSender {
     return this.results.get(what) ?? null;
   }
 
+  /** The number of the command that was sent last, by which the cockpit's answers name it. */
+  get newest(): number {
+    return this.sent;
+  }
+
   /** Only an emergency stop waits for a connection. */
   canSend(command: { do: string }): boolean {
     return this.isLive || STOPS.has(command.do);
@@ -111,7 +117,7 @@ export class CommandSender {
   /** Send a command. False if it can't be sent; the listener has been called then. */
   send(command: { do: string }): boolean {
     const now_ms = this.now_ms();
-    this.number += 1;
+    this.sent = this.number += 1;
     const pending: Pending = { command, n: this.number, pressed_ms: now_ms, on_its_way: false, went: false };
     if (!this.canSend(command)) {
       this.end(command.do, "not_sent", this.silence(now_ms));
@@ -198,7 +204,7 @@ export class CommandSender {
       if (message.type === "sent") this.settle(message, "sent");
       if (message.type === "refused") {
         this.settle(message, "refused");
-        this.listener.refused(message.do ?? "", message.why ?? "");
+        this.listener.refused(message.do ?? "", message.why ?? "", message.n ?? 0);
       }
       this.listener.received(message);
     }
@@ -233,7 +239,7 @@ export class CommandSender {
     this.pending.delete(what);
     if (pending) this.settled.set(what, pending.n);
     this.show(what, fate, why);
-    this.listener.refused(what, `${t.commands.fates[fate]}: ${why}`);
+    this.listener.refused(what, `${t.commands.fates[fate]}: ${why}`, pending?.n ?? this.sent);
   }
 
   private show(what: string, fate: Fate, why: string): void {

@@ -178,7 +178,7 @@ export interface Question {
 export type PilotMessage =
   | Authority
   | { type: "asked"; questions: Question[] }
-  | { type: "done"; do: string; name?: string; value?: Value }
+  | { type: "done"; do: string; n?: number; name?: string; value?: Value }
   | RouteProgress
   | FollowMessage
   | { type: "sent"; do: string; n: number }

@@ -41,6 +41,7 @@ export class Pilot {
   following = false;
   /** How this page lost the control that it had; it stays until the person takes control or puts it away. */
   ended = "";
+  private flight = 0; // the number of what took the place of what this page had under way
   private steering = false;
   private stopping = false; // the emergency stop is not shown by the vehicle yet, or no round of the sticks has seen it
   private stopped = false; // it is answered: the next round ends it
@@ -57,7 +58,7 @@ export class Pilot {
     this.commands = new CommandSender(
       connect,
       clock,
-      { linked: (open) => this.linked(open), received: (message) => this.onMessage(message as PilotMessage), refused: (command, why) => this.refused(command, why), changed: () => listener.changed() },
+      { linked: (open) => this.linked(open), received: (message) => this.onMessage(message as PilotMessage), refused: (command, why, n) => this.refused(command, why, n), changed: () => listener.changed() },
       now_ms,
     );
   }
@@ -209,7 +210,14 @@ export class Pilot {
   private replace(command: Command): boolean {
     if (this.commands.canSend(command)) this.end();
     else this.rest();
-    return this.send(command);
+    const sent = this.send(command);
+    this.flight = this.commands.newest;
+    return sent;
+  }
+
+  /** Whether an answer is about what this page flies now, and not about what that took the place of; 0: it does not say. */
+  private isNewest(n?: number): boolean {
+    return !n || !this.flight || n === this.flight;
   }
 
   private end(): void {
@@ -228,9 +236,9 @@ export class Pilot {
     this.listener.changed();
   }
 
-  private refused(command: string, why: string): void {
+  private refused(command: string, why: string, n: number): void {
     if (command === "stop") this.stopped = true;
-    if (["goto", "route", "return", "follow_mode"].includes(command)) this.end(); // sticks fly on until they are let go
+    if (["goto", "route", "return", "follow_mode"].includes(command) && this.isNewest(n)) this.end(); // sticks fly on until they are let go
     this.listener.refused(command, why);
   }
 
@@ -256,7 +264,7 @@ export class Pilot {
       this.listener.follow?.(message);
     } else if (message.type === "done") {
       if (message.do === "stop") this.stopped = true;
-      if (message.do === "goto" || message.do === "return") this.going = false;
+      if ((message.do === "goto" || message.do === "return") && this.isNewest(message.n)) this.going = false;
       this.listener.done(message.do, message.name, message.value);
     }
   }

@@ -238,6 +238,24 @@ test("a page that loses the focus hovers what it has under way, and nothing else
   assert.deepEqual(doings(sent).slice(4), ["goto"], "there already");
 });
 
+test("what became of a flight to an earlier place ends no other flight", () => {
+  const { pilot, sent, receive, live } = flown();
+  live();
+  receive(held(true));
+  pilot.goTo(1, 2, 3);
+  pilot.goTo(4, 5, 6);
+  const [first, second] = sent.filter((message) => message["do"] === "goto").map((message) => message["n"]);
+  receive({ type: "done", do: "goto", n: first });
+  receive({ type: "refused", do: "goto", n: first, why: "ended on the way" });
+  pilot.rest();
+  assert.deepEqual(doings(sent), ["goto", "goto", "hover"], "it was on its way to the second one");
+  pilot.goTo(7, 8, 9);
+  receive({ type: "done", do: "goto", n: second });
+  receive({ type: "done", do: "goto", n: sent.findLast((message) => message["do"] === "goto")?.["n"] });
+  pilot.rest();
+  assert.deepEqual(doings(sent).slice(3), ["goto"], "there already");
+});
+
 test("sticks that are let go, or count no more, as no answers come, hover all the same", () => {
   const { pilot, sent, receive, live, at } = flown();
   live();

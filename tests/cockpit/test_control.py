@@ -275,6 +275,21 @@ def test_flying_to_a_place(client: TestClient, node: Node) -> None:
         until(lambda: node.flyer.state is FlightState.HOVERING)
 
 
+def test_what_becomes_of_a_flight_to_a_place_is_told_by_the_number_of_its_command(
+    client: TestClient, node: Node
+) -> None:
+    """The page took what came of an earlier one for the newest's: it hovered, or did not when it was let go."""
+    with page(client) as pilot:
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.say("goto", x=0.3, y=0.0, z=0.3, n=71)
+            assert pilot.wait("done", do="goto")["n"] == 71
+        pilot.say("goto", x=2.0, y=0.0, z=0.3, n=72)
+        pilot.say("goto", x=3.0, y=0.0, z=0.3, n=73)
+        refused = pilot.wait("refused", do="goto")
+        assert (refused["n"], "silent" in refused["why"]) == (73, True)
+
+
 def test_returning_to_the_start(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().say("return")

@@ -342,6 +342,20 @@ def test_it_hovers_while_no_frames_come_and_goes_on_when_they_do(
         until(lambda: node.flyer.state is FlightState.FLYING)
 
 
+def test_it_hovers_while_the_vehicles_motion_is_not_known_and_goes_on_when_it_is(
+    client: TestClient, node: Node, stand_ins: StandIns
+) -> None:
+    """It was sent level attitudes, or velocities of zero that nothing can measure, in place of a hover."""
+    with following(client, node) as pilot:
+        stand_ins.last.says(unknown="the vehicle's velocity is not known")
+        told = pilot.wait("follow", state="waiting")
+        assert told["problem"] == "the vehicle's velocity is not known: it hovers until that is known"
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+        stand_ins.last.says(unknown="")
+        pilot.wait("follow", state="flying")
+        until(lambda: node.flyer.state is FlightState.FLYING)
+
+
 def test_a_tracker_that_is_stuck_flies_nothing(client: TestClient, node: Node, stand_ins: StandIns) -> None:
     with following(client, node) as pilot:
         stand_ins.last.waits = threading.Event()

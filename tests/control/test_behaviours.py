@@ -6,7 +6,7 @@ import importlib.util
 import math
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -30,7 +30,18 @@ from skyloop.control.gate_law import GatePhase, GateSettings
 from skyloop.control.landing_law import LandingPhase
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.errors import AuthorityError, UnknownNameError, UsageError
-from skyloop.messages import Annotation, FlightState, Land, LinkState, Severity, Velocity
+from skyloop.messages import (
+    Annotation,
+    Attitude,
+    Feedback,
+    FlightState,
+    Hover,
+    Land,
+    LinkState,
+    Severity,
+    Velocity,
+)
+from skyloop.sim.camera import BOTTOM_CAMERA
 from skyloop.sim.geometry import geometry_of
 from skyloop.sim.world_file import load_world
 from skyloop.stepping.rehearsal import Radio, rehearse
@@ -204,6 +215,33 @@ def test_a_landing_goes_on_after_a_link_that_was_down_for_a_moment() -> None:
         landing.steer(Velocity())
         proxy.until_commanded(Land())
         proxy.state = FlightState.LANDED
+
+
+def test_what_holds_its_place_by_the_ground_hovers_while_it_does_not_see_it() -> None:
+    """It went level, and kept whatever speed it had, although the vehicle can brake by itself."""
+    with ExitStack() as stack:
+        proxy = stack.enter_context(scripted())
+        proxy.capabilities = msgspec.structs.replace(proxy.capabilities, cameras=(BOTTOM_CAMERA.info(),))
+        drone = stack.enter_context(flown(proxy))
+        proxy.state = FlightState.FLYING
+        drone.wait(lambda feedback: feedback.state is FlightState.FLYING, WAIT_S)
+        hold = FlowHover(drone)
+        now_ns = 1_000_000_000
+        seen = Feedback(
+            captured_ns=now_ns, state=FlightState.FLYING, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, altitude_m=1.0
+        )
+        hold._flow_law.feedback(seen)
+        hold.fly(now_ns)
+        proxy.until_commanded(Hover())
+        hold._flow_law.see(np.zeros(2), now_ns)
+        hold.fly(now_ns)
+        proxy.until(lambda: isinstance(proxy.actions()[-1], Attitude), "it flies by what it sees")
+        after = len(proxy.commands)
+        hold._flow_law.feedback(msgspec.structs.replace(seen, captured_ns=now_ns + 400_000_000))
+        hold.fly(now_ns + 400_000_000)
+        proxy.until_commanded(Hover(), after)
+        warnings = [event.text for event in drone.recent_events() if event.severity is Severity.WARNING]
+        assert "flow hover: lost the ground: hovering" in warnings
 
 
 def test_what_makes_no_sense_is_refused() -> None:

@@ -212,3 +212,33 @@ def test_what_flies_after_a_long_sleep_may_be_somebody_elses(bench: Bench) -> No
 
 def test_the_computers_own_sleep_is_known_where_it_says_so() -> None:
     assert -(10**9) < slept_ns() < 10 * 365 * 24 * 3600 * 10**9
+
+
+def test_who_flies_is_told_when_a_vehicle_that_flies_by_attitude_drifts() -> None:
+    """It went level where its velocity went missing, and flew on at whatever speed it had, without a word."""
+    bench = Bench(ATTITUDE)
+    bench.driver.answers = False
+    with bench.proxy:
+        pilot = bench.pilot()
+        moving: dict[str, object] = {"state": FlightState.FLYING, "altitude_m": 1.0, "yaw_rad": 0.0}
+
+        def run(velocity: tuple[float, float, float] | None) -> None:
+            def step() -> None:
+                bench.driver.report(**moving, velocity_m_s=velocity)
+                pilot.command(Idle())
+
+            bench.run(0.2, step)
+
+        run((1.0, 0.0, 0.0))
+        pilot.command(Hover())
+        run((1.0, 0.0, 0.0))
+        assert isinstance(bench.driver.told[-1], Attitude)
+        assert bench.driver.told[-1].pitch < 0.0, "it brakes"
+        told = [event for event in bench.events if event.data.get("reason") == "drift"]
+        assert told == []
+        run(None)
+        assert bench.driver.told[-1] == Attitude()
+        run((1.0, 0.0, 0.0))
+        told = [event for event in bench.events if event.data.get("reason") == "drift"]
+        assert [event.data["active"] for event in told] == [True, False]
+        assert "it is held level, which does not brake it" in told[0].text

@@ -123,11 +123,14 @@ class ControlSession:
         self._silence: asyncio.TimerHandle | None = None
         self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
-        self._decided = ""  # what the page decided last, which may yet be refused, or wait for answers
-        self._last_command, self._first = "", 0  # what took another's place last, and the number of its first intent
+        self._decided = ("", 0)  # what the page decided last, which may yet be refused, or wait for answers: do, n
+        self._last_command, self._first = (
+            ("", 0),
+            0,
+        )  # what took another's place last, and its first intent
         self._decisions = 0  # grows with whatever flies, or ends a flight: what waits for answers compares it
         self._hands = HandWatch()
-        self._awaited: tuple[str, frozenset[FlightState], int] | None = None  # what is done in which states, from when
+        self._awaited: tuple[str, int, frozenset[FlightState], int] | None = None  # do, n, in which states, from when
         self._repeated = False  # for as long as a take-off may be
         self._last_refusal = ("", -_REFUSE_AGAIN_S)  # about sticks: why, and when [s]
         self._handlers: dict[type[AnyCommand], Callable[[Any], None]] = {
@@ -188,7 +191,7 @@ class ControlSession:
             try:
                 commands.append(decode_command(text))
             except DecodeError as error:
-                self._refuse("", str(error))
+                self._refuse("", 0, str(error))
         for command, after in itertools.zip_longest(commands, commands[1:]):
             if not (isinstance(command, Fly) and isinstance(after, Fly)):
                 self._on_command(command)
@@ -207,7 +210,7 @@ class ControlSession:
             if _decides(command):
                 self._decisions += 1
                 # A stop has a connection of its own: no refusal here is its own.
-                self._decided = self._decided if isinstance(command, Stop) else command.do
+                self._decided = self._decided if isinstance(command, Stop) else (command.do, command.n)
             self._handlers[type(command)](command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
@@ -240,9 +243,9 @@ class ControlSession:
         self._send_now(pilot, act, command)
         self._acknowledge(command)
         if until:
-            self._awaited, self._repeated = (command.do, until, pilot.proxy_now_ns + SETTLED_NS), False
+            self._awaited, self._repeated = (command.do, command.n, until, pilot.proxy_now_ns + SETTLED_NS), False
         else:
-            self._done(command.do)
+            self._done(command.do, command.n)
 
     def _send_now(self, pilot: PilotConnection, act: Callable[[PilotConnection], bool], command: AnyCommand) -> None:
         """End what the page flew before, and send a command; :class:`LinkError` if it was not sent."""
@@ -286,7 +289,7 @@ class ControlSession:
         pilot = self._held()
         leg = plan(pilot)
         self._send_now(pilot, lambda pilot: pilot.command(leg.action), command)
-        self._place.watch(command.do, pilot, leg)
+        self._place.watch(command, pilot, leg)
         self._acknowledge(command)
         self._restart_silence_timer()
 
@@ -358,7 +361,7 @@ class ControlSession:
         except SkyloopError as error:
             self._refuse_command(command, str(error))
         else:
-            self._done(command.do)
+            self._done(command.do, command.n)
 
     async def _take(self, command: Take) -> None:
         pilot = self._pilot
@@ -384,7 +387,7 @@ class ControlSession:
             if isinstance(error, AuthorityError) and error.code == "busy":
                 raise AuthorityError(self._authority.busy(command.priority), code="busy") from error
             raise
-        self._done(command.do)
+        self._done(command.do, command.n)
         self._update()
 
     async def _answer(self, command: Answer) -> None:
@@ -397,14 +400,14 @@ class ControlSession:
         except RefusedError:
             self._authority.handed_over(given=False)
             raise
-        self._done(command.do)
+        self._done(command.do, command.n)
 
     async def _release(self, command: Release) -> None:
         self.let_go("the page gives control back")
         self._authority.released()
         self._acknowledge(command)
         await self._close_pilot()
-        self._done(command.do)
+        self._done(command.do, command.n)
         self._update()
 
     async def _close_pilot(self) -> None:
@@ -472,7 +475,7 @@ class ControlSession:
         if self._is_under_way:
             why = f"the page was silent for {SILENT_S:g} s: the vehicle hovers"
             self.let_go(why)
-            self._refuse(self._last_command, why)
+            self._refuse(*self._last_command, why)
 
     @property
     def _is_under_way(self) -> bool:
@@ -538,7 +541,7 @@ class ControlSession:
         if pilot is not None:
             self._observe_refusal(pilot)
         if self._awaited is not None and pilot is not None:
-            do, states, from_ns = self._awaited
+            do, n, states, from_ns = self._awaited
             if do == TakeOff().do and not self._repeated:
                 patience_ns = _BEGUN_NS if pilot.is_told else _TAKEOFF_NS
                 if pilot.proxy_now_ns - from_ns > patience_ns:
@@ -549,7 +552,7 @@ class ControlSession:
                 feedback = pilot.feedback()
                 if feedback.captured_ns >= from_ns and feedback.state in states:
                     self._awaited = None
-                    self._done(do)
+                    self._done(do, n)
 
     def _on_event(self, event: Event) -> None:
         """Handle takeovers by asking."""
@@ -565,19 +568,19 @@ class ControlSession:
         watched = self._follow.is_under_way or (self._route is not None and self._route.is_under_way)
         refused = outcome.fate in (Fate.UNDER_WAY, Fate.REFUSED, Fate.OTHERS)
         if not watched and (refused or self._awaited or self._is_under_way):
-            self._refuse(self._last_command, outcome.text)
+            self._refuse(*self._last_command, outcome.text)
         if watched or self._place.is_under_way:
             self.let_go(outcome.text)  # the same feedback tells whether others have the vehicle
-        elif self._last_command == TakeOff().do:
+        elif self._last_command[0] == TakeOff().do:
             with suppress(SkyloopError):
                 pilot.idle()  # or it would take off, to everybody's surprise, once it can
         self._awaited = None
 
-    def _refuse(self, do: str, why: str) -> None:
-        self._send({"type": "refused", "do": do, "n": 0, "why": why})
+    def _refuse(self, do: str, n: int, why: str) -> None:
+        self._send({"type": "refused", "do": do, "n": n, "why": why})
 
-    def _done(self, do: str) -> None:
-        self._send({"type": "done", "do": do})
+    def _done(self, do: str, n: int) -> None:
+        self._send({"type": "done", "do": do} | ({"n": n} if n else {}))
 
     def _refuse_command(self, command: AnyCommand, why: str) -> None:
         if isinstance(command, Fly):  # comes twenty times a second

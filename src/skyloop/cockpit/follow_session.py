@@ -261,7 +261,7 @@ class FollowSession:
             self._steer(self._report.action)
 
     def _steer(self, action: AnyAction | None) -> None:
-        """Send a set-point, or hover without new frames; ends with the first thing that goes wrong."""
+        """Send a set-point, or hover without new frames or known motion; ends with the first thing that goes wrong."""
         pilot = self._pilot
         assert pilot is not None
         waited, self._waits = self._waits, self._stopped() or ("" if action else "the tracker does not report")
@@ -283,10 +283,12 @@ class FollowSession:
             self.end(str(error))
 
     def _stopped(self) -> str:
-        """Return why there are no frames to fly by; empty if there are."""
+        """Return why there is nothing to fly by: no frames, or no motion of the vehicle; empty if there is."""
         report = self._report
         if report is None:
             return ""
+        if report.status is not None and report.status.unknown:
+            return f"{report.status.unknown}: it hovers until that is known"
         since_s = seconds(self._clock() - report.frame_ns)
         if since_s > STOPPED_S:
             return f"no new frame of {self._camera} for {since_s:.1f} s: it hovers until they come back"

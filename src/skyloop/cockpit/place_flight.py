@@ -21,7 +21,7 @@ from skyloop.messages import Feedback, FlightState, Hover, Land, Position, Retur
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.cockpit.commands import GoTo
+    from skyloop.cockpit.commands import AnyCommand, GoTo
     from skyloop.cockpit.pilot_connection import PilotConnection
     from skyloop.cockpit.station import Station
     from skyloop.control.route import Route
@@ -86,12 +86,12 @@ class PlaceFlight:
     Args:
         station: The drone.
         app: The name under which the page flies.
-        done: Called when it is there, with the command's kind.
-        refused: Called when it was ended on the way, with the command's kind and why.
+        done: Called when it is there, with the command's kind and number.
+        refused: Called when it was ended on the way, with the command's kind and number, and why.
     """
 
     def __init__(
-        self, station: Station, app: str, done: Callable[[str], None], refused: Callable[[str, str], None]
+        self, station: Station, app: str, done: Callable[[str, int], None], refused: Callable[[str, int, str], None]
     ) -> None:
         self._station = station
         self._app = app
@@ -104,17 +104,17 @@ class PlaceFlight:
         """Whether it flies there now."""
         return self._job is not None
 
-    def watch(self, do: str, pilot: PilotConnection, leg: Leg) -> None:
+    def watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
         """Watch a flight that was commanded.
 
         Args:
-            do: The command's kind.
+            command: The page's.
             pilot: Holds the authority.
             leg: The flight.
         """
         self.cancel()
         self._station.goals[self._app] = leg.goal
-        self._job = asyncio.create_task(self._watch(do, pilot, leg))
+        self._job = asyncio.create_task(self._watch(command, pilot, leg))
 
     def cancel(self) -> None:
         """End it, as something else is commanded."""
@@ -123,7 +123,7 @@ class PlaceFlight:
             self._job.cancel()
             self._job = None
 
-    async def _watch(self, do: str, pilot: PilotConnection, leg: Leg) -> None:
+    async def _watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
         try:
             while not leg.is_over(feedback := pilot.feedback(max_age_s=1.0)):
                 if feedback.others:
@@ -134,9 +134,9 @@ class PlaceFlight:
             lands = feedback.return_phase is ReturnPhase.LANDING  # which ends by itself from here on
             if lands or feedback.state in UP:
                 pilot.let_go("it is there", land=lands)
-            self._done(do)
+            self._done(command.do, command.n)
         except SkyloopError as error:
-            self._refused(do, str(error))
+            self._refused(command.do, command.n, str(error))
             pilot.let_go(str(error))
         finally:
             if self._job is asyncio.current_task():

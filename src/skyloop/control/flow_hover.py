@@ -17,7 +17,8 @@ from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import GRAVITY_M_S2, clamped, shortened
 from skyloop.control.pid import Gains, VectorPi
 from skyloop.errors import UsageError
-from skyloop.messages import Attitude, Points, Text
+from skyloop.extend import let_go
+from skyloop.messages import Attitude, Points, Text, Velocity
 from skyloop.messages.geometry import wrap_angle
 from skyloop.messages.relayed import Colour, Shape
 from skyloop.vision.flow import GroundTracker
@@ -35,7 +36,7 @@ class FlowPhase(StrEnum):
 
     WAITING = "waiting for the first pictures of the ground"
     HOLDING = "holding the place by the ground's picture"
-    LOST = "lost the ground: level"
+    LOST = "lost the ground: hovering"
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,7 @@ class FlowLaw(AirframeLaw):
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
-        """Compute the set-point for now: level while the position is not known."""
+        """Compute the set-point for now: level, which brakes nothing, while the position is not known."""
         s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
         if self._seen_ns is not None and not_ahead(self._seen_ns, now_ns) is None:
             self._seen_ns, self.phase, self.off_m = None, FlowPhase.LOST, None
@@ -147,8 +148,8 @@ class FlowHover(Behaviour):
     """Holds the position, height and yaw at which it first saw the ground, by the camera that looks down.
 
     Needs attitude and height from the vehicle, uses nothing else of its feedback, and flies by attitude. Without sight
-    of the ground it goes level, which lets the vehicle drift, emits a warning, and holds wherever it sees the ground
-    again.
+    of the ground it hovers as the vehicle itself can, by which some drift, emits a warning, and holds wherever it sees
+    the ground again.
     """
 
     name = "flow hover"
@@ -182,6 +183,13 @@ class FlowHover(Behaviour):
     def off_m(self) -> float | None:
         """Estimated distance from the position to hold [m]; None while it is not known."""
         return self._flow_law.off_m
+
+    def steer(self, wanted: Velocity | Attitude) -> None:
+        """Send the set-point; hover in place of it while the ground is not seen, which the event of the phase says."""
+        if self.phase is FlowPhase.HOLDING:
+            super().steer(wanted)
+        else:
+            let_go(self.drone, "the ground is not seen")
 
     def look(self, frame: Frame) -> list[Shape]:
         """Track the ground."""

@@ -58,6 +58,7 @@ class FollowStatus:
     speed_m_s: float | None = None  #: of the target; None where the vehicle does not know its own
     lost_s: float = 0.0  #: since it was last seen; 0 while it is seen, or was not seen yet
     problem: str = ""  #: what keeps it from being followed as wanted; empty for nothing
+    unknown: str = ""  #: what of the vehicle's motion is not known: it has to hover, whatever the set-point
 
 
 class TargetFollower(AirframeLaw):
@@ -264,7 +265,7 @@ class TargetFollower(AirframeLaw):
         estimator, at_ns = self._estimator, self._frame_ns
         box, confidence = self._sighting.box, self._sighting.confidence
         class_name = self._class_name if self._finder is None else self._finder.class_name
-        known = FollowStatus(self.phase.value, self.mode, box, confidence, class_name)
+        known = FollowStatus(self.phase.value, self.mode, box, confidence, class_name, unknown=self.problem)
         if estimator is None or at_ns is None or self._view is None:
             return known
         state = estimator.at(at_ns)

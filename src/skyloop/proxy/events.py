@@ -254,6 +254,15 @@ def landing_given_up_event() -> EventDraft:
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": "landing_given_up"})
 
 
+def drift_event(drifts: bool) -> EventDraft:
+    """The software autopilot does not know the vehicle's velocity, or knows it again."""
+    if not drifts:
+        text = "the vehicle's velocity is known again: it is held against its drift"
+        return EventDraft(EventKind.VEHICLE_MESSAGE, text, data={"reason": "drift", "active": False})
+    text = "the vehicle's velocity is not known: it is held level, which does not brake it, and drifts with the wind"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "drift", "active": True})
+
+
 def emergency_event(name: str) -> EventDraft:
     """The application ``name`` stopped the motors."""
     text = f"emergency stop by {name}"

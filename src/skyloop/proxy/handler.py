@@ -66,6 +66,7 @@ from skyloop.proxy.events import (
     authority_event,
     battery_event,
     clamped_event,
+    drift_event,
     emergency_event,
     enforcement_event,
     failsafe_event,
@@ -151,6 +152,7 @@ class CommandHandler:
         self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
         #: Until when a take-off that the vehicle was told of, and does not show yet, has time to; None: there is none.
         self._rising_until_ns: int | None = None
+        self._drifts = False  # what the software autopilot flies; told last
         self._enforced = True  # whether the safety box and zones could be, at the last set-point
         self._episodes = Episodes()  # of limits that touch what the proxy does with nobody in command
         self._stamp()
@@ -296,6 +298,7 @@ class CommandHandler:
             steered = self._executor.step(now_ns)
             if steered is not None:
                 self._echo_own(steered, now_ns)
+                self._report_drift()
             why, self._executor.gave_up = self._executor.gave_up, ""
             if why and session is not None:
                 session.intents.newest.end(Fate.REFUSED, why, Refusal.WRONG_STATE)
@@ -498,6 +501,13 @@ class CommandHandler:
         assert isinstance(allowed, Velocity)
         return allowed
 
+    def _report_drift(self) -> None:
+        """Tell when what the software autopilot flies begins, or ceases, to drift."""
+        autopilot = self._executor.autopilot
+        if autopilot is not None and autopilot.drifts is not self._drifts:
+            self._drifts = drifts = autopilot.drifts
+            self._events.publish_repeated((0, "drift", drifts), lambda: drift_event(drifts))
+
     def _refuse_role(self, session: Session, command: Command) -> AnyAction:
         if session.role is Role.OBSERVER:
             return self._refuse(session, command, Refusal.OBSERVER, "observers command nothing: connect as a pilot")
@@ -656,19 +666,26 @@ class CommandHandler:
         self._update_failsafe(now_ns)
 
     def _observe_silence(self, now_ns: int) -> None:
-        """Give up a landing when the vehicle has not been heard for long: by then it may be on another flight."""
+        """Give up a landing when the vehicle has not been heard for long: by then it may be on another flight.
+
+        One that the ladder ordered leaves what is found in the air to others: nobody is there to say whose it is.
+        """
         if self._vehicle.link_up:
             self._heard_ns = now_ns
             return
         landing = self._landing
-        if landing is None and not self.ladder.lands_on:
+        if landing is None and not self.ladder.lands:
             return
         asked_ns = self.ladder.wanted_ns if landing is None else landing.asked_ns  # its pilot may have left
         if now_ns - max(asked_ns, self._heard_ns) >= BELIEF_NS:
             if landing is not None:
                 self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: land it again", Refusal.VEHICLE_LINK_LOST)
-            self.ladder.give_up_landing()
+            if landing is not None or self.ladder.lands_on:
+                self.ladder.give_up_landing()
+            elif not self.flight.forget():
+                return
             self._events.publish_drafts(landing_given_up_event())
+            self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
         """Act on a sleep of the computer: all that is known is older than its clock says."""

@@ -89,6 +89,25 @@ def test_a_drone_that_another_program_flies_is_told_nothing_but_that_we_are_ther
     assert cockpit.setpoints.messages(3) == [("COMWDG", ())], "the next flight is not ours because the last one was"
 
 
+@pytest.mark.parametrize("before", [None, GROUND, AIR, EMERGENCY])
+def test_a_drone_that_is_not_heard_and_that_nobody_flies_from_here_is_told_nothing(before: Condition | None) -> None:
+    """A hover stops another program's sticks, and after an emergency a landing; it also kept a lost drone in the air."""
+    cockpit = at(before)
+    cockpit.setpoints.lost()
+    assert cockpit.setpoints.messages(0) == []
+    cockpit.take(Hover())
+    assert [name for name, _ in cockpit.setpoints.messages(0)] != [], "somebody flies it by now"
+
+
+def test_a_landing_that_was_given_up_leaves_what_is_not_heard_to_land_by_itself() -> None:
+    cockpit = at(AIR)
+    cockpit.take(Land())
+    cockpit.setpoints.lost()
+    assert cockpit.ref() == Ref(0)
+    assert cockpit.setpoints.forget_landing()
+    assert cockpit.setpoints.messages(0) == []
+
+
 def test_takeoff_is_said_until_the_drone_flies_and_as_long_as_it_does() -> None:
     cockpit = at(GROUND)
     assert cockpit.take(Takeoff()) == Takeoff()
@@ -225,6 +244,14 @@ def test_a_set_point_does_not_outlive_the_flight() -> None:
     cockpit = at(AIR)
     cockpit.take(Attitude(pitch=0.1))
     cockpit.hears(GROUND)
+    assert cockpit.pcmd()[0] == 0
+
+
+def test_a_set_point_does_not_outlive_the_link() -> None:
+    """It was sent on for as long as nothing was heard, unless somebody thought of a hover."""
+    cockpit = at(AIR)
+    cockpit.take(Attitude(pitch=0.1))
+    cockpit.setpoints.lost()
     assert cockpit.pcmd()[0] == 0
 
 

@@ -493,6 +493,25 @@ def test_poses_from_outside_are_told_in_the_autopilots_axes() -> None:
     assert (told.x, told.y, told.z) == pytest.approx((2.0 - 10.0, 1.0, -3.0), abs=0.02)
 
 
+def test_no_pose_from_outside_goes_where_it_might_be_read_late_nor_one_that_is_old() -> None:
+    """An autopilot that dates it by its arrival takes it for a jump: poses went on for 2.5 s of silence."""
+    bench = Bench(Vehicle(PX4)).found()
+
+    def problem(age_s: float = 0.0) -> str:
+        return bench.session.pose_problem(bench.clock() - round(age_s * 1e9), bench.clock())
+
+    assert (problem(), problem(0.4)) == ("", "")
+    assert problem(0.6) == "an external pose is 0.6 s old, at most 0.5 s"
+    bench.go_on(0.6, silent=True)
+    assert "nothing is heard from the vehicle just now" in problem()
+    bench.go_on(3.0, silent=True)
+    assert "no data from the vehicle" in problem()
+    bench.go_on(1.0)
+    assert problem() == ""
+    bench.session._heard_by_it = False
+    assert problem() != "", "nothing shows yet that it reads what is sent"
+
+
 def test_places_of_different_times_are_not_taken_together() -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.found()

@@ -13,7 +13,8 @@ from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
 from skyloop.errors import DriverError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, Hover, Idle, LinkState, ResetEmergency
-from skyloop.vehicles.msp.emulator.board import BoardSettings, bit
+from skyloop.vehicles.msp.emulator.board import EMPTY_WRITES, BoardSettings, bit
+from skyloop.vehicles.msp.firmware import Setup
 from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
 from skyloop.vehicles.msp.telemetry import Motion
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
@@ -617,6 +618,44 @@ def test_a_stop_keeps_to_the_switches_that_an_earlier_round_of_questions_found(s
     assert all(widths[4] > 1300 for widths in sticks(bench))
 
 
+@pytest.mark.parametrize("silent", [{Function.BOXNAMES}, {Function.BOXIDS}])
+def test_a_stop_reaches_what_flies_with_an_inverted_switch_and_does_not_name_its_modes(silent: set[int]) -> None:
+    """It was sent throttle off, with the arm switch on: its motors ran on, and nothing ended that."""
+    bench = Bench(replace(INVERTED, failsafe=FailsafeConfig(20.0, 60.0, 1000, 10.0, 1)))
+    bench.take_off()
+    bench.reconnect()
+    bench.unanswered = silent
+    bench.run(8.0)
+    assert bench.board.armed
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    bench.until(lambda: not bench.board.armed, 2.0)
+    for _ in range(round(14.0 / TICK_S)):  # over several rounds of questions, and after it is given up
+        bench.tick()
+        assert not bench.board.armed
+
+
+@pytest.mark.parametrize("silent", [Function.BOXNAMES, Function.BOXIDS, Function.MODE_RANGES])
+def test_no_stop_arms_what_tells_neither_whether_it_stands_nor_the_names_of_its_modes(silent: Function) -> None:
+    bench = Bench(INVERTED)
+    bench.ready()
+    bench.reconnect()
+    bench.unanswered = {Function.STATUS, Function.STATUS_EX, silent}
+    bench.session.command(EmergencyStop(), bench.clock.now_ns)
+    for _ in range(round(14.0 / TICK_S)):
+        bench.tick()
+        assert not bench.board.armed
+
+
+def test_a_stop_takes_the_throttle_away_where_the_order_of_the_sticks_is_not_known() -> None:
+    """The middle of roll may be half of the throttle: a stop that no arm switch carries went out so."""
+    setpoints = SetpointController()
+    setpoints.on_report(Report(True), 10**9)
+    setpoints.apply(EmergencyStop(), 10**9)
+    assert setpoints.channels(10**9)[:4] == [1000] * 4
+    setpoints.set_up(Setup(sticks=(1, 2, 3, 0), sticks_told=True), "")
+    assert setpoints.channels(10**9)[:4] == [1000, 1500, 1500, 1500]
+
+
 def test_a_stop_reaches_what_can_not_be_heard_by_a_new_proxy() -> None:
     """What flies may hear it, and what stands had no sticks for so long that it wants its arm switch off first."""
     bench = Bench()
@@ -770,3 +809,17 @@ def test_one_that_was_started_just_now_says_what_it_waits_for() -> None:
     stays = Bench(BoardSettings(boot_s=5.0, flags=bit("MSP")))
     stays.until(lambda: stays.sink.newest is not None, 2.0)
     assert stays.sink.links[-1] == (LinkState.UP, ""), "what keeps it from being armed does not pass by itself"
+
+
+# Beside a real one ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", sorted(EMPTY_WRITES))
+def test_an_empty_write_is_acknowledged_as_by_a_real_one_and_changes_nothing(number: int) -> None:
+    """A configurator was told that its write was refused. Compared with Betaflight 4.6.0's own simulation."""
+    bench = Bench()
+    reply = bench.board.answer(Frame(number, b""), bench.clock.now_ns)
+    assert reply == Frame(number, b"", Direction.REPLY)
+    written = bench.board.answer(Frame(number, b"\0"), bench.clock.now_ns)
+    assert written is not None
+    assert written.direction is Direction.ERROR, "what is written is not kept"

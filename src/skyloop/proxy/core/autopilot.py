@@ -80,6 +80,7 @@ class Autopilot:
         self.flight = flight or Flight(native)
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
+        self.drifts = False  #: it is held level, as its velocity is not known: nothing brakes it
         #: The velocity that is allowed instead of the wanted one, by the newest feedback; not asked while it lands.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._takes_velocity = "velocity" in native
@@ -229,6 +230,7 @@ class Autopilot:
 
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
         """Roll and pitch [rad] that bring the velocity to the wanted one; level while the velocity is not known."""
+        self.drifts = known is None or known.velocity_m_s is None
         if known is None or known.velocity_m_s is None:
             return 0.0, 0.0
         settings = self.settings

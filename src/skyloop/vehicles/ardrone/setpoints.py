@@ -322,8 +322,8 @@ class SetpointController:
             self._landing_is_ours = False
 
     def lost(self) -> None:
-        """Forget the drone's condition and a take-off that is under way, as nothing is received any more."""
-        self.condition = None
+        """Forget the drone's condition, a take-off that is under way and the sticks: nothing is received any more."""
+        self.condition = self._stick = None
         self._warned_blind = False
         self._releasing = False
         if self._decision is Decision.TAKE_OFF:
@@ -339,11 +339,12 @@ class SetpointController:
     def messages(self, now_ns: int) -> list[AtMessage]:
         """Return the commands of this tick: ``PCMD``, and ``REF`` unless nothing is wanted of take-off and landing.
 
-        While another program flies the drone: only the watchdog's answer.
+        While another program flies the drone: only the watchdog's answer. While it is not heard and nobody flies it
+        from here: nothing, as it may be another program's, and must land by itself where nobody flies it.
         """
         bits = self._emergency_bits(now_ns)
-        if bits is None and self.condition is not None and self.condition.flying and not self._steering:
-            return [("COMWDG", ())]
+        if bits is None and not self._steering and (self.condition is None or self.condition.flying):
+            return [] if self.condition is None else [("COMWDG", ())]
         if bits is None:
             bits = self._flight_bits(now_ns)
         moving = motion(self._stick, self.reference_rad if self._stick is not None else None)

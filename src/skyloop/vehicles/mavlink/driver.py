@@ -102,10 +102,11 @@ class MavlinkDriver(Driver):
 
     def external_pose(self, pose: ExternalPose) -> None:
         """Send the pose as ``ODOMETRY``, or as what ``?pose=`` says."""
-        link = self._opened()
-        if not link.session.is_receiving:
-            raise DriverError("no data from the vehicle: an external pose can't be sent until the link is up")
-        link.send(pose_message(pose.bounded(monotonic_ns()), self.options.pose))
+        link, now_ns = self._opened(), monotonic_ns()
+        bounded = pose.bounded(now_ns)
+        if why := link.session.pose_problem(bounded.captured_ns, now_ns):
+            raise DriverError(why)
+        link.send(pose_message(bounded, self.options.pose))
 
     def checkup(self) -> list[Diagnostic]:
         """Return which of the autopilot's own safety nets are off, and what to set."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.byte_stream import Rank
 from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.vehicle_session import (
@@ -43,6 +43,7 @@ REST_NS: Final = nanoseconds(0.1)  #: the same while nothing is under way: for s
 HEARTBEAT_NS: Final = nanoseconds(1.0)
 UNHEARD_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: the autopilots' own failsafes act after 5 or 10 s without one
 QUIET_NS: Final = nanoseconds(0.5)  #: of silence: set-points may wait where nobody reads, and be followed later
+OLD_POSE_NS: Final = nanoseconds(0.5)  #: an older one tells where the vehicle was
 DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
 LOST_NS: Final = nanoseconds(2.5)
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle without any data by then is reported as lost
@@ -185,6 +186,19 @@ class MavlinkSession(VehicleSession):
         due_ns = self.setpoints.due_ns(now_ns)
         self.due_ns = min(self.due_ns, now_ns if due_ns is None else max(now_ns, due_ns))
         return applied
+
+    def pose_problem(self, captured_ns: int, now_ns: int) -> str:
+        """Return why a pose from outside is not sent now; empty if it is.
+
+        While nothing is heard it might wait somewhere, and be taken for a new one when somebody reads again: an
+        autopilot may date it by its arrival.
+        """
+        if self._received_ns is None:
+            return "no data from the vehicle: an external pose can't be sent until the link is up"
+        if not self._is_read(now_ns):
+            return "nothing is heard from the vehicle just now: an external pose would come late"
+        age_ns = now_ns - captured_ns
+        return f"an external pose is {seconds(age_ns):.2g} s old, at most 0.5 s" if age_ns > OLD_POSE_NS else ""
 
     def send(self, message: Message) -> None:
         """Send a message to the vehicle with the next tick."""
@@ -364,11 +378,14 @@ class MavlinkSession(VehicleSession):
         messages = (
             self.setpoints.messages(vehicle, now_ns) if self.setpoints is not None and vehicle is not None else []
         )
-        quiet = now_ns - (self._received_ns or 0) >= QUIET_NS
         holds = self.setpoints is not None and self.setpoints.holds  # harmless late, and needed now
-        if not self._heard_by_it or (quiet and not holds):
+        if not self._heard_by_it or not (holds or self._is_read(now_ns)):
             messages = []  # they would wait somewhere, and be followed when somebody reads again
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
+
+    def _is_read(self, now_ns: int) -> bool:
+        """Whether what is sent now is read soon, as far as what is heard shows."""
+        return self._heard_by_it and now_ns - (self._received_ns or 0) < QUIET_NS
 
     def _heartbeats(self, peer: Peer, now_ns: int) -> list[Packet]:
         """Return the heartbeat when it is due.

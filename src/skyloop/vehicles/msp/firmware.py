@@ -37,6 +37,7 @@ SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: channels beside the sticks that are always sent
 MOST_AUX: Final = 14
 USUAL_AUX_US: Final = 1000
+_ARM_NUMBER: Final = 0  #: of both firmwares
 LONG_DELAY_S: Final = 2.0  #: a failsafe that begins later is warned of
 CURVED_API: Final = (1, 46)  #: from Betaflight 4.5 on a stick leans along the curve of its rates
 _PROCEDURES: Final = {
@@ -55,6 +56,7 @@ class Setup:
     boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status' bits
     ranges: tuple[ModeRange, ...] = ()
     sticks: tuple[int, ...] = USUAL_MAP  #: where roll, pitch, yaw and throttle are
+    sticks_told: bool = False  #: else that is a guess
     rx: RxConfig = field(default_factory=RxConfig)
     failsafe: FailsafeConfig | None = None
     on_loss: tuple[tuple[int, int], ...] = ()
@@ -86,6 +88,16 @@ class Setup:
         return [each for each in self.ranges if each.mode in numbers]
 
     @property
+    def arm_number(self) -> int | None:
+        """The permanent number of the mode that arms: that of every version where the names of modes were not read."""
+        return self.number(ARM) if any(name for _, name in self.boxes) else _ARM_NUMBER
+
+    @property
+    def arm_ranges(self) -> list[ModeRange]:
+        """The ranges of the arm switch."""
+        return [each for each in self.ranges if each.mode == self.arm_number]
+
+    @property
     def aux_channels(self) -> int:
         """How many AUX channels are sent: one that is not would take a value of the firmware's own choice."""
         used = max((each.aux + 1 for each in self.ranges), default=0)
@@ -100,8 +112,8 @@ class Setup:
         """
         wanted = {self.number(ANGLE)}
         if arm:
-            wanted |= {self.number(ARM), self.number(PREARM)}
-        switch = {each.aux for each in self.ranges_of(ARM)}
+            wanted |= {self.arm_number, self.number(PREARM)}
+        switch = {each.aux for each in self.arm_ranges}
         chosen = []
         for aux in range(self.aux_channels):
             if aux in given and aux not in switch:
@@ -115,7 +127,7 @@ class Setup:
         edges = sorted({1000, 2000, *(edge for each in ranges for edge in (each.low_us, each.high_us))})
         edges = [edge for edge in edges if 1000 <= edge <= 2000]
         candidates = [USUAL_AUX_US, 2000, *((low + high) // 2 for low, high in pairwise(edges))]
-        arm = self.number(ARM)
+        arm = self.arm_number
 
         def cost(width: int) -> tuple[int, int, int, int]:
             on = {each.mode for each in ranges if each.low_us <= width < each.high_us}

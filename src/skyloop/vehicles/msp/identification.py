@@ -92,7 +92,7 @@ class Identification:
         self.setup = replace(self.setup, ranges=tuple(msp.mode_ranges(payload)))
 
     def _on_sticks(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, sticks=msp.rx_map(payload))
+        self.setup = replace(self.setup, sticks=msp.rx_map(payload), sticks_told=True)
 
     def _on_rx(self, payload: bytes) -> None:
         self.setup = replace(self.setup, rx=msp.RxConfig.decode(payload))

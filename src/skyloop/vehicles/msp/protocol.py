@@ -30,7 +30,7 @@ from skyloop.vehicles.msp.telemetry import MotionEstimate, Reported, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
-from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, Sensor
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
 
 DEGRADED_NS: Final = nanoseconds(0.4)
 LOST_NS: Final = nanoseconds(1.0)
@@ -504,7 +504,7 @@ class MspSession(VehicleSession):
 
 
 def _told(setup: Setup) -> tuple[bool, bool]:
-    return bool(setup.ranges_of(ARM)), setup.sticks != USUAL_MAP
+    return bool(setup.arm_ranges), setup.sticks_told
 
 
 def _has_height(status: msp.Status) -> bool:

@@ -388,6 +388,8 @@ class SetpointController:
         centred = (round(1500 + 500 * stick) for stick in (roll, pitch, yaw))
         for place, width in zip(self._setup.sticks, (*centred, throttle), strict=True):
             sticks[place] = width
+        if self.stop.active and not self._setup.sticks_told:
+            sticks = [OFF_US] * len(sticks)  # wherever the throttle is, it is off
         given: Mapping[int, int] = self.given_aux
         return [*sticks, *self._setup.aux_us(arm=on, given=given)]
 

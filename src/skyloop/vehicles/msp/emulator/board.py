@@ -116,6 +116,13 @@ RECORDED: Final[dict[int, tuple[int, str]]] = {
 }
 
 
+#: Writes that Betaflight 4.6.0 acknowledges even when empty, of the numbers up to 100; they have no effect
+#: here. Not among them: 59, 61, 68 (which restarts it) and 69, to which it gives answers of their own or none.
+EMPTY_WRITES: Final = frozenset(
+    (11, 33, 35, 37, 39, 41, 43, 45, 51, 53, 55, 57, 60, 62, 65, 76, 78, 91, 93, 95, 97, 99)
+)
+
+
 @dataclass(frozen=True, slots=True)
 class BoardSettings:
     """How the flight controller is set up: by default, as ``docs/msp.md`` asks for."""
@@ -213,6 +220,8 @@ class Board:
                 part = self._state(function, now_ns) or b""
                 made += bytes((len(part),)) + part
             return made
+        if frame.function in EMPTY_WRITES and not frame.payload:
+            return b""
         return self._state(frame.function, now_ns)
 
     def _take_sticks(self, widths: list[int], now_ns: int) -> bytes | None:
