@@ -183,6 +183,13 @@ def failsafe(proxy: ScriptedProxy, _: Command) -> None:
     proxy.more["failsafe"] = Failsafe.HOVER
 
 
+def failsafe_before_others(proxy: ScriptedProxy, command: Command) -> None:
+    """The application was silent, and a pilot takes the vehicle by hand from the failsafe."""
+    proxy.more["others"] = "the vehicle is in LOITER, which was not chosen here"
+    proxy.feedback()
+    failsafe(proxy, command)
+
+
 def not_fresh(proxy: ScriptedProxy, command: Command) -> None:
     refuse(proxy, command, Refusal.NOT_FRESH, "me: ask anew", Fate.AUTHORITY)
 
@@ -206,7 +213,9 @@ def lost_lease_to_others(proxy: ScriptedProxy, command: Command) -> None:
     lost_lease(proxy, command)
 
 
-@pytest.mark.parametrize("ending", [failsafe, not_fresh, lost_link, lost_lease, lost_lease_to_others])
+@pytest.mark.parametrize(
+    "ending", [failsafe, failsafe_before_others, not_fresh, lost_link, lost_lease, lost_lease_to_others]
+)
 def test_a_landing_that_something_ended_is_asked_for_anew(
     proxy: ScriptedProxy, drone: Drone, ending: Callable[[ScriptedProxy, Command], None]
 ) -> None:
@@ -225,7 +234,7 @@ def test_a_landing_that_something_ended_is_asked_for_anew(
     landing.join(WAIT_S)
     assert {command.action for command in proxy.commands if command.intent > 0} <= {Land(), Idle()}
     again = [command for command in proxy.commands if command.action == Land()][-1]
-    kept = ending in (lost_link, lost_lease_to_others)
+    kept = ending in (failsafe_before_others, lost_link, lost_lease_to_others)
     assert again.automatic is kept, "a pilot who took it meanwhile keeps it; else who asked for it still does"
 
 

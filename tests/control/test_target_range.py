@@ -53,6 +53,7 @@ class Watching:
         self.estimator = estimator or estimator_of(None, None)
         self.at_s, self._z, self._speed = 0.0, z, speed_m_s
         self._rng, self._error = np.random.default_rng(seed), np.zeros(2)
+        self.misread = still  # by how much its altimeter is wrong [m], by the time [s]
 
     def view(self, up_m: float) -> tuple[BoxView, Camera]:
         self._error = 0.9 * self._error + self._rng.normal(0.0, 0.44, 2)
@@ -64,7 +65,7 @@ class Watching:
         up, down = (self._error * (0.5 + 0.03 * height)).tolist()
         view = BoxView.of((x, y + up, width, height - up + down), camera, 0.06)
         assert view is not None
-        return view, camera
+        return view, replace(camera, position=camera.position + (0.0, 0.0, self.misread(self.at_s)))
 
     def run(self, seconds: float, motion: Callable[[float], float] = still) -> TargetState:
         for _ in range(round(seconds / PERIOD_S)):
@@ -124,6 +125,26 @@ def test_while_the_vehicle_stays_no_guess_wins() -> None:
     assert isinstance(watching.estimator, RangeEstimator)
     assert watching.estimator.on_ground is not False
     assert found.range_m == pytest.approx(PERSON[0], rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "misread",
+    [
+        lambda at_s: -2.1 * (3.0 < at_s < 4.0),
+        lambda at_s: -0.7 * (at_s > 3.0),
+        lambda at_s: 0.7 * (at_s > 3.0),
+        lambda at_s: -1.7 * min(1.0, max(0.0, 4.0 * (at_s - 3.0))),
+    ],
+    ids=["not known for a second", "over a table", "beyond a table", "somebody below, by a filtered altimeter"],
+)
+def test_a_jump_of_the_altimeter_is_no_motion_that_shows_the_range(misread: Callable[[float], float]) -> None:
+    """A picture came to be known to be 40 m away, and would have been flown into."""
+    watching = Watching(PICTURE)
+    watching.misread = lambda at_s: misread(at_s + 2.0)
+    for _ in range(6):
+        assert not watching.run(0.5).range_known
+    found = watching.run(4.0, bobbing)
+    assert not found.range_known or found.range_m == pytest.approx(PICTURE[0], rel=0.4)
 
 
 def test_what_hangs_above_the_vehicle_does_not_stand_on_the_ground() -> None:

@@ -379,8 +379,7 @@ class ActionWait:
                 # The caller still asks for it, but a pilot who took the vehicle by hand since then keeps it. While the
                 # application's own link is lost, nothing shows that.
                 taken = self._may_be_sent and self._others_now not in (None, self._others)
-                explicit = outcome.fate is Fate.FAILSAFE or (outcome.fate is Fate.AUTHORITY and not taken)
-                self._again(automatic=not explicit)
+                self._again(automatic=taken or outcome.fate not in (Fate.FAILSAFE, Fate.AUTHORITY))
             return None
         return None if outcome.fate in OUTDONE else _refused(outcome)
 

@@ -11,6 +11,7 @@ moved, above all up or down, where hardly any target moves, those at a wrong ran
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 from typing import Final
 
@@ -33,6 +34,9 @@ _UNKNOWN: Final = 0.4  # and above which it is not any more
 _STIRRED_M: Final = 0.1  # off from where it was of late, from which on what a box says counts in full
 _OF_LATE_S: Final = 2.0  # of late: the mean of about this time
 _BASELINE: Final = 0.015  # how far off it must have been once, by range, before the range is known
+_JUMP_M: Final = 0.15  # by more the vehicle's height does not change at once, ...
+_JUMP_M_S: Final = 1.0  # ... nor faster than this: what its altimeter measures to is another thing
+_JUMPING_S: Final = 0.5  # a jump takes as long at most, where altimeters are filtered
 
 
 class RangeEstimator(TargetEstimator):
@@ -56,6 +60,8 @@ class RangeEstimator(TargetEstimator):
         self._on_ground: TargetEstimator | None = None  # the guess that it stands there, until that is dropped
         self._sight = self._about = np.zeros(3)  # the first line of sight; where the vehicle was of late
         self._stirred_m = 0.0  # the farthest that the vehicle ever was from there, across that line
+        self._heights: deque[tuple[int, float]] = deque()  # when, and how high it was lately
+        self._jumped_ns: int | None = None  # when its height jumped last
         self._size_known = self._known = self._learns = False
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
@@ -85,6 +91,7 @@ class RangeEstimator(TargetEstimator):
         azimuth = view.azimuth
         self._sight = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
         self._about, self._stirred_m = camera.position, 0.0
+        self._heights.append((at_ns, float(camera.position[2])))
         self._judge(self.at(at_ns))
 
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
@@ -94,9 +101,17 @@ class RangeEstimator(TargetEstimator):
         return min(fits), -2.0 * math.log(likelihood) if math.isfinite(min(costs)) and likelihood > 0.0 else math.inf
 
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
-        """Update with a box, as :meth:`TargetEstimator.update`, and drop the guesses that it does not fit."""
+        """Update with a box, as :meth:`TargetEstimator.update`, and drop the guesses that it does not fit.
+
+        All begins anew where the vehicle's height jumps: somebody walks below, it comes over a table, or its height is
+        not known for a moment. By such a motion that was none, the thing would surely be far away.
+        """
         if self.seen_ns is None:
             return super().update(view, camera, at_ns)  # which says so
+        if self._learns and self._jumps(camera, at_ns):
+            self._seen_before = self.at(at_ns) if self._known else self._seen_before
+            self.start(view, camera, at_ns, ground=True)
+            return True
         since_s = seconds(at_ns - self.seen_ns)
         costs = np.minimum([guess.distance(view, camera, at_ns)[1] for guess in self._guesses], 1e9)
         used = [guess.update(view, camera, at_ns) for guess in self._guesses]
@@ -174,6 +189,16 @@ class RangeEstimator(TargetEstimator):
         self._weights = self._weights[kept] / self._weights[kept].sum()
         if self._on_ground not in self._guesses:
             self._on_ground = None
+
+    def _jumps(self, camera: Camera, at_ns: int) -> bool:
+        """Return whether the height jumps, or did a moment ago."""
+        height, heights = float(camera.position[2]), self._heights
+        while len(heights) > 1 and abs(seconds(at_ns - heights[0][0])) > _JUMPING_S:
+            heights.popleft()
+        if any(abs(height - was) > _JUMP_M + _JUMP_M_S * abs(seconds(at_ns - ns)) for ns, was in heights):
+            self._jumped_ns = at_ns
+        heights.append((at_ns, height))
+        return self._jumped_ns is not None and abs(seconds(at_ns - self._jumped_ns)) < _JUMPING_S
 
     def _stir(self, camera: Camera, since_s: float) -> float:
         """Return how far the vehicle is from where it was of late, across the first line of sight [m]."""

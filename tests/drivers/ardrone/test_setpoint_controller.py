@@ -193,6 +193,20 @@ def test_a_landing_is_not_broken_off_where_the_drone_touches_down(low: Condition
         assert cockpit.ref() == Ref(0)
 
 
+def test_a_drone_that_lands_by_itself_after_a_landing_that_was_broken_off_is_left_to_land() -> None:
+    """It was told to take off again, on and on, with an empty battery."""
+    cockpit = at(AIR)
+    cockpit.take(Land())
+    cockpit.hears(LANDING)
+    cockpit.take(Hover())
+    assert cockpit.ref() == Ref.TAKEOFF
+    cockpit.hears(AIR)
+    cockpit.take(Attitude(pitch=0.1))
+    assert cockpit.ref() == Ref.TAKEOFF
+    cockpit.hears(LANDING)
+    assert cockpit.ref() == Ref(0)
+
+
 def test_a_landing_that_is_broken_off_too_late_for_the_drone_to_hear_it_is_completed() -> None:
     """The bit was sent on until navdata no longer showed it flying, which is later than it stands."""
     cockpit = at(AIR)

@@ -766,7 +766,8 @@ def test_a_vehicle_that_stands_still_is_left_with_few_set_points(way: str) -> No
     assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
 
 
-def test_a_hover_is_sent_to_what_falls_silent() -> None:
+@pytest.mark.parametrize("stop", [Hover(), Velocity()])
+def test_a_hover_is_sent_to_what_falls_silent(stop: AnyAction) -> None:
     """With the other set-points it was held back: what only could not be heard flew on for seconds."""
     bench = Bench(Vehicle(ARDUPILOT), options("mavlink://udpin:127.0.0.1:14540?parameters=no")).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
@@ -776,7 +777,7 @@ def test_a_hover_is_sent_to_what_falls_silent() -> None:
     bench.apply(Velocity(forward=0.5))
     bench.go_on(0.2, silent=True)
     assert not bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
-    bench.apply(Hover())
+    bench.apply(stop)
     bench.go_on(0.2, silent=True)
     assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
 

@@ -117,6 +117,8 @@ TOGGLE_NS: Final = nanoseconds(0.5)
 
 #: A landing is completed below this: navdata are up to 0.25 s old, and what stands by now rises by the take-off bit.
 BREAK_OFF_M: Final = 0.5
+#: What a landing that goes on shows.
+_LANDING_ON: Final = (ControlState.LANDING, ControlState.LANDED, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,6 +311,10 @@ class SetpointController:
         self._emergency = condition.emergency
         if self.condition is not None and self.condition.flying and not condition.flying:
             self._stick = None
+        was_landing = self.condition is not None and self.condition.control is ControlState.LANDING
+        broken_off = was_landing and self._steering and self._decision is Decision.STAY
+        if broken_off and condition.control not in _LANDING_ON:
+            self._landing_is_ours = False  # the next one may be the drone's own
         self.condition, self._received_ns = condition, now_ns
         self._releasing &= condition.emergency
         stands = not (condition.flying or condition.emergency)

@@ -345,7 +345,9 @@ class SetpointController:
     @property
     def holds(self) -> bool:
         """Whether it is to stay in the air where it is."""
-        return self.goal is Goal.HOLD or (self.goal is Goal.FOLLOW and isinstance(self._setpoint, PositionHold))
+        setpoint = self._setpoint
+        stops = isinstance(setpoint, VelocitySetpoint) and setpoint.action == Velocity()
+        return self.goal is Goal.HOLD or (self.goal is Goal.FOLLOW and (stops or isinstance(setpoint, PositionHold)))
 
     def step_stop(self, vehicle: VehicleState | None, now_ns: int) -> bool:
         """Send an emergency stop that is due, whether or not the vehicle is heard; return whether one is in force."""
