@@ -16,7 +16,7 @@ from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import VehicleUri
-from skyloop.messages import AnyAction, Capabilities, Feedback, Hover, Land, LinkState, Value, Velocity
+from skyloop.messages import AnyAction, Capabilities, Feedback, Hover, Land, LinkState, Takeoff, Value, Velocity
 
 SOURCE = Path(__file__).parents[1] / "example_driver" / "skyloop_toy.py"
 
@@ -160,6 +160,28 @@ class IgnoresParameters(Toy):  # type: ignore[misc, valid-type]
         return 1.0
 
 
+class StartsLater(Toy):  # type: ignore[misc, valid-type]
+    """Begins a take-off a moment after it was asked for, whatever became of it meanwhile."""
+
+    sink: Sink  # of the one that is open
+
+    def capabilities(self) -> Capabilities:
+        return Capabilities(vehicle="toy", actions=frozenset({"velocity", "takeoff", "land"}))
+
+    def _open(self, sink: Sink) -> None:
+        StartsLater.sink = sink
+        super()._open(sink)
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        if isinstance(action, Takeoff):
+            timer = threading.Timer(1.2, lambda: super(StartsLater, self)._apply(Velocity(up=0.5)))
+            timer.daemon = True
+            timer.start()
+        elif isinstance(action, Velocity):
+            super()._apply(action)
+        return action
+
+
 FAULTS: list[tuple[type[Driver], str, str]] = [
     (SocketInConstructor, "test_constructor_does_no_io", "opened a descriptor"),
     (TakesAnyOption, "test_unknown_option_is_refused", "must raise UsageError"),
@@ -173,6 +195,8 @@ FAULTS: list[tuple[type[Driver], str, str]] = [
     (DownIsUp, "test_flight", "0.6 m high"),
     (NeedsRepeats, "test_flight", "0.6 m high"),
     (Slow, "test_apply_returns_what_was_applied_at_once", "took 6"),
+    (StartsLater, "test_a_landing_withdraws_a_takeoff", "motors turn"),
+    (StartsLater, "test_a_takeoff_is_not_kept_for_a_lost_vehicle", "motors turn"),
     (FailsafeRaises, "test_failsafe_never_raises", "nothing works"),
     (Leaks, "test_gives_threads_and_descriptors_back", "threads and descriptors"),
     (TalksAfterClose, "test_close_is_idempotent_and_final", "after close"),
@@ -192,6 +216,12 @@ def test_a_fault_is_found(faulty: type[Driver], test: str, message: str) -> None
 
         def make(self, uri: VehicleUri) -> Driver:
             return faulty(uri)
+
+        def vehicle_disappears(self) -> None:
+            StartsLater.sink.link(LinkState.LOST, "it is gone")
+
+        def vehicle_appears(self) -> None:
+            StartsLater.sink.link(LinkState.UP)
 
     with pytest.raises((AssertionError, ValueError), match=message):
         getattr(Suite(), test)()

@@ -204,10 +204,18 @@ class ExternalPose:
 class Driver(ABC):
     """Base class of drivers: owns the life cycle; a subclass writes ``_open``, ``_close`` and ``_apply``.
 
-    No I/O happens before :meth:`open`. Times given to the sink are ``time.monotonic_ns`` of this host.
+    No I/O happens before :meth:`open`. Times given to the sink are ``time.monotonic_ns`` of this host. ``_open(sink)``
+    starts threads and waits for nothing, ``_close()`` joins them and forgets what was in force, and ``_apply(action)``
+    does what :meth:`apply` says. The attributes ``uri`` and ``_sink`` are this class's own.
 
     Args:
         uri: The vehicle's address with its options.
+
+    Attributes:
+        shared: Whether others may fly the vehicle too. If so, one that is found in the air is theirs and left alone.
+        parameters_without_authority: Names of parameters that any pilot may write: those that move nothing that flies.
+        serve_link: Set by a host before :meth:`open`, for a thread that serves several vehicles; None: the driver has
+            a thread of its own.
 
     Raises:
         UsageError: A subclass raises it for an option that it does not know; see :func:`reject_unknown_options`.
@@ -223,7 +231,7 @@ class Driver(ABC):
     def __init__(self, uri: VehicleUri) -> None:
         """Store the address. A subclass reads its options here, and does no I/O."""
         self.uri = uri
-        self._lock = threading.Lock()
+        self.__lock = threading.Lock()  # of this class alone: a driver may well have a _lock of its own
         self._sink: Sink | None = None
 
     # What it can do --------------------------------------------------------------------------------------------
@@ -236,7 +244,10 @@ class Driver(ABC):
         """
 
     def parameters(self) -> list[Parameter]:
-        """Return the vehicle's own parameters with their present values. Names are dotted and lower-case."""
+        """Return the vehicle's own parameters with their present values, those known so far.
+
+        Names are dotted and lower-case. May be called before the vehicle has answered.
+        """
         return []
 
     def set_parameter(self, name: str, value: Value) -> Value:  # noqa: ARG002
@@ -270,7 +281,7 @@ class Driver(ABC):
             UsageError: The driver is open already, or for something else that trying again can't mend.
             MissingExtraError: A package that this vehicle needs is not installed.
         """
-        with self._lock:
+        with self.__lock:
             if self._sink is not None:
                 raise UsageError(f"{self.uri} is open already")
             self._sink = sink
@@ -285,7 +296,7 @@ class Driver(ABC):
 
         Does not land the vehicle: the proxy does that before. The sink is not called after it returns.
         """
-        with self._lock:
+        with self.__lock:
             was_open, self._sink = self._sink is not None, None
         if was_open:
             self._close()
@@ -299,7 +310,8 @@ class Driver(ABC):
         :meth:`capabilities` names and with finite numbers.
 
         Args:
-            action: A set-point or a one-time action.
+            action: A set-point or a one-time action. A take-off without telemetry is refused, and not kept for
+                later.
             new: Whether an application newly asked for it. If not, it is the library's repeat of an earlier request, or
                 what became of one, and keeps in force what is in force: it never takes the vehicle back from somebody
                 else.

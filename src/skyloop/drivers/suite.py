@@ -24,7 +24,7 @@ import threading
 import time
 import unittest
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import ClassVar, Final
 
@@ -33,7 +33,7 @@ from skyloop.drivers.recording_sink import RecordingSink, another_value, implaus
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.suite_flight import Flight
 from skyloop.drivers.uri import VehicleUri, parse_uri
-from skyloop.errors import ParameterError, UnknownNameError, UsageError
+from skyloop.errors import DriverError, ParameterError, UnknownNameError, UsageError
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,
@@ -45,6 +45,7 @@ from skyloop.messages import (
     Idle,
     Land,
     LinkState,
+    Parameter,
     Position,
     ResetEmergency,
     Takeoff,
@@ -62,7 +63,24 @@ class DriverSuite:
     """Base class of a driver's tests. Set :attr:`uri`, or override :meth:`make`; everything else has a default.
 
     Override the class attributes below for a vehicle that is slower or moves less, and :meth:`vehicle_disappears` and
-    :meth:`vehicle_appears` to have the loss of the link tested.
+    :meth:`vehicle_appears` to have the loss of the link tested. To give each test a fake vehicle of its
+    own, start it in a fixture and override :meth:`new_driver`.
+
+    Attributes:
+        uri: The address of the vehicle to test with.
+        connect_timeout_s: How long the link may take to come up [s]. All names in ``_timeout_s`` are such times.
+        close_grace_s: How long threads that were joined may take to vanish from the system's tables [s].
+        speed: Commanded forward, backward, left and right in the flight [m/s].
+        climb: Commanded up and down [m/s].
+        tilt: Commanded roll and pitch, of a vehicle that takes no velocities [rad].
+        yaw_rate: [rad/s]
+        distance: How far the vehicle must go each way within ``motion_timeout_s`` [m].
+        turn: How far it must turn [rad].
+        near: How near it must come to a commanded position [m].
+        stand_s: How long the vehicle is watched where it must not start its motors [s].
+        feedback_age_s: Greatest age of a sample when it arrives [s].
+        frame_age_s: Greatest age of a frame when it arrives [s].
+        untouched_parameters: Names of parameters that the suite must not write.
     """
 
     #: The address of the vehicle to test with.
@@ -88,6 +106,9 @@ class DriverSuite:
     distance: ClassVar[float] = 0.15
     turn: ClassVar[float] = 0.2
     near: ClassVar[float] = 0.15
+
+    #: How long the vehicle is watched where it must not start its motors [s].
+    stand_s: ClassVar[float] = 2.0
 
     #: How old a sample or frame may be when it arrives [s].
     feedback_age_s: ClassVar[float] = 0.5
@@ -377,9 +398,11 @@ class DriverSuite:
         """What is written to a parameter is in force and listed. Writes the old value back."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
-            writable = [p for p in driver.parameters() if not p.read_only and p.name not in self.untouched_parameters]
-            if not writable:
-                raise unittest.SkipTest("the vehicle has no parameter to write")
+            end = time.monotonic() + self.feedback_timeout_s
+            while not (writable := self._writable(driver)):  # a driver may have to request them first
+                if time.monotonic() > end:
+                    raise unittest.SkipTest(f"parameters() lists none to write within {self.feedback_timeout_s} s")
+                time.sleep(0.05)
             for parameter in writable:
                 try:
                     for value in (another_value(parameter), parameter.value):
@@ -389,6 +412,9 @@ class DriverSuite:
                         assert same(reported, in_force), f"{parameter.name}: {in_force!r} in force, {reported!r} listed"
                 finally:
                     driver.set_parameter(parameter.name, parameter.value)
+
+    def _writable(self, driver: Driver) -> list[Parameter]:
+        return [p for p in driver.parameters() if not p.read_only and p.name not in self.untouched_parameters]
 
     def test_bad_parameters_are_refused(self) -> None:
         """Writing an unknown or read-only parameter raises ParameterError or UnknownNameError."""
@@ -419,9 +445,49 @@ class DriverSuite:
                     flight.goes_to_places()
                 if "hover" in driver.capabilities().actions:
                     driver.apply(Hover())
-                    flight.until(lambda f: f.state is FlightState.HOVERING, self.motion_timeout_s, "hovering")
+                    flight.until(
+                        lambda f: f.state is FlightState.HOVERING, self.motion_timeout_s, "HOVERING after Hover"
+                    )
             finally:
                 flight.land()
+
+    def test_a_landing_withdraws_a_takeoff(self) -> None:
+        """A landing right after a take-off ends with a vehicle that is on the ground and stays there."""
+        with self.opened(watch=set()) as (driver, sink):
+            if not {"takeoff", "land"} <= driver.capabilities().actions:
+                raise unittest.SkipTest("the vehicle takes no take-off and landing of its own")
+            flight = Flight(self, driver, sink)
+            flight.wake()
+            driver.apply(Takeoff())
+            driver.apply(Land())
+            self._stands(sink, "a take-off that a landing withdrew")
+
+    def test_a_takeoff_is_not_kept_for_a_lost_vehicle(self) -> None:
+        """A take-off requested while the link is lost does not start when the link is back."""
+        with self.opened(watch=set()) as (driver, sink):
+            if "takeoff" not in driver.capabilities().actions:
+                raise unittest.SkipTest("the vehicle takes no take-off of its own")
+            Flight(self, driver, sink).wake()
+            self.vehicle_disappears()
+            try:
+                lost = sink.wait(lambda: sink.link_state is LinkState.LOST, self.lost_timeout_s)
+                assert lost, f"the link was not reported LOST; reported: {sink.links}"
+                with suppress(DriverError):  # the best answer
+                    driver.apply(Takeoff())
+            finally:
+                self.vehicle_appears()
+            found = sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
+            assert found, f"the link was not reported UP again; reported: {sink.links}"
+            self._stands(sink, "a take-off from before the link was back", at_once=True)
+
+    def _stands(self, sink: RecordingSink, what: str, *, at_once: bool = False) -> None:
+        """Check that the vehicle stands for ``stand_s``, and unless ``at_once`` give it time to land before."""
+        if not at_once:
+            time.sleep(1.0)  # time for telemetry to show what the vehicle received
+            sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.LANDED, self.land_timeout_s)
+        up = (FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.LANDING)
+        flies = sink.wait(lambda: sink.newest is not None and sink.newest.state in up, self.stand_s)
+        assert not flies, f"the motors turn after {what}: state {sink.newest and sink.newest.state}"
 
     def test_emergency_stop_and_reset(self) -> None:
         """An emergency stop is reported and ends only with the reset. On the ground."""
@@ -433,7 +499,8 @@ class DriverSuite:
             driver.apply(EmergencyStop())
             flight.until(lambda f: f.state is FlightState.EMERGENCY, self.emergency_timeout_s, "in emergency")
             if "hover" in actions:
-                driver.apply(Hover())
+                with suppress(DriverError):  # refused or ignored, as the driver likes
+                    driver.apply(Hover())
                 time.sleep(0.2)
                 flight.until(lambda f: f.state is FlightState.EMERGENCY, 1.0, "still in emergency after hover")
             driver.apply(ResetEmergency())

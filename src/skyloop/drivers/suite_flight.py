@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import time
 import unittest
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from skyloop.drivers.base import Driver
-from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.drivers.recording_sink import PLAUSIBLE, RecordingSink
 from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.messages.geometry import wrap_angle
@@ -62,9 +63,18 @@ class Flight:
         def holds() -> bool:
             return sink.newest is not None and condition(sink.newest)
 
-        assert sink.wait(holds, timeout_s), f"not {what} within {timeout_s} s; newest feedback: {sink.newest}"
+        assert sink.wait(holds, timeout_s), f"not {what} within {timeout_s} s; newest feedback: {_told(sink.newest)}"
         assert sink.newest is not None
         return sink.newest
+
+    def wake(self) -> None:
+        """Wait until the vehicle is awake, where its link says that it wakes up.
+
+        Raises:
+            AssertionError: It was not awake within the suite's ``takeoff_timeout_s``.
+        """
+        links, timeout_s = self.sink.links, self.suite.takeoff_timeout_s
+        assert self.sink.wait(lambda: not links[-1][1].startswith(WAKING_UP), timeout_s), links[-1]
 
     def take_off(self) -> None:
         """Take off and wait until the vehicle hovers or flies; without a native take-off, climb to 0.6 m.
@@ -73,8 +83,7 @@ class Flight:
             AssertionError: It was not awake, or not up within the suite's ``takeoff_timeout_s``.
         """
         if "takeoff" in self.actions:
-            links, timeout_s = self.sink.links, self.suite.takeoff_timeout_s
-            assert self.sink.wait(lambda: not links[-1][1].startswith(WAKING_UP), timeout_s), links[-1]
+            self.wake()
             self.driver.apply(Takeoff())
             settled = (FlightState.HOVERING, FlightState.FLYING)
             self.until(lambda f: f.state in settled, self.suite.takeoff_timeout_s, "hovering after take-off")
@@ -167,7 +176,7 @@ class Flight:
             gone = measure(start, feedback)
             return gone is not None and gone * math.copysign(1.0, goal) >= abs(goal)
 
-        self.until(far_enough, self.suite.motion_timeout_s, f"{goal:+g} along {axis} from {start}")
+        self.until(far_enough, self.suite.motion_timeout_s, f"{goal:+g} along {axis} from {_told(start)}")
         self.set_point()
         self._settle()
 
@@ -177,6 +186,16 @@ class Flight:
         if brake:
             self.driver.apply(Hover())
         self.sink.wait(lambda: _speed(self.sink.newest) < 0.25, 2.0 if brake else 0.3)
+
+
+def _told(feedback: Feedback | None) -> str:
+    """Return what a driver filled in, and how old it is, for the text of an error."""
+    if feedback is None:
+        return "none"
+    age_s = (time.monotonic_ns() - feedback.captured_ns) / 1e9
+    values = {name: getattr(feedback, name) for name in (*PLAUSIBLE, "native")}
+    told = [f"{name} {value}" for name, value in values.items() if value is not None]
+    return ", ".join([f"state {feedback.state.name}", f"{age_s:.2f} s old", *told])
 
 
 def _height(start: Feedback, now: Feedback) -> float | None:
