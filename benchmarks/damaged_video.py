@@ -29,7 +29,7 @@ from skyloop.drivers.live_container import LiveDecoder, Piece
 from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser, av
 from skyloop.vehicles.emulation.video import OneCamera
-from skyloop.vehicles.tello.emulator.emulator import TelloPacker, automatic_kbps
+from skyloop.vehicles.tello.emulator import TelloPacker, automatic_kbps
 from skyloop.vehicles.tello.video import TelloVideo
 from skyloop.vehicles.tello.wire import Assembly, pieces
 from tests.recordings import FIXTURES
