@@ -34,7 +34,7 @@ from skyloop.sim.parameters import Limits, VehicleParameters
 from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
 from skyloop.vehicles.emulation.encoders import Encoder, Format, require_encoder
-from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
+from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import OneCamera, Piece, VideoEncoding
 from skyloop.vehicles.tello.emulator.logic import TelloLogic
 from skyloop.vehicles.tello.emulator.telemetry import MOST
