@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 from skyloop.drivers.h264 import Inspector
 from skyloop.drivers.live_container import LiveDecoder, Piece
 from skyloop.drivers.live_frames import Coded
+from skyloop.vehicles.ardrone.pave_decoder import av
 from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo
-from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser, av
+from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from skyloop.vehicles.emulation.video import OneCamera
-from skyloop.vehicles.tello.emulator.emulator import TelloPacker, automatic_kbps
+from skyloop.vehicles.tello.emulator import TelloPacker, automatic_kbps
 from skyloop.vehicles.tello.video import TelloVideo
 from skyloop.vehicles.tello.wire import Assembly, pieces
 from tests.recordings import FIXTURES

@@ -48,7 +48,7 @@ def read_film(path: Path, most: int | None = None) -> NDArray[np.uint8]:
         FileFormatError: Nothing in it can be decoded.
         MissingExtraError: PyAV is not installed.
     """
-    from skyloop.vehicles.ardrone.wire.pave import PaveDecoder
+    from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder
 
     decoder = PaveDecoder()
     frames = []

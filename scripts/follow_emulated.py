@@ -32,8 +32,7 @@ from skyloop.sim.world import Wind
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports, with_ardrones
 from skyloop.vehicles.ardrone.emulator.video import FRONT_2
-from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
-from skyloop.vehicles.tello.emulator.emulator import FRONT
+from skyloop.vehicles.tello.emulator import FRONT, TelloFirmware, with_tellos
 from skyloop.vision import simulated_detector
 
 CAMERAS: Final = {"ardrone2": FRONT_2, "tello": FRONT}

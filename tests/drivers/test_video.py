@@ -317,7 +317,7 @@ def test_without_pyav_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
     for name in [
         name
         for name in sys.modules
-        if name.startswith(("skyloop.vehicles.video", "skyloop.vehicles.ardrone.wire.pave", "av."))
+        if name.startswith(("skyloop.vehicles.video", "skyloop.vehicles.ardrone.pave_decoder", "av."))
     ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "av", None)

@@ -15,8 +15,8 @@ from skyloop.sim.reports import VehicleTruth
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.datagrams import Address
-from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
-from skyloop.vehicles.tello.emulator.emulator import LIMITS, TELLO
+from skyloop.vehicles.emulation.flight import SimulatedVehicle
+from skyloop.vehicles.tello.emulator import LIMITS, TELLO
 from skyloop.vehicles.tello.emulator.logic import TelloLogic
 from skyloop.vehicles.tello.wire import Sdk, State, parse
 

@@ -14,8 +14,7 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
-from skyloop.vehicles.tello.emulator import Faults, TelloFirmware, with_tellos
-from skyloop.vehicles.tello.emulator.emulator import FULL_KBPS, LEAST_KBPS, automatic_kbps
+from skyloop.vehicles.tello.emulator import FULL_KBPS, LEAST_KBPS, Faults, TelloFirmware, automatic_kbps, with_tellos
 from skyloop.vehicles.tello.wire import PIECE, AccessUnit, Assembly, parse
 from tests.drivers.tello.addresses import Addresses
 

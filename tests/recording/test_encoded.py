@@ -34,9 +34,9 @@ from skyloop.recording.review.video import export_mp4
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
-from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
-from skyloop.vehicles.ardrone.emulator.emulator import with_ardrones
-from skyloop.vehicles.ardrone.wire.pave import PaveDecoder, PaveFrame, PaveParser
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports, with_ardrones
+from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder
+from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from tests.integration.fake_vehicle import FakeVehicle
 from tests.recording import files
 from tests.recordings import recorded

@@ -17,8 +17,7 @@ import pytest
 from skyloop.errors import LinkError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
-from skyloop.vehicles.ardrone.emulator import ArdroneFirmware
-from skyloop.vehicles.ardrone.emulator.emulator import with_ardrones
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, with_ardrones
 
 HERE = Path(__file__).parent
 INSTALLED = HERE.parents[1] / ".third-party"

@@ -33,7 +33,7 @@ from skyloop.cli.network import (
     warn_if_open,
 )
 from skyloop.errors import UsageError
-from skyloop.vehicles.sim.options import AutopilotKind
+from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -345,8 +345,7 @@ def _racers(options: SimOptions, drones: int, serving: Serving) -> list[Betaflig
 def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFirmware]:
     from skyloop.sim.host import SimHost
     from skyloop.sim.render.planar import Quality, prepare
-    from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
-    from skyloop.vehicles.tello.emulator.emulator import FRONT
+    from skyloop.vehicles.tello.emulator import FRONT, TelloFirmware, with_tellos
     from skyloop.vehicles.tello.wire import PORT
 
     prepare(FRONT, Quality(options.quality))  # so that its first picture comes at once when it is asked for

@@ -107,7 +107,35 @@ class Exposure:
     due_ns: int  #: when the frame is delivered
 
 
-class CameraPipeline:
+class _Frames:
+    """Finished pictures, each delivered when it is due."""
+
+    def __init__(self) -> None:
+        self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
+        self._order = itertools.count()
+        self._handing = threading.RLock()
+
+    def hand_out(self, now_ns: int) -> None:
+        """Deliver the frames that are due by then."""
+        while self._finished and self._finished[0][0] <= now_ns:
+            _, _, exposure, picture = heapq.heappop(self._finished)
+            with self._handing:
+                if not exposure.camera.gone:
+                    exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
+
+    def forget(self, cameras: tuple[Camera, ...]) -> None:
+        """Stop delivering frames of these cameras; on return no other thread delivers one."""
+        with self._handing:
+            for camera in cameras:
+                camera.gone = True
+
+    def _develop(self, renderer: PlanarRenderer, exposure: Exposure) -> None:
+        picture = renderer.render(exposure.state, exposure.pose, exposure.model)
+        picture = exposure.camera.finish(picture, exposure.number, exposure.rates_rad_s)
+        heapq.heappush(self._finished, (exposure.due_ns, next(self._order), exposure, picture))
+
+
+class CameraPipeline(_Frames):
     """Renders exposures on its own thread, the newest of each camera, and delivers each frame when it is due.
 
     The scene is created at the start, which takes some tenths of a second: start it when the first frame is wanted.
@@ -121,14 +149,12 @@ class CameraPipeline:
             drones: How many it has.
             quality: Of the images: ``fast``, ``smooth`` or ``best``.
         """
+        super().__init__()
         self._world = world
         self._drones = drones
         self._quality = quality
         self._changed = threading.Condition()
         self._waiting: dict[Camera, Exposure] = {}  # oldest camera first
-        self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
-        self._order = itertools.count()
-        self._handing = threading.Lock()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="skyloop-sim-cameras", daemon=True)
 
@@ -153,12 +179,6 @@ class CameraPipeline:
                 self._waiting[exposure.camera] = exposure
             self._changed.notify()
 
-    def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Stop delivering frames of these cameras; on return none is under way."""
-        with self._handing:
-            for camera in cameras:
-                camera.gone = True
-
     def _run(self) -> None:
         try:
             renderer = make_renderer(self._world, self._drones, self._quality)
@@ -170,17 +190,14 @@ class CameraPipeline:
             return
         while (exposure := self._next()) is not None:
             try:
-                picture = renderer.render(exposure.state, exposure.pose, exposure.model)
-                picture = exposure.camera.finish(picture, exposure.number, exposure.rates_rad_s)
+                self._develop(renderer, exposure)
             except Exception as error:  # noqa: BLE001  reported to the driver; the next frame may succeed
                 exposure.camera.screen.failed(error)
-            else:
-                heapq.heappush(self._finished, (exposure.due_ns, next(self._order), exposure, picture))
 
     def _next(self) -> Exposure | None:
         """Return the next exposure to render, delivering meanwhile what is due; None to stop."""
         while True:
-            self._hand_out()
+            self.hand_out(monotonic_ns())
             with self._changed:
                 if self._stopping:
                     return None
@@ -192,15 +209,8 @@ class CameraPipeline:
                 if wait_s > 0:
                     self._changed.wait(wait_s)
 
-    def _hand_out(self) -> None:
-        while self._finished and self._finished[0][0] <= monotonic_ns():
-            _, _, exposure, picture = heapq.heappop(self._finished)
-            with self._handing:
-                if not exposure.camera.gone:
-                    exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
 
-
-class SteppedCameraPipeline:
+class SteppedCameraPipeline(_Frames):
     """Renders each exposure at once, and delivers what is due on demand, all on one thread.
 
     For a world whose time stands still between two steps.
@@ -208,28 +218,13 @@ class SteppedCameraPipeline:
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
         """Create the renderer."""
+        super().__init__()
         self._renderer = make_renderer(world, drones, quality)
-        self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
-        self._order = itertools.count()
 
     def expose(self, exposures: list[Exposure]) -> None:
         """Render exposures."""
         for exposure in exposures:
-            picture = self._renderer.render(exposure.state, exposure.pose, exposure.model)
-            picture = exposure.camera.finish(picture, exposure.number, exposure.rates_rad_s)
-            heapq.heappush(self._finished, (exposure.due_ns, next(self._order), exposure, picture))
-
-    def hand_out(self, now_ns: int) -> None:
-        """Deliver the frames that are due by then."""
-        while self._finished and self._finished[0][0] <= now_ns:
-            _, _, exposure, picture = heapq.heappop(self._finished)
-            if not exposure.camera.gone:
-                exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
-
-    def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Stop delivering frames of these cameras."""
-        for camera in cameras:
-            camera.gone = True
+            self._develop(self._renderer, exposure)
 
     def stop(self) -> None:
         """Drop the frames that were not delivered yet."""

@@ -11,8 +11,7 @@ from skyloop.clock import seconds
 from skyloop.drivers.live_video import VideoEvent
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
-from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
-from skyloop.vehicles.ardrone.emulator.emulator import with_ardrones
+from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports, with_ardrones
 from skyloop.vehicles.ardrone.video import VideoReceiver
 from tests.drivers.ardrone.video_ports import HOST, Viewer
 

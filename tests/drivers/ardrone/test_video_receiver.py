@@ -280,7 +280,7 @@ def test_without_pyav_it_names_what_to_install(monkeypatch: pytest.MonkeyPatch) 
     for name in [
         name
         for name in sys.modules
-        if name == "av" or name.startswith(("av.", "skyloop.vehicles.ardrone.wire.pave", "skyloop.vehicles.video"))
+        if name == "av" or name.startswith(("av.", "skyloop.vehicles.ardrone.pave_decoder", "skyloop.vehicles.video"))
     ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "av", None)

@@ -21,9 +21,9 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind
 from skyloop.transport.testing import wait_until
+from skyloop.vehicles.mavlink import emulator
 from skyloop.vehicles.mavlink.driver import MavlinkDriver
-from skyloop.vehicles.mavlink.emulator import Kind, Ports, emulator
-from skyloop.vehicles.mavlink.emulator.emulator import TransportStream
+from skyloop.vehicles.mavlink.emulator import Kind, Ports, TransportStream
 from tests.drivers.ardrone.video_ports import TcpPort
 from tests.drivers.mavlink.film import FPS, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
 from tests.drivers.mavlink.rtsp_server import HOST, RtspServer

@@ -17,7 +17,7 @@ from skyloop.sim.host import Report
 from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
-from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
+from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.msp.emulator.board import RACER, Board, BoardSettings
 from skyloop.vehicles.msp.options import MspOptions, options_of
 from skyloop.vehicles.msp.protocol import MspSession

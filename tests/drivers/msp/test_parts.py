@@ -18,9 +18,8 @@ from skyloop.vehicles.msp.firmware import Setup, hindrances
 from skyloop.vehicles.msp.options import options_of
 from skyloop.vehicles.msp.parameters import DriverParameters
 from skyloop.vehicles.msp.protocol import MspSession
-from skyloop.vehicles.msp.requests import PATIENCE_NS, Questions, Telemetry
 from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
-from skyloop.vehicles.msp.telemetry import MotionEstimate, charge_left
+from skyloop.vehicles.msp.telemetry import PATIENCE_NS, MotionEstimate, Questions, Telemetry, charge_left
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import Function, Identity, ModeRange

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skyloop.drivers.live_frames import Coded
 from skyloop.drivers.uri import parse_uri
 from skyloop.vehicles.emulation.video import OneCamera
-from skyloop.vehicles.tello.emulator.emulator import FRONT, GROUP, TelloPacker
+from skyloop.vehicles.tello.emulator import FRONT, GROUP, TelloPacker
 from skyloop.vehicles.tello.video import TelloVideo, cameras_of, intrinsics_for
 from skyloop.vehicles.tello.wire import AccessUnit, Assembly, pieces
 

@@ -10,7 +10,7 @@ from skyloop.sim.host import Report
 from skyloop.sim.parameters import VehicleParameters, with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
-from skyloop.vehicles.emulation.vehicle import SimulatedVehicle
+from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.mavlink.emulator import Kind
 from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
 from skyloop.vehicles.mavlink.emulator.links import Streams

@@ -285,7 +285,7 @@ class PaveVideo:
 
     def __init__(self) -> None:
         try:
-            from skyloop.vehicles.ardrone.wire.pave import PaveDecoder
+            from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder
         except MissingExtraError as error:
             raise MissingExtraError("the video of an AR.Drone 2", error.extra, cause=str(error.__cause__)) from error
         self._decoder = PaveDecoder()

@@ -1,18 +1,73 @@
-"""The loops below an autopilot's modes: positions, world velocities and headings, over a simulated vehicle. Pure."""
+"""The body that flies, one drone of a simulation, and the loops below an autopilot's modes over it. Pure.
+
+The loops fly positions, world velocities and headings.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Hover, Land, ResetEmergency, Takeoff
 from skyloop.messages import Velocity as VelocityAction
 from skyloop.messages.geometry import clamped, turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits
+from skyloop.sim.simulation import Simulation
 from skyloop.sim.world import Vec3
-from skyloop.vehicles.emulation.vehicle import Vehicle
+
+
+class Vehicle(Protocol):
+    """A body with motors and an autopilot that holds attitude, velocity and altitude."""
+
+    @property
+    def state(self) -> FlightState: ...
+
+    @property
+    def ceiling_m(self) -> float:
+        """Height of its world [m]."""
+
+    def command(self, action: AnyAction) -> AnyAction:
+        """Command the body.
+
+        Returns:
+            What was applied, :class:`skyloop.messages.Idle` where it was ignored.
+        """
+
+    def set_limits(self, limits: Limits) -> None: ...
+
+
+class SimulatedVehicle:
+    """A drone of a simulation; see :class:`Vehicle`.
+
+    Args:
+        simulation: Flies it.
+        drone: Its number.
+    """
+
+    def __init__(self, simulation: Simulation, drone: int) -> None:
+        self._simulation = simulation
+        self._drone = drone
+
+    @property
+    def state(self) -> FlightState:
+        """Flight state, as it is."""
+        return self._simulation.state(self._drone)
+
+    @property
+    def ceiling_m(self) -> float:
+        """Height of its world [m]."""
+        return self._simulation.world.room.size_m[2]
+
+    def command(self, action: AnyAction) -> AnyAction:
+        """Command the body, and return what was applied."""
+        return self._simulation.command(self._drone, action)
+
+    def set_limits(self, limits: Limits) -> None:
+        """Set the limits of its set-points."""
+        self._simulation.set_limits(self._drone, limits)
+
 
 LIFT_M: Final = 0.3  #: what the simulated vehicle's own take-off does, before these loops go on
 LIMITS: Final = Limits(

@@ -10,7 +10,7 @@ from typing import Final
 
 from skyloop.errors import DecodeError
 from skyloop.vehicles.msp.firmware import Setup
-from skyloop.vehicles.msp.requests import Questions
+from skyloop.vehicles.msp.telemetry import Questions
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import betaflight_rates
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function

@@ -24,9 +24,8 @@ from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.msp.firmware import SUPPORTED, Setup, hindrances
 from skyloop.vehicles.msp.identification import Identification
 from skyloop.vehicles.msp.options import MspOptions
-from skyloop.vehicles.msp.requests import Questions, Telemetry
 from skyloop.vehicles.msp.setpoints import PASSING, Phase, Report, SetpointController
-from skyloop.vehicles.msp.telemetry import MotionEstimate, Reported, feedback_of
+from skyloop.vehicles.msp.telemetry import MotionEstimate, Questions, Reported, Telemetry, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode

@@ -18,7 +18,8 @@ from skyloop.drivers.live_container import Units
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages.frame import H264
 from skyloop.pyav import limit_memory
-from skyloop.vehicles.ardrone.wire.pave import Codec, PaveDecoder, PaveFrame, PaveParser, av
+from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder, av
+from skyloop.vehicles.ardrone.wire.pave import Codec, PaveFrame, PaveParser
 
 if TYPE_CHECKING:
     from av.container import InputContainer

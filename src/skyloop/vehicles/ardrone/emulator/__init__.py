@@ -15,8 +15,301 @@ On free ports of this machine, for a test::
 ``faults=Faults(seed=1, drop=0.1)`` of :mod:`skyloop.faults` datagrams get lost both ways.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from skyloop.clock import monotonic_ns, nanoseconds
+from skyloop.errors import UsageError
 from skyloop.faults import Faults
-from skyloop.vehicles.ardrone.emulator.emulator import ArdroneFirmware, with_ardrones
-from skyloop.vehicles.ardrone.wire.navdata import Ports
+from skyloop.sim.host import Report, SimHost
+from skyloop.sim.options import SimOptions
+from skyloop.sim.vehicles import AR_DRONE
+from skyloop.vehicles.ardrone.emulator.logic import ArdroneLogic, VideoSettings
+from skyloop.vehicles.ardrone.emulator.streams import Listeners, Outlet, StreamPort
+from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, tags_of
+from skyloop.vehicles.ardrone.emulator.video import CAMERAS, DroneClock, PavePacker, UvlcPacker
+from skyloop.vehicles.ardrone.wire import navdata
+from skyloop.vehicles.ardrone.wire.navdata import STANDARD, Ports
+from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
+from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.vehicles.emulation.encoders import require_encoder
+from skyloop.vehicles.emulation.flight import SimulatedVehicle
+from skyloop.vehicles.emulation.video import Packer, Piece, VideoEncoding
+
+if TYPE_CHECKING:
+    from skyloop.sim.camera_pipeline import Camera
 
 __all__ = ["ArdroneFirmware", "Faults", "Ports", "with_ardrones"]
+
+
+REPORTS_HZ: Final = 125.0  #: as often as a world that keeps time reports
+
+
+def with_ardrones(options: SimOptions | None = None) -> SimOptions:
+    """Return options of a world whose drones are AR.Drones: their identified response, navdata as often as possible.
+
+    Cameras are the firmware's own, whatever the options say.
+    """
+    return replace(options or SimOptions(), parameters=AR_DRONE, rate_hz=REPORTS_HZ, cameras=())
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The arguments of :class:`skyloop.vehicles.ardrone.emulator.ArdroneFirmware`."""
+
+    version: int
+    bind: str
+    ports: Ports
+    faults: Faults
+    delay_s: float
+    header_size: int
+    torn_start: bool
+
+
+DEMO_HZ: Final = 15.0
+
+
+class RunningFirmware(RunningEmulator):
+    """An AR.Drone that is switched on. The logic, the ports and the lists of clients belong to the loop's thread."""
+
+    def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
+        super().__init__(host, drone, "skyloop-ardrone")
+        self._settings = settings
+        self._clock = DroneClock(monotonic_ns())
+        self._demo_due_ns = 0
+        self._stale = b""  # the picture sent last that needs others before it
+        self._navdata_clients, self._video_clients = Listeners(), Listeners()
+        self._most_thrust = host.simulation.parameters[drone].most_thrust
+        vehicle = SimulatedVehicle(host.simulation, drone)
+        self.logic = ArdroneLogic(vehicle, self._send_text, monotonic_ns, version=settings.version)
+        self._shown = self.logic.video
+        self._video = self._encoding = VideoEncoding(self._packer(), lambda: self._shown, self._encoded)
+        self._cameras: tuple[Camera, ...] = ()
+        try:
+            self._open_ports(settings.ports)
+            self._encoding.start()
+            self._loop.start()
+            self._cameras = host.attach(drone, self, self, list(CAMERAS[settings.version]))
+        except BaseException:
+            self.stop()
+            raise
+
+    # Ports -----------------------------------------------------------------------------------------------------
+
+    def _open_ports(self, wanted: Ports) -> None:
+        self._navdata_port = self._datagrams("navdata", wanted.navdata, self._asked_for_navdata)
+        self._at_port = self._datagrams("AT", wanted.at, self._on_commands)
+        self._control_port = self._stream("control", wanted.control)
+        self._video_stream: StreamPort | None = None
+        self._video_datagrams: DatagramPort | None = None
+        if self._settings.version == 1:
+            self._video_datagrams = self._datagrams("video", wanted.video, self._asked_for_video)
+            video = self._video_datagrams.port
+        else:
+            self._video_stream = self._stream("video", wanted.video, self._joined_video)
+            video = self._video_stream.port
+        self.ports = Ports(self._navdata_port.port, video, self._at_port.port, self._control_port.port)
+
+    def _datagrams(self, name: str, port: int, on_datagram: Callable[[bytes, Address], None]) -> DatagramPort:
+        settings = self._settings
+        opened = DatagramPort(
+            self._loop, (settings.bind, port), on_datagram, name=name, faults=settings.faults, delay_s=settings.delay_s
+        )
+        self._open.append(opened)
+        return opened
+
+    def _stream(self, name: str, port: int, joined: Callable[[Outlet], None] | None = None) -> StreamPort:
+        opened = StreamPort(self._loop, (self._settings.bind, port), name=name, joined=joined)
+        self._open.append(opened)
+        return opened
+
+    # Commands and navdata, on the loop's thread ----------------------------------------------------------------
+
+    def _on_commands(self, datagram: bytes, _sender: Address) -> None:
+        self.logic.receive(datagram)
+        self._look_at_video()
+
+    def _send_text(self, text: bytes) -> None:
+        self._control_port.accept()  # a client that connected just before its command gets the answer, too
+        self._control_port.broadcast(text)
+
+    def _asked_for_navdata(self, _datagram: bytes, sender: Address) -> None:
+        if self._navdata_clients.refresh(sender):
+            self._demo_due_ns = 0
+
+    def _tick(self, report: Report) -> None:
+        self.logic.supervise(report.believed)
+        if self.logic.lost:
+            self._video_clients = Listeners()  # or an AR.Drone 1 would send pictures to nobody for ever
+        self._look_at_video()
+        now_ns = monotonic_ns()
+        if self.logic.demo or self.logic.bootstrap:
+            if now_ns < self._demo_due_ns:
+                return
+            period_ns = nanoseconds(1 / DEMO_HZ)
+            self._demo_due_ns = max(self._demo_due_ns + period_ns, now_ns)
+        self._send_navdata(report)
+
+    def _send_navdata(self, report: Report) -> None:
+        if not self._navdata_clients:
+            return
+        options = []
+        logic = self.logic
+        if not logic.bootstrap:
+            mask = int(logic.configuration.number("general:navdata_options"))
+            tags = tags_of(mask, demo=logic.demo, version=self._settings.version)
+            options = options_of(self._snapshot(report), tags)
+        state = logic.state(video=self._seen)
+        vision = bool(state & navdata.State.VISION)
+        for client, sequence in self._navdata_clients.next_sequences():
+            self._navdata_port.send(navdata.encode(state, sequence, options, vision), client)
+
+    def _snapshot(self, report: Report) -> Snapshot:
+        flight = self.logic.flight
+        return Snapshot(
+            believed=report.believed,
+            state=report.believed.state,
+            time=self._clock.navdata_time(report.captured_ns),
+            thrust=report.truth.thrust,
+            most_thrust=self._most_thrust,
+            trim_rad=flight.trim_rad,
+            progress=flight.progress,
+            flipping=flight.flipping(monotonic_ns()),
+            video=self._encoding.status,
+            channel=self._shown.channel,
+            link_quality=round(100 * (1 - self._settings.faults.drop)),
+        )
+
+    # Video -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _seen(self) -> bool:
+        """Whether anybody receives pictures."""
+        if self._video_stream is not None:
+            return bool(self._video_stream.outlets)
+        return bool(self._video_clients)
+
+    def _packer(self) -> Packer[VideoSettings]:
+        if self._settings.version == 1:
+            return UvlcPacker()
+        return PavePacker(self._clock, self._settings.header_size, self._attitude)
+
+    def _attitude(self) -> tuple[float, float, float]:
+        """Return theta, phi and psi [rad]."""
+        if self._report is None:
+            return 0.0, 0.0, 0.0
+        believed = self._report.believed
+        return -believed.pitch_rad, believed.roll_rad, -believed.yaw_rad
+
+    def _look_at_video(self) -> None:
+        """Follow the configuration, on the loop's thread."""
+        wanted = self.logic.video
+        if wanted == self._shown:
+            return
+        self._shown = wanted
+        for camera in self._cameras:
+            camera.model = replace(camera.model, fps=wanted.fps)
+
+    def _joined_video(self, outlet: Outlet) -> None:
+        if not self._settings.torn_start:
+            outlet.skip_to_start()
+        elif self._stale:
+            outlet.offer(self._stale, starts=True)
+
+    def _asked_for_video(self, _datagram: bytes, sender: Address) -> None:
+        self._video_clients.refresh(sender)
+
+    def _encoded(self, piece: Piece) -> None:
+        """Send a picture. On the encoder's thread."""
+        self._loop.post(lambda: self._send_video(piece))
+
+    def _send_video(self, piece: Piece) -> None:
+        if self._video_stream is not None:
+            self._video_stream.broadcast(piece.data, starts=piece.starts)
+            if not piece.starts:
+                self._stale = piece.data
+        elif self._video_datagrams is not None:
+            for client, _ in self._video_clients.next_sequences():
+                self._video_datagrams.send(piece.data, client)
+
+    # Called by the host, on its threads ------------------------------------------------------------------------
+
+    def wanted_fps(self, camera: str) -> float:
+        """Return how many pictures a second of this camera would be sent to anybody: all or none."""
+        return super().wanted_fps(camera) if self._seen else 0.0
+
+
+VERSIONS: Final = (1, 2)
+
+
+class ArdroneFirmware(Emulator[RunningFirmware]):
+    """The firmware of one drone of a host's world. Several may share a host, each with a drone and ports of its own.
+
+    Make the host with :func:`with_ardrones`. Full navdata is sent as often as the host reports
+    (:attr:`skyloop.sim.options.SimOptions.rate_hz`), and at most 125 times a second; real drones send 200.
+
+    Args:
+        host: The simulated world.
+        drone: Its number in it.
+        version: 1 or 2.
+        bind: The address of this machine to listen on.
+        ports: To listen on; 0 for any free one.
+        faults: Befall the datagrams of AT commands, navdata and an AR.Drone 1's video, each way.
+        delay_s: By which those datagrams are late, each way.
+        header_size: Of the PaVE headers, 68 bytes or, as early firmware has it, 64.
+        torn_start: Whether a new client of an AR.Drone 2's video first gets the last picture that was sent to somebody
+            before, however old, and then what comes, key frame or not, as from a real drone; otherwise its stream
+            begins with the next key frame.
+
+    Raises:
+        UsageError: There is no such version or header, or the delay is out of range.
+        MissingExtraError: What draws or encodes pictures is not installed.
+    """
+
+    def __init__(
+        self,
+        host: SimHost,
+        drone: int = 0,
+        *,
+        version: int = 2,
+        bind: str = "127.0.0.1",
+        ports: Ports = STANDARD,
+        faults: Faults = NO_FAULTS,
+        delay_s: float = 0.0,
+        header_size: int = 68,
+        torn_start: bool = True,
+    ) -> None:
+        if version not in VERSIONS:
+            raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, and none of version {version!r}")
+        if header_size not in (64, 68):
+            raise UsageError(f"a PaVE header has 64 or 68 bytes, not {header_size!r}")
+        if version > 1:
+            require_encoder()
+        super().__init__(host, drone)
+        self.settings = Settings(version, bind, ports, faults, checked_delay(delay_s), header_size, torn_start)
+
+    def _switched_on(self) -> RunningFirmware:
+        running = RunningFirmware(self.host, self.drone, self.settings)
+        self.settings = replace(self.settings, ports=running.ports)  # found again after a restart
+        return running
+
+    @property
+    def ports(self) -> Ports:
+        """The real ports, where 0 was asked for.
+
+        Raises:
+            UsageError: It is not started.
+        """
+        return self._started.ports
+
+    @property
+    def logic(self) -> ArdroneLogic:
+        """The state of the running firmware, for tests; it belongs to its thread.
+
+        Raises:
+            UsageError: It is not started.
+        """
+        return self._started.logic

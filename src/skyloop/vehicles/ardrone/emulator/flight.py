@@ -23,7 +23,7 @@ from skyloop.sim.reports import VehicleFeedback
 from skyloop.vehicles.ardrone.emulator.configuration import Configuration
 from skyloop.vehicles.ardrone.wire.at import Pcmd, Ref
 from skyloop.vehicles.ardrone.wire.navdata import State
-from skyloop.vehicles.emulation.vehicle import Vehicle
+from skyloop.vehicles.emulation.flight import Vehicle
 
 TAKEOFF_ALTITUDE_M: Final = 0.85  #: hovers after a take-off at 0.7 to 1 m
 _LEAST_TURNING_SPEED_M_S: Final = 1.0  # of a coordinated turn: slower ones turn as if this fast

@@ -17,7 +17,7 @@ from skyloop.vehicles.ardrone.emulator.flight import LOST_AFTER_S, FlightControl
 from skyloop.vehicles.ardrone.wire.at import SILENCE_RESET_S, AtCommand, Ctrl, parse_commands, to_float
 from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.navdata import State
-from skyloop.vehicles.emulation.vehicle import Vehicle
+from skyloop.vehicles.emulation.flight import Vehicle
 
 RESTART: Final = 1  #: the sequence number with which a client restarts
 

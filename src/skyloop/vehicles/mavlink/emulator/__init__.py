@@ -13,8 +13,245 @@ On free ports of this machine, for a test::
 What the two do differently is what was observed on the real ones; ``docs/mavlink.md`` has it as a table.
 """
 
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import monotonic_ns
+from skyloop.errors import MissingExtraError, UsageError
 from skyloop.faults import Faults
-from skyloop.vehicles.mavlink.emulator.emulator import MavlinkFirmware
-from skyloop.vehicles.mavlink.emulator.links import Kind, Ports, with_multirotors
+from skyloop.sim.camera import FRONT_CAMERA, CameraModel
+from skyloop.sim.host import Report, SimHost
+from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.vehicles.emulation.encoders import GROUP
+from skyloop.vehicles.emulation.flight import SimulatedVehicle
+from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.emulation.video import OneCamera, VideoEncoding
+from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
+from skyloop.vehicles.mavlink.emulator.autopilot import Autopilot
+from skyloop.vehicles.mavlink.emulator.links import (
+    Kind,
+    Port,
+    Ports,
+    Settings,
+    Streams,
+    TcpPort,
+    UdpPort,
+    with_multirotors,
+)
+from skyloop.vehicles.mavlink.emulator.px4 import Px4
+
+if TYPE_CHECKING:
+    from av.container import OutputContainer
+    from av.video.stream import VideoStream
 
 __all__ = ["Faults", "Kind", "MavlinkFirmware", "Ports", "with_multirotors"]
+
+
+_KINDS: dict[Kind, type[Autopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px4}
+
+
+class RunningFirmware(RunningEmulator):
+    """An autopilot that is switched on. It belongs to the loop's thread."""
+
+    def __init__(self, host: SimHost, drone: int, settings: Settings, loop: Loop | None) -> None:
+        super().__init__(host, drone, loop or f"skyloop-{settings.kind.value}")
+        kind = _KINDS[settings.kind]
+        self.autopilot = kind(SimulatedVehicle(host.simulation, drone), settings.system, settings.boot_s, settings.gps)
+        try:
+            udp = UdpPort(self._loop, settings, Streams(kind.RATES), self._on_message)
+            self._open.append(udp)
+            tcp = None
+            if settings.ports.tcp is not None:
+                tcp = TcpPort(self._loop, settings, Streams(kind.RATES), self._on_message)
+                self._open.append(tcp)
+            self.ports = Ports(udp.port, settings.ports.remote, tcp.port if tcp is not None else None)
+            self.autopilot.ports = (udp,) if tcp is None else (udp, tcp)
+            if self._own_loop:
+                self._loop.start()
+            if settings.video is not None:
+                stream = TransportStream(*settings.video)
+                self._open.append(stream)
+                self._video = encoding(stream)
+                self._video.start()
+            host.attach(drone, self, self, [CAMERA] if self._video is not None else [])
+        except BaseException:
+            self.stop()
+            raise
+
+    def _on_message(self, port: Port, message: object) -> None:
+        self.autopilot.on_message(port, message, monotonic_ns())
+
+    def _tick(self, report: Report) -> None:
+        self.autopilot.tick(report)
+
+    # Called by the host, on its threads ------------------------------------------------------------------------
+
+    def happened(self, occurrence: Occurrence) -> None:
+        """Report a crash, which stops the motors, to the autopilot."""
+        super().happened(occurrence)
+        if occurrence.kind is OccurrenceKind.EMERGENCY:
+            self._loop.post(partial(self.autopilot.crashed, occurrence.text))
+
+
+BOOT_S: Final = 2.0
+
+
+class MavlinkFirmware(Emulator[RunningFirmware]):
+    """The autopilot of one drone of a host's world. Several may share a host, each with a drone and ports of its own.
+
+    Make the host with :func:`with_multirotors`.
+
+    Args:
+        host: The simulated world.
+        drone: Its number in it.
+        kind: ArduCopter or PX4.
+        bind: The address of this machine to listen on.
+        ports: To listen on; None: those of the real one's simulation.
+        system: Its MAVLink system id, 1 to 255; None: the drone's number plus one.
+        faults: Befall UDP datagrams, each way.
+        delay_s: By which UDP datagrams are late, each way.
+        boot_s: From the start until it lets itself be armed, in seconds of the simulation (real ones take 5 to 40).
+        gps: Whether it has GPS; without it the autopilot is not ready before poses come from outside.
+        version: 1: it speaks the old MAVLink, and answers in nothing else.
+        key: 32 bytes that sign everything; None: nothing is signed.
+        video: Host and port to which the front camera's pictures are sent over UDP; None: no camera.
+        loop: The thread of a whole fleet, started after all of it was started, and stopped before any of it; None: a
+            thread of its own.
+
+    Raises:
+        UsageError: An argument is out of range.
+        MissingExtraError: pymavlink is not installed.
+    """
+
+    def __init__(
+        self,
+        host: SimHost,
+        drone: int = 0,
+        *,
+        kind: Kind,
+        bind: str = "127.0.0.1",
+        ports: Ports | None = None,
+        system: int | None = None,
+        faults: Faults = NO_FAULTS,
+        delay_s: float = 0.0,
+        boot_s: float = BOOT_S,
+        gps: bool = True,
+        version: int = 2,
+        key: bytes | None = None,
+        video: tuple[str, int] | None = None,
+        loop: Loop | None = None,
+    ) -> None:
+        number = drone + 1 if system is None else system
+        if not 1 <= number <= 255:
+            raise UsageError(f"a system id is from 1 to 255, not {number!r}")
+        if version not in (1, 2):
+            raise UsageError(f"there is MAVLink 1 and MAVLink 2, not {version!r}")
+        super().__init__(host, drone)
+        self._loop = loop
+        delay_s = checked_delay(delay_s)
+        ports = ports or Ports.standard(kind, drone)
+        self.settings = Settings(kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video)
+
+    def _switched_on(self) -> RunningFirmware:
+        running = RunningFirmware(self.host, self.drone, self.settings, self._loop)
+        self.settings = replace(self.settings, ports=running.ports)  # found again after a restart
+        return running
+
+    @property
+    def autopilot(self) -> Autopilot:
+        """The running autopilot, for tests; it belongs to its thread.
+
+        Raises:
+            UsageError: It is not started.
+        """
+        return self._started.autopilot
+
+    @property
+    def address(self) -> str:
+        """Address of a driver on this machine, over UDP."""
+        return f"mavlink://udpin:{self.settings.bind}:{self.settings.ports.remote}"
+
+    @property
+    def tcp_address(self) -> str:
+        """Address of a driver on this machine, over TCP.
+
+        Raises:
+            UsageError: This kind has no such port.
+        """
+        if self.settings.ports.tcp is None:
+            raise UsageError(f"an emulated {self.settings.kind.value} has no TCP port")
+        return f"mavlink://tcp:{self.settings.bind}:{self.settings.ports.tcp}"
+
+    @property
+    def description(self) -> str:
+        """Where it is, in one line for people."""
+        settings = self.settings
+        tcp = f", {self.tcp_address}" if settings.ports.tcp is not None else ""
+        return (
+            f"{settings.kind.value} drone {self.drone}, system {settings.system}, "
+            f"from udp {settings.ports.udp}: {self.address}{tcp}"
+        )
+
+
+CAMERA: Final[CameraModel] = replace(FRONT_CAMERA, fps=20.0)
+_CLOCK: Final = Fraction(1, 90_000)  #: of transport streams [s]
+_X264: Final = {"preset": "ultrafast", "tune": "zerolatency", "x264-params": "scenecut=0:repeat-headers=1:threads=1"}
+_SETTINGS: Final = OneCamera("front", CAMERA.fps, 1500)
+
+
+class TransportStream:
+    """Encodes and sends each picture as it comes. Not thread-safe.
+
+    Args:
+        host: To send to.
+        port: UDP.
+
+    Raises:
+        MissingExtraError: PyAV is not installed.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        try:
+            import av
+        except ImportError as error:
+            raise MissingExtraError("the video of an emulated vehicle", "video", cause=str(error)) from error
+        self._av = av
+        options = {"mpegts_flags": "resend_headers", "flush_packets": "1"}
+        url = f"udp://{host}:{port}?pkt_size=1316"
+        self._container: OutputContainer = av.open(url, "w", format="mpegts", options=options)
+        self._stream: VideoStream = self._container.add_stream("libx264", rate=round(CAMERA.fps), options=dict(_X264))
+        self._stream.width, self._stream.height = CAMERA.width, CAMERA.height
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.bit_rate = _SETTINGS.bitrate_kbps * 1000
+        self._stream.gop_size = GROUP
+        self._stream.time_base = self._stream.codec_context.time_base = _CLOCK  # or two pictures may get one stamp
+        self._begun_ns: int | None = None
+        self._stamp = -1
+
+    def pack(self, picture: NDArray[np.uint8], _settings: OneCamera, captured_ns: int) -> None:
+        """Encode and send a picture: BGR, uint8, shape (height, width, 3)."""
+        self._begun_ns = captured_ns if self._begun_ns is None else self._begun_ns
+        frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
+        # Exposures of a drone may come out of order; a stream's stamps must grow.
+        self._stamp = max(self._stamp + 1, round((captured_ns - self._begun_ns) / 1e9 / _CLOCK))
+        frame.pts = self._stamp
+        frame.time_base = _CLOCK
+        for packet in self._stream.encode(frame):
+            self._container.mux(packet)
+
+    def close(self) -> None:
+        """Close the stream."""
+        self._container.close()
+
+
+def encoding(stream: TransportStream) -> VideoEncoding[OneCamera]:
+    """Return the thread that encodes the newest picture; not started."""
+    return VideoEncoding(stream, lambda: _SETTINGS, lambda _: None)

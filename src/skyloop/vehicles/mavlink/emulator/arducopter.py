@@ -7,8 +7,7 @@ from dataclasses import replace
 from typing import ClassVar, Final
 
 from skyloop.messages.geometry import turned, wrap_angle
-from skyloop.vehicles.emulation.flight import GO_M_S, SINK_M_S, Speeds
-from skyloop.vehicles.emulation.vehicle import Vehicle
+from skyloop.vehicles.emulation.flight import GO_M_S, SINK_M_S, Speeds, Vehicle
 from skyloop.vehicles.mavlink.emulator import services
 from skyloop.vehicles.mavlink.emulator.autopilot import (
     ACCEPTED,

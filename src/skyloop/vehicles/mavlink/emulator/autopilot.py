@@ -12,8 +12,7 @@ from typing import ClassVar, Final
 
 from skyloop.messages import FlightState
 from skyloop.sim.host import Report
-from skyloop.vehicles.emulation.flight import FlightControl
-from skyloop.vehicles.emulation.vehicle import Vehicle
+from skyloop.vehicles.emulation.flight import FlightControl, Vehicle
 from skyloop.vehicles.mavlink.emulator.links import MAX_INTERVAL_US, Port
 from skyloop.vehicles.mavlink.emulator.manoeuvres import ORIGIN, Manoeuvres, on_earth, place_of
 from skyloop.vehicles.mavlink.emulator.services import ParameterTable, answers

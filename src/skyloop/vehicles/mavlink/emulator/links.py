@@ -13,8 +13,7 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.options import SimOptions
-from skyloop.vehicles.emulation.byte_server import ByteServer
-from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
+from skyloop.vehicles.emulation.datagrams import Address, ByteServer, DatagramPort
 from skyloop.vehicles.emulation.loop import Loop
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 

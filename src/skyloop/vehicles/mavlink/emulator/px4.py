@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Final
 
-from skyloop.vehicles.emulation.flight import USUAL, Speeds
-from skyloop.vehicles.emulation.vehicle import Vehicle
+from skyloop.vehicles.emulation.flight import USUAL, Speeds, Vehicle
 from skyloop.vehicles.mavlink.emulator import services
 from skyloop.vehicles.mavlink.emulator.autopilot import (
     ACCEPTED,

@@ -15,7 +15,130 @@ Its barometer and GPS are those of the simulated vehicle. It answers what a driv
 ``docs/msp.md`` asks for.
 """
 
-from skyloop.vehicles.msp.emulator.board import BoardSettings, with_racers
-from skyloop.vehicles.msp.emulator.emulator import BetaflightFirmware
+from __future__ import annotations
+
+from typing import Final
+
+from skyloop.clock import monotonic_ns
+from skyloop.sim.host import Report, SimHost
+from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.vehicles.emulation.datagrams import ByteServer
+from skyloop.vehicles.emulation.emulator import Emulator, RunningEmulator
+from skyloop.vehicles.emulation.flight import SimulatedVehicle
+from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.msp.emulator.board import PORT, Board, BoardSettings, with_racers
+from skyloop.vehicles.msp.wire.frames import Parser, encode
 
 __all__ = ["BetaflightFirmware", "BoardSettings", "with_racers"]
+
+
+USUAL: Final = BoardSettings()
+
+
+class RunningFirmware(RunningEmulator):
+    """A flight controller that is switched on. It belongs to the loop's thread."""
+
+    def __init__(
+        self, host: SimHost, drone: int, bind: str, port: int, settings: BoardSettings, loop: Loop | None
+    ) -> None:
+        super().__init__(host, drone, loop or "skyloop-betaflight")
+        self.board = Board(SimulatedVehicle(host.simulation, drone), settings, monotonic_ns())
+        self._parser = Parser()
+        simulation = host.simulation
+        first = Report(simulation.feedback(drone), simulation.truth(drone), (), monotonic_ns())
+        self.board.tick(first, monotonic_ns())
+        try:
+            self._server = ByteServer(self._loop, (bind, port), self._receive, self._parser.reset, name="MSP")
+            self._open.append(self._server)
+            if self._own_loop:
+                self._loop.start()
+            host.attach(drone, self, self, [])
+        except BaseException:
+            self.stop()
+            raise
+
+    @property
+    def port(self) -> int:
+        """The real port, where 0 was asked for."""
+        return self._server.port
+
+    def _receive(self, data: bytes) -> None:
+        now_ns = monotonic_ns()
+        for frame in self._parser.feed(data):
+            reply = self.board.answer(frame, now_ns)
+            if reply is not None:
+                self._server.send(encode(reply))
+
+    def _tick(self, report: Report) -> None:
+        self.board.tick(report, monotonic_ns())
+
+    # Called by the host, on its threads --------------------------------------------------------------------------
+
+    def happened(self, occurrence: Occurrence) -> None:
+        """Disarm after a crash."""
+        super().happened(occurrence)
+        if occurrence.kind is OccurrenceKind.EMERGENCY:
+            self._loop.post(self.board.crashed)
+
+
+class BetaflightFirmware(Emulator[RunningFirmware]):
+    """The flight controller of one drone of a host's world. Several may share a host, each with a drone and a port.
+
+    Make the host with :func:`with_racers`.
+
+    Args:
+        host: The simulated world.
+        drone: Its number in it.
+        bind: The address of this machine to listen on.
+        port: TCP; 0 for any free one.
+        settings: How it is set up.
+        loop: The thread of a whole fleet; None: a thread of its own.
+    """
+
+    def __init__(
+        self,
+        host: SimHost,
+        drone: int = 0,
+        *,
+        bind: str = "127.0.0.1",
+        port: int = PORT,
+        settings: BoardSettings = USUAL,
+        loop: Loop | None = None,
+    ) -> None:
+        super().__init__(host, drone)
+        self.settings = settings
+        self._bind, self._port = bind, port
+        self._loop = loop
+
+    def _switched_on(self) -> RunningFirmware:
+        running = RunningFirmware(self.host, self.drone, self._bind, self._port, self.settings, self._loop)
+        self._port = running.port  # found again after a restart
+        return running
+
+    @property
+    def port(self) -> int:
+        """The real port, where 0 was asked for.
+
+        Raises:
+            UsageError: It is not started.
+        """
+        return self._started.port
+
+    @property
+    def board(self) -> Board:
+        """The running flight controller, for tests; it belongs to its thread.
+
+        Raises:
+            UsageError: It is not started.
+        """
+        return self._started.board
+
+    @property
+    def address(self) -> str:
+        """Address of a driver on this machine."""
+        return f"msp://tcp:{self._bind}:{self.port}"
+
+    @property
+    def description(self) -> str:
+        """Where it is, in one line for people."""
+        return f"betaflight drone {self.drone}: {self.address}"

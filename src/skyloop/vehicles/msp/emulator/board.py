@@ -15,8 +15,7 @@ from skyloop.messages.feedback import EarthOrigin
 from skyloop.sim.host import Report
 from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import VehicleParameters
-from skyloop.vehicles.emulation.flight import FlightControl
-from skyloop.vehicles.emulation.vehicle import Vehicle
+from skyloop.vehicles.emulation.flight import FlightControl, Vehicle
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import (
     ARM_SWITCH,

@@ -17,7 +17,7 @@ from skyloop.messages import EmergencyStop, FlightState, Hover, ResetEmergency, 
 from skyloop.sim.host import Report
 from skyloop.sim.world import Vec3
 from skyloop.vehicles.emulation.datagrams import Address
-from skyloop.vehicles.emulation.vehicle import Vehicle
+from skyloop.vehicles.emulation.flight import Vehicle
 from skyloop.vehicles.tello.emulator import telemetry
 from skyloop.vehicles.tello.emulator.manoeuvres import OK, Flipping, Going, Job, Landing, Rising, Turning
 from skyloop.vehicles.tello.emulator.telemetry import Sighting, seen

@@ -1,0 +1,83 @@
+"""Decodes the frames of a PaVE stream, live or from a file, with PyAV; to be imported only where video is wanted."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Literal
+
+from skyloop.errors import MissingExtraError
+from skyloop.pyav import new_decoder
+from skyloop.vehicles.ardrone.wire.pave import Codec, PaveFrame
+
+try:
+    import av
+    import av.error
+except ImportError as error:
+    raise MissingExtraError("video://", "video", cause=str(error)) from error
+
+if TYPE_CHECKING:
+    from av.video.codeccontext import VideoCodecContext
+
+__all__ = ["PaveDecoder", "av"]
+
+_DECODERS: Final[dict[int, Literal["mpeg4", "h264"]]] = {Codec.MPEG4_VISUAL: "mpeg4", Codec.MPEG4_AVC: "h264"}
+# FFmpeg refuses an MPEG-4 frame now and then that is padded by a single bit, unless the sequence's end follows.
+_ENDS: Final = {int(Codec.MPEG4_VISUAL): b"\0\0\1\xb1"}
+
+
+class PaveDecoder:
+    """Decodes frames of a PaVE stream, one in and at most one picture out, without delay.
+
+    Gives nothing before the first key frame (a stream torn open, or the stale frame that the drone sends first), and
+    after damage or a gap in the frames' numbers nothing up to the next key frame: those pictures would be smeared.
+    ``waited`` counts frames left out for that, ``damaged`` those that could not be decoded.
+
+    PaVE and H.264 have no checksum: a flipped bit that makes another valid stream passes. A stream over TCP has one.
+    """
+
+    def __init__(self) -> None:
+        self.waited = 0
+        self.damaged = 0
+        self._codec: int | None = None
+        self._context: VideoCodecContext | None = None
+        self._needs_key = True
+        self._number = 0  # of the frame before
+
+    def restart(self) -> None:
+        """Wait for a key frame: what comes next does not continue what came before."""
+        self._needs_key = True
+
+    def decode(self, frame: PaveFrame) -> av.VideoFrame | None:
+        """Return the picture of a frame, or None. Never raises, whatever a frame holds."""
+        follows = frame.number == self._number + 1 & 0xFFFFFFFF and frame.codec == self._codec
+        self._needs_key = self._needs_key or frame.after_damage or not follows
+        self._number = frame.number
+        if self._needs_key and not frame.is_key:
+            self.waited += 1
+            return None
+        if self._needs_key:
+            self._start(frame.codec)
+        if self._context is None:
+            self.damaged += 1
+            return None
+        try:
+            images = self._context.decode(av.Packet(frame.payload + _ENDS.get(frame.codec, b"")))
+        except (av.error.FFmpegError, ValueError):
+            images = []
+        if not images or images[-1].is_corrupt or not _fits(images[-1], frame):
+            self.damaged += 1
+            self._needs_key = True
+            return None
+        return images[-1]
+
+    def _start(self, codec: int) -> None:
+        """Make a fresh decoder: what an old one remembers of the pictures before the damage must not show."""
+        self._codec, self._context = codec, None
+        name = _DECODERS.get(codec)
+        if name is None:
+            return
+        self._context, self._needs_key = new_decoder(name, "video://"), False
+
+
+def _fits(image: av.VideoFrame, frame: PaveFrame) -> bool:
+    """Return whether an H.264 picture has the size that its header says. Real drones' MPEG-4 is not known."""
+    return frame.codec != Codec.MPEG4_AVC or (image.width, image.height) == (frame.width, frame.height)
