@@ -58,7 +58,7 @@ from skyloop.cockpit.follow_session import NO_CONTROL, FollowerFactory, FollowSe
 from skyloop.cockpit.place_flight import UP, Leg, PlaceFlight, RouteSession, to_place, to_start
 from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.takeover import AuthorityReport, TakeoverDialog
-from skyloop.control.route_flight import check_for
+from skyloop.control.route import check_for
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
 from skyloop.messages import Fate, FlightState, Land, Takeoff

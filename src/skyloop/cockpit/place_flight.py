@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.client.commands import position_action
 from skyloop.client.completion import ReturnWatch
-from skyloop.control.route_flight import save_photo
-from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto
+from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto, save_photo
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import LinkError, RefusedError, SkyloopError
 from skyloop.messages import Feedback, FlightState, Hover, Land, Position, ReturnPhase, ReturnToStart

@@ -11,8 +11,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from skyloop.cockpit.answers import answer_json, answered, body_of, check_json
-from skyloop.control.route import parse_route
-from skyloop.control.route_flight import check_for
+from skyloop.control.route import check_for, parse_route
 from skyloop.errors import UnknownNameError
 
 if TYPE_CHECKING:
