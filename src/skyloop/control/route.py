@@ -18,12 +18,11 @@ import msgspec
 from skyloop import files
 from skyloop.control.waypoint import Waypoint, lacking
 from skyloop.errors import LinkError, NoAnswerError, UsageError
+from skyloop.messages import Feedback, Value, Vector
+from skyloop.zones import BOX, FAR_M, Space, space_of
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-
-from skyloop.messages import Feedback, Value, Vector
-from skyloop.zones import BOX, FAR_M, Space, space_of
 
 ENDING: Final = ".route.json"
 VERSION: Final = 1

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 from skyloop.client.completion import OVERRULED
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.controller import Controller
-from skyloop.control.route import check_for, (
+from skyloop.control.route import (
     Action,
     Look,
     Photo,
@@ -27,11 +26,10 @@ from skyloop.control.route import check_for, (
     RouteCheck,
     RouteWaypoint,
     Wait,
-    check_route,
-    conditions_of,
+    check_for,
 )
 from skyloop.control.waypoint import Waypoint, lacking, reached
-from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
+from skyloop.errors import SkyloopError, UsageError
 from skyloop.extend import ask, commands, let_go
 from skyloop.files import write
 from skyloop.messages import EventKind, Fate, Feedback, Hover, Land, Position, Severity
