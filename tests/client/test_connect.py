@@ -25,7 +25,7 @@ from skyloop.client.private_proxy import PrivateProxy
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import FlightState, LinkState
 from skyloop.messages.feedback import WAKING_UP
-from skyloop.network.settings import FabricSettings
+from skyloop.network.config import FabricSettings
 from skyloop.transport.local import LocalServer
 from tests.client.scripted import ScriptedProxy
 
@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[2]
 CHILD = """
 import os, sys
 sys.path.insert(0, {root!r})
-from skyloop.network.settings import FabricSettings
+from skyloop.network.config import FabricSettings
 from skyloop.transport.local import LocalServer
 from tests.client.scripted import ScriptedProxy
 name, descriptor = sys.argv[sys.argv.index("--name") + 1], int(sys.argv[-1])

@@ -7,7 +7,7 @@ import pytest
 
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, compressed
-from skyloop.cockpit.frame_keeper import KEPT_S, STRIDE_S, KeptFrames
+from skyloop.cockpit.target_tracker import KEPT_S, STRIDE_S, KeptFrames
 from skyloop.errors import RefusedError
 from skyloop.messages import Encoding, FrameHeader
 
