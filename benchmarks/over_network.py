@@ -22,7 +22,7 @@ from skyloop.errors import LinkError, SkyloopError, UnknownNameError
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.messages.subscription import VideoRequest
 from skyloop.network import FabricServer, FabricSettings
-from skyloop.network.settings import LEASE_S
+from skyloop.network.config import LEASE_S
 from skyloop.transport.base import TransportServer
 
 JPEG: Final = VideoOptions(encoding="jpeg", quality=80)

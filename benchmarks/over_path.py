@@ -17,7 +17,7 @@ from skyloop.client import Drone, Frame
 from skyloop.client.video import VideoOptions
 from skyloop.messages import CameraInfo
 from skyloop.network import FabricServer
-from skyloop.network.settings import LEASE_S as DEFAULT_LEASE_S
+from skyloop.network.config import LEASE_S as DEFAULT_LEASE_S
 from skyloop.transport.base import TransportServer
 
 FPS: Final = 30.0

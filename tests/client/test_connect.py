@@ -23,7 +23,7 @@ from skyloop.client.drone import open_drone
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import FlightState, LinkState
 from skyloop.messages.feedback import WAKING_UP
-from skyloop.network.settings import FabricSettings
+from skyloop.network.config import FabricSettings
 from skyloop.transport.local import LocalServer
 from tests.client.scripted import ScriptedProxy
 
@@ -35,7 +35,7 @@ CONNECT = sys.modules["skyloop.client.connect"]  # the module: its function has 
 CHILD = """
 import os, sys
 sys.path.insert(0, {root!r})
-from skyloop.network.settings import FabricSettings
+from skyloop.network.config import FabricSettings
 from skyloop.transport.local import LocalServer
 from tests.client.scripted import ScriptedProxy
 name, descriptor = sys.argv[sys.argv.index("--name") + 1], int(sys.argv[-1])

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from skyloop.clock import ManualClock, nanoseconds
 from skyloop.cockpit import listening
 from skyloop.cockpit.access import OpenGate, Person
-from skyloop.cockpit.admission import (
+from skyloop.cockpit.listening import (
     ANSWER_S,
     DESCRIPTORS_LEFT,
     HEADER_S,
@@ -27,9 +27,11 @@ from skyloop.cockpit.admission import (
     NEXT_S,
     Admission,
     Connection,
+    Listener,
     Places,
+    RepeatLimit,
+    places_here,
 )
-from skyloop.cockpit.listening import Listener, RepeatLimit, places_here
 from skyloop.cockpit.security import ADMIT, Guard, own_names
 from skyloop.messages import Role
 

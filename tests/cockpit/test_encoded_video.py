@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.cockpit.camera_feed import FPS
 from skyloop.cockpit.commands import FollowTarget
-from skyloop.cockpit.encoded_feed import KEPT, RATES, SCALES, EncodedFeed, Form, form_for
+from skyloop.cockpit.encoded_feed import FPS, KEPT, RATES, SCALES, EncodedFeed, Form, form_for
 from skyloop.cockpit.follow_session import in_frame
 from skyloop.cockpit.page_stream import (
     FALLS_BEHIND_S,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyloop.client.frame import Arrival, FeedbackHistory, compressed
-from skyloop.cockpit.frame_keeper import KEPT_S, STRIDE_S, KeptFrames
+from skyloop.cockpit.target_tracker import KEPT_S, STRIDE_S, KeptFrames
 from skyloop.errors import RefusedError
 from skyloop.messages import Encoding, FrameHeader
 

@@ -15,7 +15,7 @@ from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError
 from skyloop.recording import Recorder, record
-from skyloop.recording.listing import Described, describe
+from skyloop.recording.reader import Described, describe
 from tests.cockpit.fake import ORIGIN, FakeRecorder, Node, Nodes, cockpit, open_socket, until
 from tests.cockpit.testclient import TestClient, WebSocketTestSession
 

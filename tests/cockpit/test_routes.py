@@ -14,8 +14,7 @@ from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.routes import MOST_CHECKED, CheckedRoutes, RouteFiles
-from skyloop.control.route import Route, RouteWaypoint
-from skyloop.control.route_check import Conditions, check_route
+from skyloop.control.route import Conditions, Route, RouteWaypoint, check_route
 from skyloop.errors import RefusedError, UnknownNameError, UsageError
 from skyloop.messages import AnyAction, FlightState, Hover
 from tests.cockpit.fake import ORIGIN, Node, Nodes, cockpit, until

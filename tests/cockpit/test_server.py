@@ -30,8 +30,8 @@ from skyloop.client import connect
 from skyloop.cockpit import Access, serve_cockpit, target_tracker, with_certificate
 from skyloop.cockpit.__main__ import main
 from skyloop.cockpit.addresses import bind
-from skyloop.cockpit.camera_feed import _ENCODER, NICENESS
 from skyloop.cockpit.child import CockpitProcess
+from skyloop.cockpit.encoded_feed import _ENCODER, NICENESS
 from skyloop.cockpit.testing import HeadlessPage, Pages
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import FlightState

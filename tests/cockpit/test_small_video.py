@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from skyloop.cockpit.camera_feed import FPS, WIDTHS, CameraFeed, SmallFeed, rounded_width
+from skyloop.cockpit.encoded_feed import FPS, WIDTHS, CameraFeed, SmallFeed, rounded_width
 from skyloop.cockpit.small_video import MAX_SHOWN
 from skyloop.messages import CameraInfo
 from tests.cockpit.fake import FakeDrone, cockpit, fake_fleet, open_socket, until

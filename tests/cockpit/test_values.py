@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from skyloop.cockpit.api import parameter_values
-from skyloop.cockpit.telemetry import encode_json
-from skyloop.cockpit.values import (
+from skyloop.cockpit.telemetry import (
+    encode_json,
     feedback_values,
     flat_values,
     motion_values,

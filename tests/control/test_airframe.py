@@ -15,10 +15,9 @@ from skyloop.clock import nanoseconds
 from skyloop.control.airframe import DRAG_PER_S, Airframe, AirframeLaw, Part, TiltVelocity
 from skyloop.control.chase_law import FollowMode
 from skyloop.control.course_law import CourseLaw, GatePlace
-from skyloop.control.flow_hover import FlowLaw, FlowPhase
 from skyloop.control.follow_law import FollowLaw, Mode
 from skyloop.control.gate_law import GateLaw, GatePhase
-from skyloop.control.image_servo import ImageServoLaw
+from skyloop.control.image_servo import FlowLaw, FlowPhase, ImageServoLaw
 from skyloop.control.landing_law import LandingLaw, LandingPhase
 from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Attitude, Feedback, FlightState, Velocity

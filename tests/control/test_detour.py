@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from skyloop.control.detour import Point, Wall, detour
+from skyloop.control.gate_law import Point, Wall, detour
 
 PLACES = st.tuples(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0))
 

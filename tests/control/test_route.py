@@ -13,17 +13,19 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.control.route import (
+    Conditions,
     Look,
     Photo,
     Route,
     RouteWaypoint,
     Wait,
+    check_route,
     checked,
+    conditions_of,
     load_route,
     parse_route,
     save_route,
 )
-from skyloop.control.route_check import Conditions, check_route, conditions_of
 from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, RouteState, TakePhoto
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Feedback, FlightState, Hover, Land, Position, Value

@@ -11,8 +11,8 @@ import pytest
 
 import skyloop
 from skyloop.control import FlyRoute, Photo, Route, RouteWaypoint, Wait
-from skyloop.control.route_flight import ENDED, TAKEN, check_for, save_photo
-from skyloop.control.route_law import Progress, TakePhoto
+from skyloop.control.route import check_for
+from skyloop.control.route_law import ENDED, TAKEN, Progress, TakePhoto, save_photo
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Event, EventKind, Fate, Outcome, Refusal
 from skyloop.stepping.rehearsal import rehearse
@@ -145,7 +145,7 @@ def test_photos_are_named_by_time_waypoint_and_camera(tmp_path: Path, monkeypatc
         path = save_photo(drone, tmp_path / "new", TakePhoto(2, None))
         assert path.read_bytes()[:3] == b"\xff\xd8\xff"
         assert path.name.endswith("-waypoint2-front.jpg")
-        monkeypatch.setattr("skyloop.control.route_flight.datetime", Mock(now=Mock(return_value=datetime(2026, 1, 2))))
+        monkeypatch.setattr("skyloop.control.route_law.datetime", Mock(now=Mock(return_value=datetime(2026, 1, 2))))
         names = {save_photo(drone, tmp_path / "new", TakePhoto(2, None)).name for _ in range(3)}
         assert len(names) == 3, "within one moment"
         assert all(name.startswith("20260102T000000.000-") for name in names)

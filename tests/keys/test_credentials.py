@@ -150,10 +150,9 @@ def test_an_older_roster_is_no_news_and_a_false_one_is_an_error(lab: Lab, jane: 
 
 
 def test_a_roster_of_another_format_is_told(lab: Lab, jane: Path) -> None:
-    from skyloop.network.keys import roster as rosters
-    from skyloop.network.keys.roster import Roster
+    from skyloop.network.keys.credentials import Roster, encode_roster
 
-    content = rosters.encode(Roster(9, lab.authority.name, format=2), lab.authority)
+    content = encode_roster(Roster(9, lab.authority.name, format=2), lab.authority)
     (jane / "roster.json").write_bytes(content)
     with pytest.raises(FileFormatError, match=r"format 2; .* reads 1"):
         load(jane, now=NOW)

@@ -14,7 +14,7 @@ import pytest
 
 from skyloop.errors import UsageError
 from skyloop.network.keys import certificates
-from skyloop.network.keys.pages import PAGE_DAYS, PageFiles, page_certificate
+from skyloop.network.keys.lab import PAGE_DAYS, PageFiles, page_certificate
 
 NOW = datetime.now(UTC)
 OWN = ["localhost", "127.0.0.1", "box", "192.168.1.5"]

@@ -7,7 +7,7 @@ import re
 import msgspec
 import pytest
 
-from skyloop.network import delivery, frames, layout, packets, registry, sealing, settings
+from skyloop.network import config, delivery, frames, layout, packets, registry, sealing
 from skyloop.transport.base import MAX_TOPIC
 from tests.messages.test_codec import PACKETS
 from tests.messages.test_wire_format import FABRIC
@@ -64,7 +64,7 @@ def test_numbers_in_the_text() -> None:
     assert f"`revision` uint, now {packets.REVISION}" in FABRIC
     assert f"1 to {MAX_TOPIC} characters" in FABRIC
     assert f"at most {packets.MAX_REASON} bytes" in FABRIC
-    assert f"Lease {settings.LEASE_S * 1000:g} ms" in FABRIC
+    assert f"Lease {config.LEASE_S * 1000:g} ms" in FABRIC
     assert f"seen within {registry.CONFIRM_S:g} s" in FABRIC
     assert f"at most {delivery.DEPTH} packets or {delivery.MAX_BYTES >> 20} MiB" in FABRIC
     assert f"every {delivery.ACKNOWLEDGE_AFTER} packets" in FABRIC

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import skyloop
-from skyloop.cockpit.values import mocap_values
+from skyloop.cockpit.telemetry import mocap_values
 from skyloop.control import FollowPath, Polyline
 from skyloop.errors import ClosedError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages import LogEntry

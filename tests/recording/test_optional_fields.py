@@ -17,7 +17,7 @@ import msgspec
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.cockpit.values import event_values, feedback_values, flat_values, set_point_values
+from skyloop.cockpit.telemetry import event_values, feedback_values, flat_values, set_point_values
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.messages import AnyAction, Applied, Command, Event, Feedback, LinkState, Sample
 from skyloop.messages.codec import decode, encode

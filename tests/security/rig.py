@@ -20,11 +20,10 @@ from skyloop.network import FabricServer, FabricSettings, layout, packets
 from skyloop.network import dial as fabric_dial
 from skyloop.network.admission import Admission, JoinRequest
 from skyloop.network.client import FabricClient
-from skyloop.network.config import free_port
+from skyloop.network.config import free_port, secured
 from skyloop.network.keys import KeyRing, Lab, load
 from skyloop.network.keys.identity import make_identity
 from skyloop.network.sealing import Open
-from skyloop.network.settings import secured
 from skyloop.transport.base import Dialer
 from tests.proxy.fake import App, Bench
 

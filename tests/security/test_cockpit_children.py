@@ -19,7 +19,7 @@ from skyloop.cockpit.recordings import MAX_CHILDREN, Recordings
 from skyloop.cockpit.reports import MAX_WAITING, Reports
 from skyloop.cockpit.security import foreign, own_names
 from skyloop.errors import LinkError, RefusedError, UsageError
-from skyloop.recording.listing import describe
+from skyloop.recording.reader import describe
 from tests.cockpit.fake import FakeRecorder
 from tests.cockpit.test_server import served
 

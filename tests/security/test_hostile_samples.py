@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from skyloop.client import Drone
 from skyloop.cockpit.feeds import WAYPOINTS, LogFeed, drawing_values
-from skyloop.cockpit.values import event_values, feedback_values, flat_values, mocap_values, motion_values
+from skyloop.cockpit.telemetry import event_values, feedback_values, flat_values, mocap_values, motion_values
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import (
     Annotation,

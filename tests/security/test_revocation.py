@@ -15,11 +15,10 @@ from skyloop.messages import Command, EmergencyStop, Velocity, encode
 from skyloop.messages.codec import SIGNATURE
 from skyloop.network import FabricSettings, layout, packets, sealing
 from skyloop.network import dial as fabric_dial
-from skyloop.network.config import Part, free_port
+from skyloop.network.config import Part, free_port, secured
 from skyloop.network.discovery import runs
 from skyloop.network.keys import Lab, load
 from skyloop.network.session import Session, acquire, release, renewed
-from skyloop.network.settings import secured
 from skyloop.transport.base import FEEDBACK
 from skyloop.transport.testing import ClientLog, wait_until
 from tests.security.deeds import DEEDS

@@ -14,8 +14,8 @@ from skyloop.network import FabricServer, FabricSettings, dial, layout, packets
 from skyloop.network import server as fabric_server
 from skyloop.network.client import FabricClient
 from skyloop.network.config import free_port
+from skyloop.network.connection import Publisher
 from skyloop.network.delivery import Outgoing
-from skyloop.network.publishing import Publisher
 from skyloop.network.sealing import PLAIN
 from skyloop.network.session import Session, release
 from skyloop.transport.base import FEEDBACK, Dialer, TransportServer

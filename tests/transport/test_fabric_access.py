@@ -14,9 +14,9 @@ import zenoh
 
 from skyloop.network import layout
 from skyloop.network.access import EGRESS, INGRESS, access_control
+from skyloop.network.config import FabricSettings, secured
 from skyloop.network.keys import Lab, load
 from skyloop.network.keys.identity import make_identity
-from skyloop.network.settings import FabricSettings, secured
 
 LAB = [
     make_identity("jane", "pilot", "alpha*"),

@@ -17,11 +17,10 @@ from skyloop.messages import Command, Hello, ReleaseAuthority, Request, Takeoff,
 from skyloop.network import FabricServer, FabricSettings, dial, layout, packets
 from skyloop.network.client import STALLED_S as CLIENT_STALLED_S
 from skyloop.network.client import FabricClient
-from skyloop.network.config import free_port
+from skyloop.network.config import LEASE_S, free_port
 from skyloop.network.connection import ServerConnection
 from skyloop.network.delivery import Outgoing
 from skyloop.network.registry import STALLED_S
-from skyloop.network.settings import LEASE_S
 from skyloop.transport.base import FEEDBACK, MAX_PACKET, Peer, results, video
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 

@@ -12,9 +12,9 @@ pytest.importorskip("zenoh", reason="needs the extra network: skyloop install ne
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError
 from skyloop.network import client, discovery, layout, packets
 from skyloop.network.admission import JoinRequest
-from skyloop.network.joining import ProxyWatch, join
+from skyloop.network.config import FabricSettings
+from skyloop.network.discovery import ProxyWatch, join
 from skyloop.network.session import Session
-from skyloop.network.settings import FabricSettings
 from skyloop.transport.testing import ClientLog
 
 RUN, OTHER = "1" * 16, "2" * 16

@@ -11,9 +11,8 @@ pytest.importorskip("zenoh", reason="needs the extra network: skyloop install ne
 
 from skyloop.network import packets
 from skyloop.network.admission import Admission
-from skyloop.network.connection import ServerConnection
+from skyloop.network.connection import Publisher, ServerConnection
 from skyloop.network.delivery import ACKNOWLEDGE_AFTER, SLOW_S, STANDS_S, AckPolicy, Pace
-from skyloop.network.publishing import Publisher
 from skyloop.network.sealing import PLAIN
 from skyloop.network.session import Session
 from skyloop.transport.base import EVENTS, FEEDBACK, Peer

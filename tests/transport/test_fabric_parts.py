@@ -38,7 +38,6 @@ from skyloop.network import (
     config,
     dial,
     discovery,
-    environment,
     layout,
     packets,
 )
@@ -261,26 +260,26 @@ def test_an_identity_needs_its_files() -> None:
 def test_without_being_asked_a_process_stays_on_its_host(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SKYLOOP_NETWORK", raising=False)
     monkeypatch.delenv("SKYLOOP_KEYS", raising=False)
-    assert environment.choose() is None
+    assert config.choose() is None
     for word in ("", "off", "0", "False"):
         monkeypatch.setenv("SKYLOOP_NETWORK", word)
-        assert environment.choose() is None
-    assert environment.choose(network=True) == FabricSettings()
-    assert environment.choose(network=False) is None
+        assert config.choose() is None
+    assert config.choose(network=True) == FabricSettings()
+    assert config.choose(network=False) is None
     with pytest.raises(UsageError, match="keys are for the network"):
-        environment.choose(keys="/somewhere")
+        config.choose(keys="/somewhere")
 
 
 def test_the_environment_may_ask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SKYLOOP_NETWORK", "multicast")
-    assert environment.choose() == FabricSettings()
+    assert config.choose() == FabricSettings()
     monkeypatch.setenv("SKYLOOP_NETWORK", "10.0.0.5:7447, lab.local")
-    assert environment.choose() == FabricSettings(connect=("10.0.0.5:7447", "lab.local"), multicast=False)
-    assert environment.choose("10.0.0.5,multicast") == FabricSettings(connect=("10.0.0.5",))
+    assert config.choose() == FabricSettings(connect=("10.0.0.5:7447", "lab.local"), multicast=False)
+    assert config.choose("10.0.0.5,multicast") == FabricSettings(connect=("10.0.0.5",))
     given_ = FabricSettings(connect=("1.2.3.4",))
-    assert environment.choose(given_) is given_
+    assert config.choose(given_) is given_
     with pytest.raises(UsageError, match="is no network address"):
-        environment.choose("10.0.0.5:port")
+        config.choose("10.0.0.5:port")
 
 
 def test_an_address_that_was_given_is_waited_for_longer_than_one_that_was_found() -> None:
@@ -293,7 +292,7 @@ def test_an_address_that_was_given_is_waited_for_longer_than_one_that_was_found(
 
 def test_others_wait_for_an_end_as_long_as_it_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
     def lease_ms() -> object:
-        settings = environment.choose(network=True)
+        settings = config.choose(network=True)
         assert settings is not None
         return config.make(settings, Part.PROXY)["transport"]["link"]["tx"]["lease"]
 

@@ -78,7 +78,7 @@ def cockpit(
     It is open to programs of the same user on this machine only, unless tokens or certificates let others in.
     """
     from skyloop.cockpit import Access, serve_cockpit, with_certificate
-    from skyloop.network.environment import choose
+    from skyloop.network.config import choose
 
     access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()), pair)
     if https:

@@ -139,7 +139,7 @@ def _chosen(
         raise UsageError("--all is every drone: give it alone, or names")
     from skyloop.cli.listing import none_runs
     from skyloop.client.connect import running_names
-    from skyloop.network.environment import choose
+    from skyloop.network.config import choose
 
     found = running_names()
     if not found:

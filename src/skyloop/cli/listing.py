@@ -55,7 +55,7 @@ def list_proxies(
 
     Those of this host, and with --network those that can be reached over the network.
     """
-    from skyloop.network.environment import choose
+    from skyloop.network.config import choose
 
     join_network(network, keys)
     settings = choose()
@@ -164,7 +164,7 @@ def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
 
 def describe(name: str) -> Row:
     """Return what the proxy with this name reports of itself, on this host or the network."""
-    from skyloop.network.environment import choose
+    from skyloop.network.config import choose
 
     return described(Row(name, transport=""), choose())
 

@@ -85,7 +85,7 @@ def list_recordings(
     import msgspec
 
     from skyloop.cli import log_tables
-    from skyloop.recording.listing import ENDING, describe, shown_name
+    from skyloop.recording.reader import ENDING, describe, shown_name
 
     try:
         paths = sorted(path for path in folder.iterdir() if path.suffix == ENDING)

@@ -13,8 +13,7 @@ from rich.text import Text
 
 from skyloop.cli.text import named
 from skyloop.clock import NS_PER_S
-from skyloop.recording.listing import Described, shown_name
-from skyloop.recording.reader import Recording
+from skyloop.recording.reader import Described, Recording, shown_name
 from skyloop.recording.review.compare import Comparison
 from skyloop.recording.review.summary import Delay, Recovered, Row, Summary
 from skyloop.recording.review.video import Videos

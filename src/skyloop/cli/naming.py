@@ -167,7 +167,7 @@ def join_network(network: str | None, keys: Path | None) -> None:
     """
     if network is None and keys is None:
         return
-    from skyloop.network.environment import choose
+    from skyloop.network.config import choose
 
     choose(network, keys)  # refuses what is not valid
     for variable, value in ((NETWORK_VARIABLE, network), (KEYS_VARIABLE, keys)):

@@ -89,7 +89,7 @@ def places(
     Raises:
         UsageError: An address or the folder is not valid, or no place is named.
     """
-    from skyloop.network.environment import serving
+    from skyloop.network.config import serving
 
     return serving(network, listen=tuple(listen or ()), connect=tuple(connect or ()), multicast=multicast, keys=keys)
 

@@ -35,7 +35,7 @@ def check(
     """Show what speaks against a route: legs, heights, speeds, zones, battery. Exit code 1 if it can't be flown."""
     from skyloop.client import connect
     from skyloop.control import load_route
-    from skyloop.control.route_flight import check_for
+    from skyloop.control.route import check_for
 
     plan = load_route(file)
     with connect(drone, access="observe") as watched:

@@ -14,7 +14,7 @@ from skyloop.child_process import on_parent_end
 from skyloop.cockpit.addresses import DEFAULT_PORT
 from skyloop.cockpit.server import RECORDINGS, serve_cockpit
 from skyloop.errors import SkyloopError
-from skyloop.network.environment import choose
+from skyloop.network.config import choose
 
 
 def main(arguments: list[str] | None = None) -> int:

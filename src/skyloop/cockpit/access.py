@@ -42,7 +42,7 @@ MAX_TOKEN: Final = 256
 CERTIFICATE: Final = "peer_certificate"  #: where the server puts it, in the connection's state
 
 FIRST_S: Final = 0.25  #: after the first wrong token of an address; each further one doubles it
-LONGEST_S: Final = 16.0  #: shorter than :data:`skyloop.cockpit.admission.ANSWER_S`, or nobody would get the answer
+LONGEST_S: Final = 16.0  #: shorter than :data:`skyloop.cockpit.listening.ANSWER_S`, or nobody would get the answer
 FORGET_S: Final = 600.0  #: an address from which no wrong token came for this long starts over
 MAX_ADDRESSES: Final = 1024  #: kept in mind; the one that has been quiet for longest is forgotten first
 FREE_IN_ALL: Final = 20  #: wrong tokens a minute from everywhere that cost nothing besides

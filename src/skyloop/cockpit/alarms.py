@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.broadcast import call_soon
+from skyloop.cockpit.feeds import call_soon
 from skyloop.errors import SkyloopError, UnknownNameError
 from skyloop.messages import Event, EventKind, Failsafe, Feedback, FlightState, LinkState, ReturnPhase, Value
 

@@ -1,30 +1,141 @@
-"""Requests over HTTP, answered in JSON; :mod:`skyloop.cockpit.security` has decided before who may ask."""
+"""Requests over HTTP, answered in JSON, whole or not at all; :mod:`.security` has decided who may ask."""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from functools import wraps
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import msgspec
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
 from skyloop.cockpit.access import SESSION_S, Gate, TokenGate
-from skyloop.cockpit.answers import BadRequest, answer_json, answered, body_of
 from skyloop.cockpit.security import gone_within, person_of
-from skyloop.cockpit.values import number
-from skyloop.errors import UnknownNameError
+from skyloop.cockpit.telemetry import encode_json, number
+from skyloop.control.route import check_for, parse_route
+from skyloop.errors import MissingExtraError, RefusedError, SkyloopError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages import Parameter, Value
 
 if TYPE_CHECKING:
-    from skyloop.cockpit.admission import Admission
     from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.listening import Admission
+    from skyloop.cockpit.routes import RouteFiles
     from skyloop.cockpit.station import Station
     from skyloop.cockpit.stream import PageCounts
 
+LARGEST_BODY: Final = 65_536  #: bytes
+BODY_S: Final = 10.0  #: within which a request's body must have come
+_JSON: Final = "application/json"
+
+_STATUS: Final = (
+    (UnknownNameError, 404),
+    (UsageError, 400),
+    (RefusedError, 409),
+    (UnsupportedError, 409),
+    (MissingExtraError, 501),
+)
+
+T = TypeVar("T")
+Handler = Callable[[Any, Request], Awaitable[Response]]
 MAX_ASKING: Final = 4  #: proxies that are asked for parameters at one time; each may take its thread for seconds
+MOST_CHECKS: Final = 4  #: at one time: each asks a proxy, and may take its thread for seconds
+
+
+class BadRequest(Exception):  # noqa: N818  (as HTTP calls it)
+    """A request that is not valid; ``status`` is the HTTP status of the answer."""
+
+    def __init__(self, status: int, why: str) -> None:
+        super().__init__(why)
+        self.status = status
+
+
+def answered(handler: Handler) -> Handler:
+    """Turn what a handler raises into an answer with a status and ``{"error": why}``."""
+
+    @wraps(handler)
+    async def answer(self: Any, request: Request) -> Response:
+        try:
+            return await handler(self, request)
+        except BadRequest as error:
+            return answer_json({"error": str(error)}, error.status)
+        except SkyloopError as error:
+            status = next((status for kind, status in _STATUS if isinstance(error, kind)), 502)
+            return answer_json({"error": str(error)}, status)
+        except ClientDisconnect:
+            return Response(status_code=400)
+
+    return answer
+
+
+async def while_wanted(request: Request, work: Coroutine[Any, Any, T]) -> T:
+    """Run work for a request, and cancel it as soon as who asked is gone.
+
+    Args:
+        request: The request.
+        work: The work.
+
+    Returns:
+        What ``work`` returns.
+
+    Raises:
+        ClientDisconnect: Who asked is gone.
+    """
+    task, gone = asyncio.create_task(work), asyncio.create_task(_gone(request))
+    try:
+        await asyncio.wait((task, gone), return_when=asyncio.FIRST_COMPLETED)
+        if not task.done():
+            raise ClientDisconnect
+        return task.result()
+    finally:
+        task.cancel()
+        gone.cancel()
+        await asyncio.gather(task, gone, return_exceptions=True)
+
+
+async def _gone(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+def answer_json(values: Any, status: int = 200) -> Response:
+    """Make an answer."""
+    return Response(encode_json(values), status, media_type=_JSON)
+
+
+def check_json(request: Request) -> None:
+    """Check the content type: another site's page can't send this one without asking first, which is refused."""
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != _JSON:
+        raise BadRequest(415, f"the content type must be {_JSON}")
+
+
+async def body_of(request: Request, kind: type[T]) -> T:
+    """Read a request's body.
+
+    Args:
+        request: The request.
+        kind: What the body is to be.
+
+    Raises:
+        BadRequest: It is no JSON, too large, not whole in time, or something else.
+    """
+    check_json(request)
+    data = b""
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for part in request.stream():
+                data += part
+                if len(data) > LARGEST_BODY:
+                    raise BadRequest(413, f"at most {LARGEST_BODY} bytes are taken")
+    except TimeoutError:
+        raise BadRequest(408, f"the request was not whole within {BODY_S:g} s") from None
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except msgspec.DecodeError as error:
+        raise BadRequest(400, f"not understood: {error}") from None
 
 
 class _Login(msgspec.Struct):
@@ -205,3 +316,65 @@ def parameter_values(parameter: Parameter) -> dict[str, Any]:
 def _value(value: Value) -> Any:
     """Return a value for JSON; the encoder makes numbers that are not finite null."""
     return list(value) if isinstance(value, tuple) else value
+
+
+class RoutesApi:
+    """The routes below ``/api/routes``, and the check of one for a drone.
+
+    Args:
+        fleet: The drones.
+        files: The routes that are kept.
+    """
+
+    def __init__(self, fleet: Fleet, files: RouteFiles) -> None:
+        self._fleet = fleet
+        self._files = files
+        self._checking = asyncio.Semaphore(MOST_CHECKS)
+
+    def routes(self) -> list[Route]:
+        """Return the routes."""
+        return [
+            Route("/api/drones/{name}/route/check", self.check, methods=["POST"]),
+            Route("/api/routes", self.listing),
+            Route("/api/routes/{name}", self.load, methods=["GET"]),
+            Route("/api/routes/{name}", self.save, methods=["POST"]),
+            Route("/api/routes/{name}/delete", self.delete, methods=["POST"]),
+        ]
+
+    @answered
+    async def check(self, request: Request) -> Response:
+        """Answer with what speaks against a route for a drone, and the ``id`` by which it is flown."""
+        name, stations = request.path_params["name"], self._fleet.stations
+        if name not in stations:
+            raise UnknownNameError("drone", name, stations)
+        station = stations[name]
+        route = parse_route(bytes(await body_of(request, msgspec.Raw)))
+        async with self._checking:
+            check = await asyncio.to_thread(check_for, station.drone, route, wait_s=0.0)
+        return answer_json(station.routes.add(route, check))
+
+    @answered
+    async def listing(self, _: Request) -> Response:
+        """Answer with the routes that are kept here."""
+        return answer_json(await asyncio.to_thread(self._files.listing))
+
+    @answered
+    async def load(self, request: Request) -> Response:
+        """Answer with a route, as its file is."""
+        route = await asyncio.to_thread(self._files.load, request.path_params["name"])
+        return Response(route.to_json(), media_type="application/json")
+
+    @answered
+    async def save(self, request: Request) -> Response:
+        """Keep a route under a name."""
+        name, route = request.path_params["name"], parse_route(bytes(await body_of(request, msgspec.Raw)))
+        await asyncio.to_thread(self._files.save, name, route)
+        return answer_json({"name": name}, 201)
+
+    @answered
+    async def delete(self, request: Request) -> Response:
+        """Delete a route."""
+        check_json(request)
+        name = request.path_params["name"]
+        await asyncio.to_thread(self._files.delete, name)
+        return answer_json({"name": name})

@@ -39,16 +39,14 @@ from starlette.types import Scope
 from starlette.websockets import WebSocket
 
 from skyloop.cockpit.access import Gate
-from skyloop.cockpit.admission import Admission
-from skyloop.cockpit.api import Api
+from skyloop.cockpit.api import Api, RoutesApi
 from skyloop.cockpit.control_session import ControlSession
-from skyloop.cockpit.fleet import Fleet, Overview
-from skyloop.cockpit.fleet_control import FleetSession
+from skyloop.cockpit.fleet import Fleet, FleetSession, Overview
 from skyloop.cockpit.follow_session import FollowerFactory
+from skyloop.cockpit.listening import Admission
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.recordings_api import RecordingsApi
 from skyloop.cockpit.routes import RouteFiles
-from skyloop.cockpit.routes_api import RoutesApi
 from skyloop.cockpit.security import NOT_ALLOWED, Guard, Names, person_of
 from skyloop.cockpit.small_video import SmallVideoSender
 from skyloop.cockpit.station import Station

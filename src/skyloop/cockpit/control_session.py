@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, Final
 from starlette.websockets import WebSocket
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.broadcast import call_soon
 from skyloop.cockpit.commands import (
     SETTLED_NS,
     UNTOUCHED_S,
@@ -54,11 +53,12 @@ from skyloop.cockpit.commands import (
     late_s,
     untimely,
 )
+from skyloop.cockpit.feeds import call_soon
 from skyloop.cockpit.follow_session import NO_CONTROL, FollowerFactory, FollowSession
 from skyloop.cockpit.place_flight import UP, Leg, PlaceFlight, RouteSession, to_place, to_start
 from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.takeover import AuthorityReport, TakeoverDialog
-from skyloop.control.route_flight import check_for
+from skyloop.control.route import check_for
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
 from skyloop.messages import Fate, FlightState, Land, Takeoff

@@ -13,11 +13,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.broadcast import call_soon
-from skyloop.cockpit.frame_keeper import FrameKeeper
+from skyloop.cockpit.feeds import call_soon
 from skyloop.cockpit.place_flight import UP
-from skyloop.cockpit.target_tracker import Follower, TargetTracker, TrackReport
-from skyloop.cockpit.values import number, vector
+from skyloop.cockpit.target_tracker import Follower, FrameKeeper, TargetTracker, TrackReport
+from skyloop.cockpit.telemetry import number, vector
 from skyloop.control.chase_law import FollowMode
 from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_follower import TargetFollower

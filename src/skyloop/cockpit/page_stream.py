@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.broadcast import Wake
 from skyloop.cockpit.encoded_feed import EncodedFeed, Form, NumberedPicture, form_for
+from skyloop.cockpit.feeds import Wake
 from skyloop.errors import SkyloopError
 from skyloop.messages import CameraInfo, EncodedFrame
 

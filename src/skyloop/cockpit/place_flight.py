@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.client.actions import ReturnWatch, position_action
-from skyloop.control.route_flight import save_photo
-from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto
+from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto, save_photo
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import LinkError, RefusedError, SkyloopError
 from skyloop.messages import Feedback, FlightState, Hover, Land, Position, ReturnPhase, ReturnToStart

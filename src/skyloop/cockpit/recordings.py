@@ -23,7 +23,7 @@ from skyloop.cockpit.recording_files import Notes
 from skyloop.cockpit.reports import Reports, timeline_command
 from skyloop.errors import FileFormatError, NoAnswerError, RefusedError, UnknownNameError, UsageError
 from skyloop.messages import Refusal
-from skyloop.recording.listing import ENDING, Described, describe, shown_name
+from skyloop.recording.reader import ENDING, Described, describe, shown_name
 
 if TYPE_CHECKING:
     from skyloop.client import Drone

@@ -13,7 +13,7 @@ from starlette.responses import FileResponse, HTMLResponse, Response
 from starlette.routing import Route
 
 from skyloop.cockpit import recording_files
-from skyloop.cockpit.answers import answer_json, answered, body_of, check_json, while_wanted
+from skyloop.cockpit.api import answer_json, answered, body_of, check_json, while_wanted
 from skyloop.cockpit.reports import MARK
 from skyloop.errors import UnknownNameError, UsageError
 

@@ -23,7 +23,7 @@ import msgspec
 
 from skyloop.child_process import on_parent_end
 from skyloop.clock import seconds
-from skyloop.cockpit.values import flat_values, truth_values, vector
+from skyloop.cockpit.telemetry import flat_values, truth_values, vector
 from skyloop.errors import LinkError, RefusedError, SkyloopError, UsageError
 from skyloop.messages import Event, EventKind, Feedback, LogEntry, Refusal, Severity
 from skyloop.recording.layout import Channel

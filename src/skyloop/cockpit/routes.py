@@ -10,8 +10,7 @@ from typing import Any, Final
 
 import msgspec
 
-from skyloop.control.route import ENDING, Route, checked, load_route, save_route
-from skyloop.control.route_check import RouteCheck
+from skyloop.control.route import ENDING, Route, RouteCheck, checked, load_route, save_route
 from skyloop.errors import RefusedError, SkyloopError, UnknownNameError, UsageError
 
 MOST_FILES: Final = 200

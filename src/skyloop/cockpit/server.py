@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from skyloop.clock import Clock, monotonic_ns
 from skyloop.cockpit.addresses import bind, host_names, own_addresses, reachable
-from skyloop.cockpit.admission import Admission, Connection
-from skyloop.cockpit.listening import Listener, ProtocolFactory, limit_messages, places_here
+from skyloop.cockpit.listening import Admission, Connection, Listener, ProtocolFactory, limit_messages, places_here
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Role
 from skyloop.metrics import client_readings
@@ -162,14 +161,14 @@ def with_certificate(access: Access, directory: Path) -> Access:
 
     Args:
         access: Without a certificate.
-        directory: Where certificates and their authority are kept (:mod:`skyloop.network.keys.pages`).
+        directory: Where certificates and their authority are kept (:mod:`skyloop.network.keys.lab`).
 
     Raises:
         UsageError: There is a certificate already, the address can't be certified, or a file can't be used.
         MissingExtraError: The extra ``network`` is not installed.
     """
     from skyloop.cockpit.security import bind_address
-    from skyloop.network.keys.pages import page_certificate
+    from skyloop.network.keys.lab import page_certificate
 
     if access.tls_cert is not None:
         raise UsageError("--https makes a certificate, and --tls-cert names one: give one of them")

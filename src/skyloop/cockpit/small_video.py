@@ -16,8 +16,8 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import monotonic_ns, seconds
-from skyloop.cockpit.broadcast import Wake
-from skyloop.cockpit.camera_feed import FPS, SmallFeed, SmallFrame, pack, rounded_width
+from skyloop.cockpit.encoded_feed import FPS, SmallFeed, SmallFrame, pack, rounded_width
+from skyloop.cockpit.feeds import Wake
 from skyloop.cockpit.page_stream import PageStream
 from skyloop.cockpit.stream import encoding_values
 from skyloop.errors import SkyloopError

@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.alarms import ThresholdReader
-from skyloop.cockpit.broadcast import ROW_HZ, Cancellable, PeriodicBroadcast
-from skyloop.cockpit.camera_feed import CameraFeed, SmallFeed
 from skyloop.cockpit.discovery import Found
-from skyloop.cockpit.encoded_feed import EncodedFeed, Form
-from skyloop.cockpit.feeds import EventFeed, LogFeed
+from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, Form, SmallFeed
+from skyloop.cockpit.feeds import ROW_HZ, Cancellable, EventFeed, LogFeed, PeriodicBroadcast
 from skyloop.cockpit.routes import CheckedRoutes
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.control.waypoint import Waypoint

@@ -17,8 +17,8 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import monotonic_ns, seconds
-from skyloop.cockpit.broadcast import PeriodicBroadcast
-from skyloop.cockpit.camera_feed import CameraFeed, pack
+from skyloop.cockpit.encoded_feed import CameraFeed, pack
+from skyloop.cockpit.feeds import PeriodicBroadcast
 from skyloop.cockpit.page_stream import PageStream, Sent
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json

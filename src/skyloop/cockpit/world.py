@@ -17,9 +17,9 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from skyloop.client import Level, PreflightFinding
-from skyloop.cockpit.answers import BadRequest, answer_json, answered
-from skyloop.cockpit.broadcast import ROW_HZ
-from skyloop.cockpit.values import Json, number, vector
+from skyloop.cockpit.api import BadRequest, answer_json, answered
+from skyloop.cockpit.feeds import ROW_HZ
+from skyloop.cockpit.telemetry import Json, number, vector
 from skyloop.errors import NoAnswerError, ParameterError, UnknownNameError
 from skyloop.messages import Position
 from skyloop.messages.parameter import WORLD, WorldGeometry, decode_world

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Motion, Part, VelocityLaw
-from skyloop.control.detour import Point, Wall, detour
-from skyloop.control.gate_law import Axis, GatePhase
+from skyloop.control.gate_law import Axis, GatePhase, Point, Wall, detour
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
 from skyloop.estimation import corrected

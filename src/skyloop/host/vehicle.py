@@ -262,7 +262,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
     """
     if settings.network is None:
         return None
-    from skyloop.network.environment import serving
+    from skyloop.network.config import serving
 
     keys = expand(settings.keys) if settings.keys is not None else None
     return serving(settings.network, listen=settings.listen, multicast=settings.multicast, keys=keys)

@@ -7,10 +7,9 @@ it each function here raises :class:`MissingExtraError`.
 from __future__ import annotations
 
 from skyloop.network.client import dial
+from skyloop.network.config import FabricSettings, TlsFiles, choose
 from skyloop.network.discovery import list_proxies
-from skyloop.network.environment import choose
 from skyloop.network.packets import ProxyInfo
 from skyloop.network.server import FabricServer
-from skyloop.network.settings import FabricSettings, TlsFiles
 
 __all__ = ["FabricServer", "FabricSettings", "ProxyInfo", "TlsFiles", "choose", "dial", "list_proxies"]

@@ -12,13 +12,11 @@ from typing import TYPE_CHECKING, Any, Final
 from skyloop.errors import DecodeError, LinkError, NoAnswerError, UnknownNameError
 from skyloop.network import layout, packets
 from skyloop.network.admission import Admission
-from skyloop.network.config import Part
+from skyloop.network.config import FabricSettings, Part
 from skyloop.network.delivery import DEPTH, Outgoing, Receiver
-from skyloop.network.discovery import SYNC_S, proxy_reached, renew
-from skyloop.network.joining import ProxyWatch, join
+from skyloop.network.discovery import SYNC_S, ProxyWatch, join, proxy_reached, renew
 from skyloop.network.sealing import contents
 from skyloop.network.session import Session, acquire, load, release, retire, undeclare
-from skyloop.network.settings import FabricSettings
 from skyloop.network.subscription import Subscription
 from skyloop.transport.base import (
     MAX_PACKET,

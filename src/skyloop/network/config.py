@@ -1,16 +1,28 @@
-"""Zenoh's configuration, made from the settings of this process; pure but for the search of a free port."""
+"""How this process joins the network: its settings, by arguments or the environment, and Zenoh's configuration of them.
+
+Pure, but for reading the environment and the search of a free port.
+"""
 
 from __future__ import annotations
 
 import json
+import logging
+import os
 import socket
 from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
-from skyloop.errors import LinkError, UsageError
-from skyloop.network.settings import FabricSettings
+from skyloop.errors import Hint, LinkError, UsageError
+from skyloop.network.layout import ANYONE, check_identity
 
+if TYPE_CHECKING:
+    from skyloop.network.keys import Credentials, Identity, KeyRing
+
+LEASE_S: Final = 0.7  #: without a sign of life for so long a peer is gone, if it asks for nothing else
+MAX_LEASE_S: Final = 10.0
 DEFAULT_PORT: Final = 7447  #: Zenoh's
 #: An address that does not answer for so long is given up, and the next one of the same peer is tried.
 OPEN_MS: Final = 800
@@ -27,6 +39,217 @@ MAX_MESSAGE_UP: Final = 1 << 18
 _ENCRYPTED: Final = ("quic/", "tls/")
 _PROTOCOLS: Final = (*_ENCRYPTED, "tcp/", "udp/", "ws/", "unixsock-stream/", "serial/", "unixpipe/", "vsock/")
 _RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+_log = logging.getLogger(__name__)
+
+NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
+KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
+LEASE_VARIABLE: Final = "SKYLOOP_LEASE_S"
+MULTICAST: Final = "multicast"
+_ON: Final = frozenset({MULTICAST, "on", "1", "true", "yes"})
+_OFF: Final = frozenset({"", "off", "0", "false", "no"})
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """An identity for mutual TLS, as PEM files."""
+
+    ca: Path  #: certificate of the authority that signed everybody's
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True, slots=True)
+class FabricSettings:
+    """How to join the network; by default others on the same network segments are found by multicast, without keys.
+
+    ``listen`` and ``connect`` are addresses such as ``10.0.0.5:7447``, ``[::1]:0`` (any free port) or ``10.0.0.5``
+    (port 7447). Without keys each stands for TCP (what must arrive) and UDP (commands and feedback), with keys for
+    QUIC. An address may also be a whole Zenoh endpoint, ``tcp/10.0.0.5:7447``, which is used as it is.
+
+    Raises:
+        UsageError: The identity is not valid, or is given without its certificate and key; or the lease is none.
+    """
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    multicast: bool = True  #: search, and be found, by UDP multicast on the network segments of this host
+    tls: TlsFiles | None = None
+    #: A link counts as lost when nothing came by it for so long [s], by the others as they are told, and by an
+    #: application 0.3 s later. A mobile network is silent for seconds, and what was lost takes another to come back.
+    lease_s: float = LEASE_S
+    who: str = ANYONE  #: the identity: the common name of the certificate
+    #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), None for none.
+    access_control: dict[str, Any] | None = None
+    #: The keys that ``tls`` and ``access_control`` were made from.
+    ring: KeyRing | None = field(default=None, compare=False)
+
+    def current(self) -> FabricSettings:
+        """Return these settings with the newest roster in the folder of the keys, for a new session.
+
+        Raises:
+            LinkError: That roster revokes these keys themselves.
+        """
+        if self.ring is None:
+            return self
+        self.ring.refresh()
+        credentials = self.ring.credentials
+        if not self.ring.admits(credentials.identity):
+            raise LinkError(f"the keys of {credentials.name} were revoked, or their rights changed: get new ones")
+        if not self.ring.outdated:
+            return self
+        return secured(self, credentials)
+
+    @property
+    def excused_s(self) -> float:
+        """By how much longer a silence is borne than usual [s]."""
+        return self.lease_s - LEASE_S
+
+    @property
+    def reach(self) -> str:
+        """Where proxies are searched for, for people."""
+        ways = [*self.connect, *(["multicast"] if self.multicast else [])]
+        return ", ".join(ways) or "nowhere"
+
+    @property
+    def identity(self) -> Identity | None:
+        """Whose keys these are; None without keys."""
+        return None if self.ring is None else self.ring.credentials.identity
+
+    def __post_init__(self) -> None:
+        check_identity(self.who)
+        if not LEASE_S <= self.lease_s <= MAX_LEASE_S:
+            raise UsageError(f"the lease is {self.lease_s!r} and must be {LEASE_S:g} to {MAX_LEASE_S:g} seconds")
+        if self.tls is None and self.who != ANYONE:
+            raise UsageError(f"the identity {self.who!r} needs its certificate and key")
+
+
+def secured(settings: FabricSettings, credentials: Credentials) -> FabricSettings:
+    """Return these settings with a key: mutual TLS over QUIC, and access control by the roster that came with it."""
+    from skyloop.network.access import access_control
+    from skyloop.network.keys import KeyRing  # with keys only: these need cryptography
+
+    return replace(
+        settings,
+        tls=TlsFiles(credentials.authority_file, credentials.certificate_file, credentials.key_file),
+        who=credentials.name,
+        access_control=access_control(credentials.roster.identities),
+        ring=KeyRing(credentials),
+    )
+
+
+#: ``True``: search by multicast; addresses to call, with ``multicast`` among them to search as well, separated by
+#: commas; ``False``: this host only; ``None``: as the environment says.
+NetworkChoice = bool | str | FabricSettings | None
+
+
+def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
+    """Return the settings of the network, None to stay on this host.
+
+    A key that ends within a week is logged as a warning.
+
+    Args:
+        network: See :data:`NetworkChoice`; defaults to the variable ``SKYLOOP_NETWORK``, without which nothing leaves
+            this host.
+        keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
+
+    Raises:
+        UsageError: An address, the folder or the variable ``SKYLOOP_LEASE_S`` is not valid.
+    """
+    found = _choose(network, keys)
+    if found is not None and found.ring is not None:
+        for change in found.ring.poll():
+            _log.warning("%s", change)
+    return found
+
+
+def _choose(network: NetworkChoice, keys: Path | str | None) -> FabricSettings | None:
+    if isinstance(network, FabricSettings):
+        return network if keys is None else secure(network, keys)
+    requested = os.environ.get(NETWORK_VARIABLE, "") if network is None else network
+    if isinstance(requested, bool):
+        requested = MULTICAST if requested else ""
+    if requested.strip().lower() in _OFF:
+        if keys is not None and network is None:
+            raise UsageError("keys are for the network").with_hint(Hint.NAME_NETWORK)
+        return None
+    words = [word.strip() for word in requested.split(",") if word.strip()]
+    connect = tuple(word for word in words if word.lower() not in _ON)
+    return settings(connect=connect, multicast=len(connect) < len(words), keys=keys)
+
+
+def serving(
+    network: str,
+    *,
+    listen: tuple[str, ...] = (),
+    connect: tuple[str, ...] = (),
+    multicast: bool = True,
+    keys: Path | str | None = None,
+) -> FabricSettings:
+    """Return the settings of what serves on the network, or joins its parts.
+
+    Args:
+        network: ``multicast``, or addresses of routers with commas, with ``multicast`` among them for both.
+        listen: Addresses to listen at.
+        connect: More addresses to connect to.
+        multicast: Whether to be found by multicast, where ``network`` names it.
+        keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
+
+    Raises:
+        UsageError: An address or the folder is not valid, or no place is named.
+    """
+    words = [word.strip() for word in network.split(",") if word.strip()]
+    if not words:
+        raise UsageError("the network names no place: give multicast, or addresses with commas")
+    routers = [word for word in words if word.lower() != MULTICAST]
+    return settings(
+        listen=listen, connect=(*routers, *connect), multicast=multicast and len(routers) < len(words), keys=keys
+    )
+
+
+def settings(
+    *,
+    listen: tuple[str, ...] = (),
+    connect: tuple[str, ...] = (),
+    multicast: bool = True,
+    keys: Path | str | None = None,
+) -> FabricSettings:
+    """Make settings for the network.
+
+    Args:
+        listen: Addresses to listen at.
+        connect: Addresses to connect to.
+        multicast: Whether to search, and be found, by multicast.
+        keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
+
+    Raises:
+        UsageError: An address or the folder is not valid.
+    """
+    found = FabricSettings(listen=listen, connect=connect, multicast=multicast, lease_s=_lease_s())
+    endpoints_of((*listen, *connect), found)  # says what is wrong with an address before anything is opened
+    folder = keys or os.environ.get(KEYS_VARIABLE) or None
+    return found if folder is None else secure(found, folder)
+
+
+def _lease_s() -> float:
+    """Return the lease that the environment asks for [s]. Raises :class:`UsageError`."""
+    text = os.environ.get(LEASE_VARIABLE) or f"{LEASE_S:g}"
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"{LEASE_VARIABLE} is {text!r} and must be {LEASE_S:g} to {MAX_LEASE_S:g} seconds") from None
+
+
+def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
+    """Return these settings with the identity in a folder.
+
+    Raises:
+        UsageError: The folder is not valid, or an address does not go with keys.
+    """
+    from skyloop.network.keys import load  # with keys only: it needs cryptography
+
+    found = secured(plain, load(folder))
+    endpoints_of((*found.listen, *found.connect), found)  # not all that are good without keys are with them
+    return found
 
 
 class Part(StrEnum):

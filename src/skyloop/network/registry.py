@@ -15,9 +15,8 @@ import msgspec
 from skyloop.errors import DecodeError, LinkError
 from skyloop.network import layout, packets
 from skyloop.network.admission import MAX_CLIENTS, Admission, Tokens, admit, no_place_reason
-from skyloop.network.connection import Sender, ServerConnection
+from skyloop.network.connection import Publisher, Sender, ServerConnection
 from skyloop.network.handler_queue import HandlerQueue
-from skyloop.network.publishing import Publisher
 from skyloop.network.sealing import Seal, TopicSeal
 from skyloop.network.session import load
 from skyloop.transport.base import NOBODY, Peer, ServerHandler

@@ -17,14 +17,12 @@ from typing import TYPE_CHECKING, Any, Final
 from skyloop.errors import DecodeError, NameTakenError, UsageError
 from skyloop.messages import FrameHeader
 from skyloop.network import discovery, layout, packets
-from skyloop.network.config import Part
-from skyloop.network.connection import MAX_WAITING, Sender, ServerConnection
+from skyloop.network.config import FabricSettings, Part
+from skyloop.network.connection import MAX_WAITING, Publisher, Sender, ServerConnection
 from skyloop.network.handler_queue import HandlerQueue
-from skyloop.network.publishing import Publisher
 from skyloop.network.registry import ConnectionRegistry, Item
 from skyloop.network.sealing import PLAIN, TopicSeal, contents
 from skyloop.network.session import Session, acquire, host_name, load, release, undeclare
-from skyloop.network.settings import FabricSettings
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_frame, check_name, check_packet
 from skyloop.transport.priority import SUPERSEDED, is_command
 

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import LinkError, MissingExtraError
 from skyloop.network import config
-from skyloop.network.config import Part
-from skyloop.network.settings import FabricSettings
+from skyloop.network.config import FabricSettings, Part
 
 if TYPE_CHECKING:
     import zenoh

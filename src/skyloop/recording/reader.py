@@ -1,7 +1,8 @@
-"""Reading a recording: its drones, and their samples in the order in which they were received."""
+"""Reading a recording: its drones, and their samples in the order in which they were received; and a folder of them."""
 
 from __future__ import annotations
 
+import os
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -10,10 +11,12 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from operator import attrgetter
 from pathlib import Path
-from typing import IO, Any, TypeGuard
+from typing import IO, Any, Final, TypeGuard
+
+import msgspec
 
 from skyloop.clock import NS_PER_S
-from skyloop.errors import FileFormatError, UnknownNameError
+from skyloop.errors import FileFormatError, SkyloopError, UnknownNameError
 from skyloop.messages.frame import H264
 from skyloop.recording.layout import (
     META_CLOCK,
@@ -50,6 +53,7 @@ from skyloop.recording.scan import (
 
 #: Called with the share of a file that has been read, from 0 to 1.
 Progress = Callable[[float], object]
+ENDING: Final = ".mcap"
 
 
 @dataclass(frozen=True, slots=True)
@@ -391,3 +395,33 @@ def _foreign(found: Scan) -> str:
         return f"{found.path} ends before its first sample: {found.cut}"
     shown = ", ".join(topics[:5]) + (", …" if len(topics) > 5 else "")
     return f"{found.path} is an MCAP file, but no recording of Skyloop's (its topics: {shown or 'none'})"
+
+
+class Described(msgspec.Struct, frozen=True):
+    """What is in a recording."""
+
+    started: float | None = None  #: Unix time [s]; None if it is not known
+    drones: tuple[str, ...] = ()
+    seconds: float | None = None  #: from the first message to the last
+    problem: str = ""  #: why it can't be read, or why it is incomplete; empty for a complete file
+
+
+def shown_name(path: Path) -> str:
+    """Return a file's name as a text, with bytes that are not UTF-8 in hexadecimal."""
+    return os.fsencode(path.name).decode(errors="backslashreplace")
+
+
+def describe(path: Path) -> Described:
+    """Describe a file without unpacking anything. Never raises because of what is in it."""
+    try:
+        recording = Recording.open(path)
+        return Described(
+            started=recording.start.started_unix_ns / NS_PER_S,
+            drones=tuple(drone.name for drone in recording.drones),
+            seconds=round(recording.seconds, 3),
+            problem=recording.cut,
+        )
+    except SkyloopError as error:
+        return Described(problem=str(error).replace(path.name, shown_name(path)))
+    except Exception as error:  # noqa: BLE001  one file's surprise must not hide the others
+        return Described(problem=f"{shown_name(path)} can't be read: {error!r:.300}")

@@ -7,10 +7,9 @@ folder too, to be copied to the machine that it is for;
 
 from __future__ import annotations
 
-from skyloop.network.keys.credentials import Credentials, load
+from skyloop.network.keys.agreement import KeyRing
+from skyloop.network.keys.credentials import Credentials, Entry, Roster, load
 from skyloop.network.keys.identity import Identity, KeyRole
 from skyloop.network.keys.lab import Lab
-from skyloop.network.keys.ring import KeyRing
-from skyloop.network.keys.roster import Entry, Roster
 
 __all__ = ["Credentials", "Entry", "Identity", "KeyRing", "KeyRole", "Lab", "Roster", "load"]

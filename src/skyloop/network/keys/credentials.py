@@ -1,4 +1,4 @@
-"""One identity's folder, as a program uses it: read, checked, watched for a newer roster.
+"""One identity's folder, as a program uses it: read, checked, watched for a newer roster; and the roster.
 
 =================  ====================================================================
 ``ca.pem``         the certificate of the lab's authority
@@ -6,19 +6,26 @@
 ``identity.key``   its private key: readable by its owner only
 ``roster.json``    all identities of the lab, signed; replace it when there is a newer one
 =================  ====================================================================
+
+Zenoh's access control knows subjects by their common names, so all names must be known where it is enforced. The
+roster is a file of two parts: the list itself, and the signature of exactly those bytes. Its number grows with each
+change, and the highest one is in force.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
-from skyloop.errors import UsageError
+import msgspec
+
+from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import expand
 from skyloop.network.keys import files
-from skyloop.network.keys import roster as rosters
 from skyloop.network.keys.certificates import (
     Authority,
     Certificate,
@@ -32,13 +39,109 @@ from skyloop.network.keys.certificates import (
     read_key,
 )
 from skyloop.network.keys.identity import Identity, KeyRole
-from skyloop.network.keys.roster import Roster
 
+FORMAT: Final = 1
+_PURPOSE: Final = b"skyloop roster\n"  # what is signed begins with it: no signature of anything else fits
 AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
 NOTICE: Final = timedelta(days=7)  #: how long before its end an expiry is announced
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """One identity. Times are whole seconds since 1970, UTC."""
+
+    name: str
+    role: KeyRole
+    drones: tuple[str, ...]
+    serial: str  #: of the newest certificate, hexadecimal
+    expires: int  #: when that one does
+    last: int  #: when the last of all certificates under this name does
+    revoked: bool = False
+
+    @property
+    def identity(self) -> Identity:
+        """The identity itself."""
+        return Identity(self.name, self.role, self.drones)
+
+    @property
+    def expires_at(self) -> datetime:
+        """When its newest certificate expires, in UTC."""
+        return datetime.fromtimestamp(self.expires, UTC)
+
+    @property
+    def last_at(self) -> datetime:
+        """When the last of all certificates under this name expires, in UTC."""
+        return datetime.fromtimestamp(self.last, UTC)
+
+
+class Roster(msgspec.Struct, frozen=True):
+    """All identities, by name."""
+
+    number: int
+    lab: str  #: the authority's name
+    entries: tuple[Entry, ...] = ()
+    format: int = FORMAT
+
+    def find(self, name: str) -> Entry | None:
+        """Return the entry of a name, None if there is none."""
+        return next((entry for entry in self.entries if entry.name == name), None)
+
+    @property
+    def identities(self) -> list[Identity]:
+        """The identities that may join: all that were not revoked.
+
+        The handshake checks that their certificates are valid.
+        """
+        return [entry.identity for entry in self.entries if not entry.revoked]
+
+    def put(self, entry: Entry) -> Roster:
+        """Return the next roster, with this entry in the place of the one of its name."""
+        others = [other for other in self.entries if other.name != entry.name]
+        entries = tuple(sorted([*others, entry], key=lambda each: each.name))
+        return Roster(self.number + 1, self.lab, entries)
+
+
+class _File(msgspec.Struct):
+    roster: msgspec.Raw
+    signature: str
+
+
+def encode_roster(roster: Roster, authority: Authority) -> bytes:
+    """Return the roster's file, signed."""
+    body = msgspec.json.format(msgspec.json.encode(roster), indent=1)
+    signature = base64.b64encode(authority.sign(_PURPOSE + body)).decode()
+    return msgspec.json.encode(_File(msgspec.Raw(body), signature)) + b"\n"
+
+
+def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
+    """Check the signature of a roster's file, then decode it.
+
+    Args:
+        content: The file.
+        authority: The lab's.
+        path: The file, for errors.
+
+    Raises:
+        FileFormatError: It is not a roster, is damaged, or has another format.
+        UsageError: It was changed, or another authority signed it.
+    """
+    try:
+        file = msgspec.json.decode(content, type=_File)
+        signature = base64.b64decode(file.signature, validate=True)
+    except (msgspec.MsgspecError, UnicodeDecodeError, binascii.Error, RecursionError) as error:
+        raise FileFormatError(f"{path} is no roster, or it is damaged: {error}") from None
+    body = bytes(file.roster)
+    if not authority.signed(_PURPOSE + body, signature):
+        raise UsageError(f"the roster {path} was changed, or is not signed by {authority.name}: copy it again")
+    try:
+        roster = msgspec.json.decode(body, type=Roster)
+    except msgspec.MsgspecError as error:
+        raise FileFormatError(f"{path} is a roster of another version of Skyloop: {error}") from None
+    if roster.format != FORMAT:
+        raise FileFormatError(f"{path} is a roster of format {roster.format}; this version of Skyloop reads {FORMAT}")
+    return roster
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +276,7 @@ def _read_authority(directory: Path) -> Authority:
 
 def _read_roster(directory: Path, authority: Authority) -> Roster:
     path = directory / ROSTER_FILE
-    return rosters.decode(files.read(path, "the roster"), authority, path)
+    return decode_roster(files.read(path, "the roster"), authority, path)
 
 
 def _check_folder(path: Path) -> None:
