@@ -91,7 +91,7 @@ def test_a_drone_that_another_program_flies_is_told_nothing_but_that_we_are_ther
 
 @pytest.mark.parametrize("before", [None, GROUND, AIR, EMERGENCY])
 def test_a_drone_that_is_not_heard_and_that_nobody_flies_from_here_is_told_nothing(before: Condition | None) -> None:
-    """Hover, which stops another program's sticks, and after an emergency land; it also kept a lost drone in the air."""
+    """Hover, which stops another program's sticks, and after an emergency land; it kept a lost drone in the air."""
     cockpit = at(before)
     cockpit.setpoints.lost()
     assert cockpit.setpoints.messages(0) == []
