@@ -82,7 +82,7 @@ RECORDED: Final[dict[int, tuple[int, str]]] = {
     238: (61, "1400000001"),
     240: (4, "00ef"),
 }
-#: Writes that Betaflight 4.6.0 acknowledges also where nothing is in them, of the numbers up to 100; they change nothing
+#: Writes that Betaflight 4.6.0 acknowledges also where they are empty, of the numbers up to 100; they change nothing
 #: here. Not among them: 59, 61, 68 (which restarts it) and 69, to which it gives answers of their own or none.
 EMPTY_WRITES: Final = frozenset(
     (11, 33, 35, 37, 39, 41, 43, 45, 51, 53, 55, 57, 60, 62, 65, 76, 78, 91, 93, 95, 97, 99)
