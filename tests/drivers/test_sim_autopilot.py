@@ -153,11 +153,11 @@ def test_the_simulated_radio_cuts_the_firmware_s_driver_off() -> None:
         count = sink.feedback_count
         assert driver.apply(Hover()) == Hover()
         with pytest.raises(DriverError, match="radio is switched off"):
-            driver.external_pose(POSE)
+            driver.external_pose(replace(POSE, captured_ns=monotonic_ns()))
         assert driver.set_parameter("sim.link", True) is True
         assert sink.wait(lambda: sink.links[-1] == (LinkState.UP, ""), LONG_S)
         assert sink.wait(lambda: sink.feedback_count > count, LONG_S)
-        driver.external_pose(POSE)
+        driver.external_pose(replace(POSE, captured_ns=monotonic_ns()))
         assert driver.failsafe(Land()) in (True, False)  # as the firmware's driver says
         assert driver.checkup()
         with pytest.raises(ParameterError):
