@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import struct
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -24,9 +25,16 @@ JPEG_QUALITY = 80
 _LENGTH: Final = struct.Struct(">I")
 _encode = msgspec.json.Encoder().encode
 NICENESS: Final = 10  #: of the thread that encodes
+
+
+def _give_way() -> None:
+    if sys.platform == "linux":  # elsewhere it is the whole process that has a priority
+        os.nice(NICENESS)
+
+
 #: One thread for all cameras: encoding for many pages must not take the cores that fly. The event loop keeps the
 #: priority it was started with: a person's sticks and stop pass through it, and must not starve beside a browser.
-_ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=os.nice, initargs=(NICENESS,))
+_ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
 
 
 @dataclass(frozen=True, slots=True)
