@@ -65,7 +65,7 @@ class Watching:
         up, down = (self._error * (0.5 + 0.03 * height)).tolist()
         view = BoxView.of((x, y + up, width, height - up + down), camera, 0.06)
         assert view is not None
-        return view, replace(camera, position=camera.position + np.array((0.0, 0.0, self.misread(self.at_s))))
+        return view, replace(camera, position=np.add(camera.position, (0.0, 0.0, self.misread(self.at_s))))
 
     def run(self, seconds: float, motion: Callable[[float], float] = still) -> TargetState:
         for _ in range(round(seconds / PERIOD_S)):
