@@ -12,7 +12,7 @@ import pytest
 
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
-from skyloop.control.follow_law import FollowMarker, FollowScore, Mode
+from skyloop.control.follow import FollowMarker, FollowScore, Mode
 from skyloop.errors import UnknownNameError
 from skyloop.messages import (
     CameraInfo,
