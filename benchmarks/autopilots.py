@@ -18,7 +18,7 @@ import msgspec
 
 import skyloop
 from skyloop.cli.demo import MARKER_ID
-from skyloop.control.follow_law import FollowMarker
+from skyloop.control.follow import FollowMarker
 from skyloop.errors import NoAnswerError, RefusedError
 from skyloop.messages import Feedback, FlightState
 from skyloop.messages.geometry import wrap_angle

@@ -23,7 +23,7 @@ from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.labels import CLASS_NAMES, TargetBox, pictures
 from skyloop.sim.render import SensorEffects, use_one_core
 from skyloop.vision import OnnxDetector
-from skyloop.vision.onnx_detector import SIMULATED_WEIGHTS
+from skyloop.vision.simulated import SIMULATED_WEIGHTS
 
 WORLDS: Final = ("street", "yard")
 SEEDS: Final = (9001, 9002, 9003, 9004)

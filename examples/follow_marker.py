@@ -8,7 +8,7 @@ import math
 import sys
 
 import skyloop
-from skyloop.control.follow_law import FollowMarker
+from skyloop.control.follow import FollowMarker
 
 
 class Follow(FollowMarker):

@@ -43,7 +43,7 @@ from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 import skyloop
 from skyloop.clock import nanoseconds
 from skyloop.cockpit.child import CockpitProcess
-from skyloop.control.follow_law import FollowMarker
+from skyloop.control.follow import FollowMarker
 from skyloop.control.waypoint import Waypoint, reached, velocity_to
 from skyloop.messages import Annotation, Polyline, Text
 from skyloop.sim import load_world

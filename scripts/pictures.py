@@ -21,7 +21,7 @@ from flight_plot import FlightLog, plot
 from numpy.typing import NDArray
 
 import skyloop
-from skyloop.control.follow_law import FollowMarker, Mode
+from skyloop.control.follow import FollowMarker, Mode
 from skyloop.messages import Annotation, Takeoff
 from skyloop.sim import STEP_S, Simulation, load_world
 from skyloop.sim.camera import CameraModel, CameraPose

@@ -43,7 +43,7 @@ def test_what_is_wrong_is_told_before_anything_is_connected(run: Run, words: tup
 
 def test_a_wrong_class_of_a_file_is_told_with_what_it_may_have_been(run: Run) -> None:
     pytest.importorskip("onnxruntime")
-    from skyloop.vision.onnx_detector import SIMULATED_WEIGHTS
+    from skyloop.vision.simulated import SIMULATED_WEIGHTS
 
     ended = run("fly", "follow", "nobody", "--class", "persn", "--detector", str(SIMULATED_WEIGHTS))
     assert ended.code == 2

@@ -18,7 +18,7 @@ from skyloop.cockpit.control_session import SILENT_S
 from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.control import Controller
-from skyloop.control.follow_law import FollowMarker
+from skyloop.control.follow import FollowMarker
 from skyloop.errors import DecodeError, RefusedError
 from skyloop.messages import (
     AnyAction,

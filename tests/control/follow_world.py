@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from skyloop.clock import NS_PER_S, nanoseconds
-from skyloop.control.follow_law import FollowLaw
+from skyloop.control.follow import FollowLaw
 from skyloop.messages import Feedback, FlightState, Velocity
 from skyloop.messages.geometry import rotation_from_euler, wrap_angle
 

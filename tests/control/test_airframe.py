@@ -15,7 +15,7 @@ from skyloop.clock import nanoseconds
 from skyloop.control.airframe import DRAG_PER_S, Airframe, AirframeLaw, Part, TiltVelocity
 from skyloop.control.chase_law import FollowMode
 from skyloop.control.course_law import CourseLaw, GatePlace
-from skyloop.control.follow_law import FollowLaw, Mode
+from skyloop.control.follow import FollowLaw, Mode
 from skyloop.control.gate_law import GateLaw, GatePhase
 from skyloop.control.image_servo import FlowLaw, FlowPhase, ImageServoLaw
 from skyloop.control.landing_law import LandingLaw, LandingPhase

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skyloop.client.frame import Arrival, FeedbackHistory, Frame
-from skyloop.control.follow_law import FollowMarker, FollowScore, Mode
+from skyloop.control.follow import FollowMarker, FollowScore, Mode
 from skyloop.errors import UnknownNameError
 from skyloop.messages import (
     CameraInfo,

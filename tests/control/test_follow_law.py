@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.control.airframe import Airframe
-from skyloop.control.follow_law import FollowLaw, FollowSettings, Mode, TargetFilter
+from skyloop.control.follow import FollowLaw, FollowSettings, Mode, TargetFilter
 from skyloop.messages import Feedback
 from tests.control.follow_world import FollowWorld
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.control.follow_law import FollowMarker
+from skyloop.control.follow import FollowMarker
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
 from skyloop.vehicles.mavlink.emulator import CAMERA
 from tests.processes.conftest import Process, eventually

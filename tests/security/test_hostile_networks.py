@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 from skyloop.control import PolicyNetwork
 from skyloop.errors import FileFormatError
 from skyloop.vision import LearnedTracker, OnnxDetector, onnx
-from skyloop.vision.onnx_detector import SIMULATED_WEIGHTS
+from skyloop.vision.simulated import SIMULATED_WEIGHTS
 from tests.control.test_onnx_policy import write as write_policy
 
 pytestmark = pytest.mark.process

@@ -13,7 +13,7 @@ from skyloop.errors import MissingExtraError, UsageError
 from skyloop.sim import load_world
 from skyloop.sim.labels import CLASS_NAMES, pictures
 from skyloop.vision import Detection, Layout, OnnxDetector, simulated_detector
-from skyloop.vision.onnx_detector import SIMULATED_WEIGHTS
+from skyloop.vision.simulated import SIMULATED_WEIGHTS
 
 SEED = 77_003  # of places and times; no training uses it
 

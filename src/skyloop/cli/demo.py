@@ -27,7 +27,7 @@ from skyloop.messages import Feedback, Value
 if TYPE_CHECKING:
     from skyloop.client import ChannelStats, Drone
     from skyloop.cockpit.child import CockpitProcess
-    from skyloop.control.follow_law import FollowMarker, FollowScore
+    from skyloop.control.follow import FollowMarker, FollowScore
 
 MARKER_ID = 7  #: on the board that is carried about the room
 ENOUGH_IN_VIEW = 0.9
@@ -89,7 +89,7 @@ class _Demo:
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> DemoReport:
         """``port`` None: the default one of pages. Raises the errors of connecting and of take-off."""
-        from skyloop.control.follow_law import FollowMarker
+        from skyloop.control.follow import FollowMarker
 
         report = DemoReport()
         with drone_and_page(uri, self.console, self.name, self._stop, port, page_shown=page_shown, browser=browser) as (

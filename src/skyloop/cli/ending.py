@@ -184,7 +184,7 @@ def _each(
 
 
 def _land(name: str, priority: int) -> str:
-    from skyloop.cli.naming import connect_pilot
+    from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
 
     over = _over_already(name, "skyloop land")
@@ -218,7 +218,7 @@ def _stay(drone: Drone) -> None:
 
 
 def _return(name: str, priority: int, height_m: float | None, flown: list[Drone], interrupted: threading.Event) -> str:
-    from skyloop.cli.naming import connect_pilot
+    from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
 
     over = _over_already(name, "skyloop return")

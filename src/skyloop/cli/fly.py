@@ -85,7 +85,7 @@ def fly(
 
     Ctrl-C lands too, and so does an error in the controller without --reload.
     """
-    from skyloop.cli.naming import connect_pilot
+    from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
     from skyloop.control.loading import Reloader, load_controller
 

@@ -78,7 +78,7 @@ def fly_follow(
 
     A line each second on standard error shows how it goes. Ctrl-C lands. Exit code 1 if the target was lost for good.
     """
-    from skyloop.cli.naming import connect_pilot
+    from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
     from skyloop.control import ChaseSettings, FollowMode, FollowTarget
 

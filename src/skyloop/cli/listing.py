@@ -7,19 +7,20 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Unpack
 
 import msgspec
 import typer
 
 from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, drone_names, join_network, one_drone
 from skyloop.cli.text import columns
-from skyloop.errors import SkyloopError, UnknownNameError, UsageError
+from skyloop.errors import AuthorityError, SkyloopError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from skyloop.client import Drone
+    from skyloop.client.connect import ConnectOptions
     from skyloop.messages import Feedback, VehicleOverview
     from skyloop.network import FabricSettings
     from skyloop.proxy.records import Tenure
@@ -295,3 +296,18 @@ def _files(name: str | None, file: Path | None) -> list[Path]:
             raise UsageError(f"there is no audit trail in {folder}: no named proxy of this user has run yet")
         raise UnknownNameError("proxy with an audit trail", name, known)
     return [audit_path(name)]
+
+
+def connect_pilot(target: str, advice: str, **options: Unpack[ConnectOptions]) -> Drone:
+    """Connect as :func:`skyloop.connect` does; where another client flies, the error names it and says what to do."""
+    from skyloop.client import connect
+
+    try:
+        return connect(target, **options)
+    except AuthorityError as error:
+        if error.code != "busy":
+            raise
+        from skyloop.cli.listing import describe
+
+        holder = describe(target).owner or "another application"
+        raise AuthorityError(f"{holder} holds the authority over {target}: {advice}", code=error.code) from error

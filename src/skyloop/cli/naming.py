@@ -9,13 +9,11 @@ import os
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Final, Unpack
+from typing import Annotated, Any, Final
 
 import typer
 
-from skyloop.client import Drone, connect
-from skyloop.client.connect import ConnectOptions
-from skyloop.errors import AuthorityError, UsageError
+from skyloop.errors import UsageError
 
 ANSWER_WITHIN_S: Final = 2.0
 MULTICAST: Final = "multicast"
@@ -186,16 +184,3 @@ def with_place(arguments: Sequence[str]) -> list[str]:
         if word == "--network" and (following.startswith("-") or "://" in following):
             words.append(MULTICAST)
     return words
-
-
-def connect_pilot(target: str, advice: str, **options: Unpack[ConnectOptions]) -> Drone:
-    """Connect as :func:`skyloop.connect` does; where another client flies, the error names it and says what to do."""
-    try:
-        return connect(target, **options)
-    except AuthorityError as error:
-        if error.code != "busy":
-            raise
-        from skyloop.cli.listing import describe
-
-        holder = describe(target).owner or "another application"
-        raise AuthorityError(f"{holder} holds the authority over {target}: {advice}", code=error.code) from error

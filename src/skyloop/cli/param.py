@@ -82,7 +82,7 @@ def _read(name: str, key: str | None) -> list[Parameter]:
 
 
 def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
-    from skyloop.cli.naming import connect_pilot
+    from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
 
     authority = Authority(priority=priority)

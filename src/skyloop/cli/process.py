@@ -234,7 +234,7 @@ def detect(
     """
     from skyloop.processing import Settings
     from skyloop.vision import OnnxDetector
-    from skyloop.vision.onnx_detector import SIMULATED_WEIGHTS
+    from skyloop.vision.simulated import SIMULATED_WEIGHTS
 
     join_network(network, keys)
     drone = one_drone(on, None)

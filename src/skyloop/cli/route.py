@@ -62,7 +62,7 @@ def fly(
     """Check a route, take off, fly it, land. Ctrl-C lands. In a terminal P pauses, R resumes, S skips."""
     from skyloop.cli.fly import ADVICE, interrupt_by_signals
     from skyloop.cli.fly import land as put_down
-    from skyloop.cli.naming import connect_pilot
+    from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
     from skyloop.control import FlyRoute, load_route
 

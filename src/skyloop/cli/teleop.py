@@ -47,7 +47,7 @@ def teleop(
 
     The keys are those of the cockpit: W A S D, arrows, T take off, L land, Esc Esc motors off, Q end.
     """
-    from skyloop.cli.naming import connect_pilot
+    from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
 
     join_network(network, keys)

@@ -5,7 +5,7 @@ from skyloop.control.behaviour import Behaviour
 from skyloop.control.chase_law import FollowMode
 from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.controller import Controller, RunSummary
-from skyloop.control.follow_law import FollowMarker
+from skyloop.control.follow import FollowMarker
 from skyloop.control.follow_target import FollowTarget
 from skyloop.control.gates import FIVE_GATES, RACE_GATES, RACE_TRACK, Course, FlyThroughGates, GateKind, course_in
 from skyloop.control.image_servo import FlowHover, ImageServo

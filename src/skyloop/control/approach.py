@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from skyloop.clock import seconds
 from skyloop.control.behaviour import Behaviour
-from skyloop.control.follow_law import FollowMarker, FollowSettings, Mode
+from skyloop.control.follow import FollowMarker, FollowSettings, Mode
 from skyloop.control.landing_law import LandingLaw, LandingPhase
 from skyloop.control.landing_settings import LandingSettings
 from skyloop.control.limiting import clamped

@@ -11,8 +11,9 @@ from skyloop.vision.gates import BlobDetector, BlobSighting, GateDetector, GateS
 from skyloop.vision.lens import project, undistort, unproject
 from skyloop.vision.markers import MarkerDetector, MarkerSighting
 from skyloop.vision.object_tracks import Detection, ObjectDetector, ObjectTracks, TrackedObject
-from skyloop.vision.onnx_detector import OnnxDetector, simulated_detector
+from skyloop.vision.onnx_detector import OnnxDetector
 from skyloop.vision.planar import PlanarSighting
+from skyloop.vision.simulated import simulated_detector
 from skyloop.vision.trackers import CorrelationTracker, LearnedTracker, MedianFlowTracker
 from skyloop.vision.tracking import Tracker, TrackResult
 

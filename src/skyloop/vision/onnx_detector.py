@@ -1,4 +1,4 @@
-"""Detectors of the YOLO and DETR families from an ONNX file, the user's or Skyloop's own, run by ONNX Runtime."""
+"""Detectors of the YOLO and DETR families from an ONNX file of the user's, run by ONNX Runtime on the processor."""
 
 from __future__ import annotations
 
@@ -37,8 +37,6 @@ _SIDE: Final = 640  # of a network that takes any size and names none
 _MOST_SIDE: Final = 4096
 _MOST: Final = 1000  # surest boxes that are compared with one another
 _TYPES: Final = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
-#: Its network: 320×256 pixels, classes ``person``, ``car`` and ``box``. ``scripts/train_detector.py`` made it.
-SIMULATED_WEIGHTS: Final = Path(__file__).with_name("weights") / "figures.onnx"
 
 
 class OnnxDetector:
@@ -271,20 +269,3 @@ def _check_size(size: Any) -> None:
 
 def _shape(shape: Sequence[Any]) -> str:
     return "×".join(str(each) for each in shape)
-
-
-def simulated_detector(*, score: float = 0.4, iou: float = 0.5, threads: int = 1) -> OnnxDetector:
-    """Return a detector of the simulator's figures: ``person``, ``car``, and ``box`` for a crate.
-
-    It was trained with drawn pictures alone and is of no use on a real drone's.
-
-    Args:
-        score: Detections that are less sure are dropped, 0 to 1.
-        iou: Boxes of one class that overlap more are one detection, 0 to 1.
-        threads: Of the processor for one image.
-
-    Raises:
-        MissingExtraError: ONNX Runtime or OpenCV is not installed.
-        UsageError: An argument is out of its range.
-    """
-    return OnnxDetector(SIMULATED_WEIGHTS, score=score, iou=iou, threads=threads)
