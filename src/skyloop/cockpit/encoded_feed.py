@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import os
 import struct
+import sys
 import threading
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
@@ -33,9 +34,16 @@ JPEG_QUALITY = 80
 _LENGTH: Final = struct.Struct(">I")
 _encode = msgspec.json.Encoder().encode
 NICENESS: Final = 10  #: of the thread that encodes
+
+
+def _give_way() -> None:
+    if sys.platform == "linux":  # elsewhere it is the whole process that has a priority
+        os.nice(NICENESS)
+
+
 #: One thread for all cameras: encoding for many pages must not take the cores that fly. The event loop keeps the
 #: priority it was started with: a person's sticks and stop pass through it, and must not starve beside a browser.
-_ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=os.nice, initargs=(NICENESS,))
+_ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
 KEPT: Final = 16  #: newest pictures of a form; who is further behind goes on with a key picture
 SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: of pictures in panes, so that like panes share a form
 RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: [kbit/s], for the same reason
