@@ -21,7 +21,7 @@ keys = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 _EXAMPLE: Final = "Example: skyloop keys "
 Directory = Annotated[
     Path | None,
-    typer.Option("--dir", metavar="DIR", help="The lab's folder", show_default="~/.config/skyloop/network/keys"),
+    typer.Option("--dir", metavar="DIR", help="The lab's folder", show_default="~/.config/skyloop/keys"),
 ]
 
 
