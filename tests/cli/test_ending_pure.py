@@ -93,7 +93,7 @@ def test_who_lands_it_at_the_same_priority_already_lands_it_for_both(
     def busy(*_: object, **__: object) -> None:
         raise AuthorityError("skyloop land holds the authority over alpha", code="busy")
 
-    monkeypatch.setattr("skyloop.cli.naming.connect_pilot", busy)
+    monkeypatch.setattr("skyloop.cli.listing.connect_pilot", busy)
     monkeypatch.setattr(
         "skyloop.client.connect",
         lambda _, **options: open_drone(proxy.server.dial, app=options["name"], access="observe", policy=QUICK),
@@ -127,7 +127,7 @@ def test_no_return_begins_after_ctrl_c(proxy: ScriptedProxy, monkeypatch: pytest
     def connect(_name: str, _advice: str, **_: object) -> Drone:
         return open_drone(proxy.server.dial, app="me", on_exit="hover", policy=QUICK)
 
-    monkeypatch.setattr("skyloop.cli.naming.connect_pilot", connect)
+    monkeypatch.setattr("skyloop.cli.listing.connect_pilot", connect)
     monkeypatch.setattr(ending, "_over_already", lambda *_: "")
     flown: list[Drone] = []
     interrupted = threading.Event()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from skyloop.control.route import Route, RouteWaypoint
 from skyloop.control.route_law import RouteState
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import NoAnswerError, RefusedError, SwarmError
-from skyloop.messages import EventKind, Feedback
+from skyloop.messages import EventKind, Fate, Feedback
 from skyloop.proxy.core.flight import Whose
 from skyloop.proxy.core.settings import FailsafeSettings
 from skyloop.proxy.proxy import Proxy
@@ -209,8 +210,11 @@ def test_sticks_that_a_pilot_moves_during_a_take_off_keep_the_vehicle_and_its_ow
             holds = threading.Thread(target=_hold_sticks, args=(scene, let_go))
             holds.start()
             try:
-                with pytest.raises(RefusedError, match="POSCTL, which was not chosen here"):
+                with suppress(RefusedError):  # it may be seen flying a moment before it is known who flies it
                     drone.takeoff(timeout_s=WAIT_S)
+                told = drone.wait(lambda f: f.outcome is not None and f.outcome.fate is Fate.OTHERS, timeout_s=WAIT_S)
+                assert told.outcome is not None
+                assert "POSCTL, which was not chosen here" in told.outcome.text
                 at = len(scene.ours)
                 scene.watched(proxy)
                 assert scene.mode == "POSCTL"

@@ -351,7 +351,9 @@ class Px4(Autopilot):
         since_s = self.time_s - self._stick_s
         if not self.remote:
             self._stick_moves = (0.0, 0.0, 0.0, 0.0)
-        elif since_s > 0.0:
+        elif since_s == 0.0:  # two in one step: how far it moves shows by the next one
+            return
+        else:
             share = since_s / (since_s + STICK_FILTER_S)
             axes = zip(self._stick_moves, self._stick, stick, strict=True)
             a, b, c, d = (was + share * ((now - then) / since_s - was) for was, then, now in axes)
