@@ -406,7 +406,7 @@ class VideoChannels:
 
     def connected(self, cameras: Iterable[CameraInfo], now_ns: int) -> None:
         """Take in the cameras of a proxy that was connected, which may count its frames from 0."""
-        for channel in self.variants.values():
+        for channel in tuple(self.variants.values()):
             channel.restart(now_ns)
         # The proxy may have been started again, with other cameras, of which another one is the first.
         self.channels = {one.name: self.channels.get(one.name) or self.made(one) for one in cameras}

@@ -258,7 +258,7 @@ def drift_event(drifts: bool) -> EventDraft:
     """The software autopilot does not know the vehicle's velocity, or knows it again."""
     if not drifts:
         text = "the vehicle's velocity is known again: it is held against its drift"
-        return EventDraft(EventKind.VEHICLE_MESSAGE, text, data={"reason": "drift", "active": False})
+        return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.INFO, data={"reason": "drift", "active": False})
     text = "the vehicle's velocity is not known: it is held level, which does not brake it, and drifts with the wind"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "drift", "active": True})
 

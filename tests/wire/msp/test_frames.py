@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from skyloop.vehicles.msp.wire.frames import MOST, Direction, Frame, Parser, crc8, encode, xor
+from skyloop.vehicles.msp.wire.frames import LONG, MOST, Direction, Frame, Parser, crc8, encode, whole_frames, xor
 
 directions = st.sampled_from(Direction)
 frames = st.one_of(
@@ -88,3 +88,10 @@ def test_reset_forgets_the_beginning_of_a_frame() -> None:
 def test_what_can_not_be_said(frame: Frame, version: int | None) -> None:
     with pytest.raises(ValueError, match="function"):
         encode(frame, version=version)
+
+
+@given(st.lists(st.tuples(frames, st.booleans()), max_size=5))
+@example([(Frame(105, bytes(300)), False), (Frame(105), False)])
+def test_what_was_encoded_in_a_row_is_found_frame_by_frame(row: list[tuple[Frame, bool]]) -> None:
+    made = [encode(frame, version=2 if newer or frame.function >= LONG else 1) for frame, newer in row]
+    assert list(whole_frames(b"".join(made))) == made

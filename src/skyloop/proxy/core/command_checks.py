@@ -1,7 +1,7 @@
 """What an application asked for, from its beginning to its one end, and the checks that each command passes. Pure.
 
 The library repeats each command many times a second. A repeat asks the intent: it is judged again while the intent is
-under way, and never acts once it is over. :data:`skyloop.messages.intent.ENDINGS` lists all that ends one.
+under way, and never acts once it is over. :data:`skyloop.messages.command.ENDINGS` lists all that ends one.
 
 The checks come in this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, decide
 whether it is a sign of life of the holder), then whether its intent is under way, the vehicle's link, support, whose

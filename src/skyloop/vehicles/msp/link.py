@@ -13,6 +13,7 @@ from skyloop.drivers.byte_stream import END_S, ByteStream, Rank, SerialStream, T
 from skyloop.drivers.vehicle_link import ConnectionLink
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.vehicles.msp.protocol import MspSession
+from skyloop.vehicles.msp.wire.frames import whole_frames
 
 EXTRA: Final = "msp"
 
@@ -68,7 +69,8 @@ class MspLink(ConnectionLink[MspSession, ByteStream]):
         if self._connection is None or self._broken or not data:
             return
         try:
-            self._connection.write(data, Rank.STOP if self.session.urgent else Rank.SETPOINT)
+            for frame in whole_frames(data):  # what a full port cuts is one frame, and none behind it is sent late
+                self._connection.write(frame, Rank.STOP if self.session.urgent else Rank.SETPOINT)
         except OSError as error:
             self._on_broken(error, now_ns)
 

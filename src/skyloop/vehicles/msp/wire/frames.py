@@ -7,6 +7,7 @@ payload CRC-8/DVB-S2 (INAV's wiki, "MSP V2").
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -96,6 +97,17 @@ def encode(frame: Frame, *, version: int | None = None) -> bytes:
     if len(payload) >= LONG:
         size += struct.pack("<H", len(payload))
     return b"$M" + bytes((frame.direction.value,)) + size + payload + bytes((xor(size + payload),))
+
+
+def whole_frames(data: bytes) -> Iterator[bytes]:
+    """Yield the frames of which ``data`` consists, as :func:`encode` made them."""
+    while data:
+        if data[1:2] == b"X":
+            size = 9 + int.from_bytes(data[6:8], "little")
+        else:
+            size = 6 + data[3] if data[3] < LONG else 8 + int.from_bytes(data[5:7], "little")
+        yield data[:size]
+        data = data[size:]
 
 
 class Parser:
