@@ -128,7 +128,7 @@ def test_no_dependency_reports(tmp_path: Path) -> None:
     """Each was imported, and a network loaded, in a home directory of its own: nothing but ours is in it."""
     code = (
         "import skyloop, os; from skyloop.cli.doctor import _extras; list(_extras());"
-        "from skyloop.vision import OnnxDetector; from skyloop.vision.onnx_detector import SIMULATED_WEIGHTS;"
+        "from skyloop.vision import OnnxDetector; from skyloop.vision.simulated import SIMULATED_WEIGHTS;"
         "OnnxDetector(SIMULATED_WEIGHTS); print(os.environ['RAY_USAGE_STATS_ENABLED'])"
     )
     home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": "", "XDG_CONFIG_HOME": "", "MPLCONFIGDIR": str(tmp_path / "mpl")}

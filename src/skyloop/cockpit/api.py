@@ -17,7 +17,15 @@ from skyloop.cockpit.access import SESSION_S, Gate, TokenGate
 from skyloop.cockpit.security import gone_within, person_of
 from skyloop.cockpit.telemetry import encode_json, number
 from skyloop.control.route import check_for, parse_route
-from skyloop.errors import MissingExtraError, RefusedError, SkyloopError, UnknownNameError, UnsupportedError, UsageError
+from skyloop.errors import (
+    ClosedError,
+    MissingExtraError,
+    RefusedError,
+    SkyloopError,
+    UnknownNameError,
+    UnsupportedError,
+    UsageError,
+)
 from skyloop.messages import Parameter, Value
 
 if TYPE_CHECKING:
@@ -33,6 +41,7 @@ _JSON: Final = "application/json"
 
 _STATUS: Final = (
     (UnknownNameError, 404),
+    (ClosedError, 404),  # a replay that was ended meanwhile
     (UsageError, 400),
     (RefusedError, 409),
     (UnsupportedError, 409),
