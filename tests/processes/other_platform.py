@@ -59,7 +59,7 @@ def fly(name: str, place: str) -> None:
 
     for offered in dir(skyloop):
         getattr(skyloop, offered)
-    packages = ("client", "messages", "control", "vision", "recording", "cockpit", "keys", "aio", "drivers")
+    packages = ("client", "messages", "control", "vision", "recording", "cockpit", "network.keys", "aio", "drivers")
     for package in packages:
         module = importlib.import_module(f"skyloop.{package}")
         for one in pkgutil.iter_modules(module.__path__):

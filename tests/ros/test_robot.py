@@ -278,6 +278,19 @@ def test_a_service_that_never_answers_is_waited_for_no_longer() -> None:
     assert rig.tell() is FlightState.LANDED
 
 
+def test_no_take_off_waits_for_a_robot_that_is_not_heard() -> None:
+    """ROS delivers a call of a service when the robot runs again: it took off then, by itself."""
+    rig = Rig()
+    rig.tell()
+    rig.clock.advance(rig.session._options.timeout_s + 0.1)
+    with pytest.raises(DriverError, match="no data from the robot"):
+        rig.session.command(Takeoff())
+    assert rig.robot.called == []
+    rig.tell()
+    rig.session.command(Takeoff())
+    assert rig.robot.called == ["/robot/takeoff"]
+
+
 def test_a_take_off_without_an_answer_is_not_called_again_by_its_repeats() -> None:
     rig = Rig()
     rig.tell()

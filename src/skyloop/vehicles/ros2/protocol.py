@@ -172,7 +172,8 @@ class RobotSession:
             new: Whether somebody newly asked for it; a repeated take-off or landing calls no service once more.
 
         Raises:
-            DriverError: The robot does not offer the service, or it is a repeat of a take-off that the robot refused.
+            DriverError: The robot does not offer the service, is not heard and is to take off, or it is a repeat of a
+                take-off that the robot refused.
         """
         with self._lock:
             if isinstance(action, Velocity):
@@ -193,8 +194,7 @@ class RobotSession:
         """Repeat the velocity in force, and watch the link: to be called every :data:`PERIOD_S`."""
         now_ns = self._clock()
         blind = self._is_blind(now_ns)
-        since_ns = self._opened_ns if self._received_ns is None else self._received_ns
-        silent_s = seconds(now_ns - since_ns)
+        silent_s = self._silent_s(now_ns)
         lost = silent_s > self._options.timeout_s
         with self._lock:
             if blind:
@@ -222,6 +222,9 @@ class RobotSession:
 
     # Inside ----------------------------------------------------------------------------------------------------------
 
+    def _silent_s(self, now_ns: int) -> float:
+        return seconds(now_ns - (self._opened_ns if self._received_ns is None else self._received_ns))
+
     @property
     def _state(self) -> FlightState:
         if self._pending is not None:
@@ -246,6 +249,8 @@ class RobotSession:
             if self._refused:
                 raise DriverError(self._refused)
             return
+        if up and self._silent_s(self._clock()) > self._options.timeout_s:
+            raise DriverError("no data from the robot: a take-off would begin when it is back")
         under_way = self._pending is not None and self._pending.state is state
         there = (self._state is FlightState.LANDED) is not up and self._state is not FlightState.UNKNOWN
         if self._up:
