@@ -72,12 +72,12 @@ check: $(VENV)/.installed-dev
 
 # Three minutes by default; an hour by hand: make chaos ARGS="--seconds 3600".
 chaos: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.chaos $(ARGS)
+	$(BIN)/python -m tests.promises.chaos $(ARGS)
 
 # A minute for each target by default.
 fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'atheris>=3'
-	$(BIN)/python -m tests.fuzz $(ARGS)
+	$(BIN)/python -m tests.promises.fuzz $(ARGS)
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff format .

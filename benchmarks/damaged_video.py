@@ -1,6 +1,6 @@
 """``python -m benchmarks.damaged_video``: what is shown of video that loses datagrams, and how much of that is right.
 
-The film of a real AR.Drone 2 (``ardrone2/video-8s.pave`` of the recordings, see ``tests/recordings.py``) is sent
+The film of a real AR.Drone 2 (``ardrone2/video-8s.pave`` of the recordings, ``tests/support/recordings.py``) is sent
 three ways: as it is, in pieces of the stream that its drone sends; encoded anew as the emulated Tello does, at the
 bit rate that it would choose, in that drone's datagrams; and as it is once more, in pieces of an RTP packet's size,
 to the decoder of cameras on the network. Of each, a share of the pieces is lost, by a seed. FFmpeg's own decoder
@@ -33,7 +33,7 @@ from skyloop.vehicles.emulation.video import OneCamera
 from skyloop.vehicles.tello.emulator import TelloPacker, automatic_kbps
 from skyloop.vehicles.tello.video import TelloVideo
 from skyloop.vehicles.tello.wire import Assembly, pieces
-from tests.recordings import FIXTURES
+from tests.support.recordings import FIXTURES
 
 LOSSES: Final = (0.01, 0.05, 0.10)
 RIGHT_DB: Final = 40.0

@@ -11,12 +11,12 @@ rm "$copy/src/skyloop/"{bench,ray}.py
 cp -r src/skyloop/{messages,transport,proxy,client,aio,drivers} "$copy/src/skyloop"
 cp pyproject.toml README.md LICENSE "$copy"
 cp tests/{__init__,conftest}.py "$copy/tests"
-cp -r tests/{messages,transport,proxy,client,data} "$copy/tests"
+cp -r tests/{messages,transport,proxy,client,support,data} "$copy/tests"
 cp -r docs "$copy"
 cp scripts/aio_stub.py "$copy/scripts"
 # Tests of what plugs into the core, and those that need SciPy, PyAV or what stands beside the package.
-rm "$copy"/tests/transport/test_{fabric*,overload}.py "$copy"/tests/messages/test_{geometry,wire_format_fabric}.py
-rm "$copy"/tests/client/test_{connect,end_of_flight,preflight,worker}.py
+rm "$copy"/tests/{transport/test_overload,messages/test_geometry}.py
+rm "$copy"/tests/client/test_{connect,end_of_flight,preflight}.py
 rm "$copy"/tests/proxy/test_{safety,h264_encoder,stream_rate}.py
 if ! [[ -e $copy/venv/installed && $copy/venv/installed -nt pyproject.toml ]]; then
   "${PYTHON:-python3}" -m venv "$copy/venv"

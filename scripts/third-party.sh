@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs, into .third-party/, programs that we did not write and that fly the emulated drones in tests/third_party, and
+# Installs, into .third-party/, programs that we did not write and that fly the emulated drones in tests/integration/third_party, and
 # what is too large for everybody's environment: Ray, ROS 2, and Betaflight, which flies simulated drones (GPL, a program
 # of its own, compiled here with gcc and make). Nothing of Skyloop needs them;
 # without them those tests are skipped. Needs a Python with venv, and node with npm.

@@ -39,7 +39,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 FLIGHTS = {"test_bench.py", "benchmarks", "docs", "examples", "processes", "test_demo.py", "third_party"}
 
 # Folders of which `make test` leaves everything out: promises kept for minutes, under faults, or between several hosts.
-SLOW = {"benchmarks", "faults", "fuzz", "hardware", "network", "security", "third_party"}
+SLOW = {"benchmarks", "faults", "fuzz", "hardware", "hosts", "security", "third_party"}
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -94,7 +94,7 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def trusted_networks() -> Iterator[None]:
-    """Load the tests' own ONNX files without a child process that tries each first; tests/security tries them."""
+    """Load the tests' own ONNX files without a child process that tries each first; tests/promises tries them."""
     with pytest.MonkeyPatch.context() as patch:
         if find_spec("onnxruntime"):
             patch.setattr("skyloop.vision.onnx.try_alone", lambda *files, tracker="": None)

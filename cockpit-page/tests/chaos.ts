@@ -1,4 +1,4 @@
-// Flies a drone with the page's own logic, a gamepad and no browser, for tests/chaos: node chaos.mjs ADDRESS DRONE JOURNAL.
+// Flies a drone with the page's own logic, a gamepad and no browser, for tests/promises/chaos: node chaos.mjs ADDRESS DRONE JOURNAL.
 //
 // Lines on standard input say what hands do: centre, push, swap (another gamepad is there, its sticks deflected), back;
 // takeoff, stop, reset. Each set-point is a number of its own, as a yaw rate, and is journalled when it is sent.

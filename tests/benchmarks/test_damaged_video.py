@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.recordings import needs_recordings
+from tests.support.recordings import needs_recordings
 
 pytest.importorskip("av")
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.swarm_flight import SwarmFlight, fly, missed, report
 from skyloop.client.monitoring import Distribution
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 DRONES = 10
 

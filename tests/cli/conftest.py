@@ -13,7 +13,7 @@ from typing import NamedTuple
 import pytest
 
 from skyloop.cli import main
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 FAST_SIM = "sim://?world=empty&cameras=none&speed=6&wind=0"
 

@@ -11,7 +11,7 @@ import pytest
 
 import skyloop
 from tests.cli.conftest import FAST_SIM, Run
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 Start = Callable[..., Process]
 

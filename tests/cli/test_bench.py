@@ -22,7 +22,7 @@ from skyloop.cli.bench import What, drawing_table, parse_sizes, physics_table
 from skyloop.errors import LinkError, UsageError
 from skyloop.sim import STEP_S
 
-PAGE = Path(__file__).parents[1] / "docs" / "delays.md"
+PAGE = Path(__file__).parents[2] / "docs" / "delays.md"
 SHORT_S = 0.5
 
 

@@ -12,7 +12,7 @@ from skyloop.cli.process import DetectionProcessor
 from skyloop.messages import Annotation, Polyline, Text
 from skyloop.vision import Detection
 from tests.cli.conftest import Run
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 from tests.vision.networks import write
 
 pytestmark = pytest.mark.process

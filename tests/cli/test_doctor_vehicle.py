@@ -10,7 +10,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.vehicles.msp.emulator import BetaflightFirmware
 from tests.cli.conftest import Run
-from tests.drivers.msp.rig import world
+from tests.vehicles.msp.rig import world
 
 
 @pytest.mark.parametrize(

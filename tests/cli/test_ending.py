@@ -10,7 +10,7 @@ import pytest
 
 import skyloop
 from tests.cli.conftest import FAST_SIM, Run
-from tests.processes.conftest import Process, eventually
+from tests.integration.processes.conftest import Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.daily]
 

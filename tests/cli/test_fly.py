@@ -15,8 +15,8 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from tests.cli.conftest import Run
 from tests.client.scripted import flown, scripted
-from tests.processes.conftest import Process
-from tests.recordings import recorded
+from tests.integration.processes.conftest import Process
+from tests.support.recordings import recorded
 
 GOOD = """
 import skyloop
@@ -38,7 +38,7 @@ class Raising(skyloop.Controller):
 """
 LOOKING = """
 import skyloop
-from tests.recordings import recorded
+from tests.support.recordings import recorded
 
 class Looking(skyloop.Controller):
     frames = 0

@@ -17,7 +17,7 @@ from skyloop.cli.fly_follow import SIDES
 from skyloop.clock import nanoseconds
 from skyloop.messages import Feedback
 from tests.cli.conftest import Run
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_a_processor_that_runs_finds_whom_it_follows(start: Callable[..., Proces
 
 @pytest.mark.process
 def test_a_class_on_a_vehicle_that_is_not_simulated_needs_a_detector(run: Run) -> None:
-    from tests.recordings import recorded
+    from tests.support.recordings import recorded
 
     ended = run("fly", "follow", f"video://{recorded('ardrone2/video-8s.pave')}", "--class", "person")
     assert ended.code == 2

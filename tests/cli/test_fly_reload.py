@@ -15,7 +15,7 @@ from skyloop.control import Controller
 from skyloop.messages import Applied, Feedback, FlightState, Hover, Velocity
 from tests.cli.conftest import Run
 from tests.client.scripted import WAIT_S, background, flown, scripted
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 MINE = """
 import skyloop

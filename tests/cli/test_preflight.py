@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 
 from tests.cli.conftest import Run
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 
 def test_the_checklist_for_people_and_programs(run: Run, start: Callable[..., Process]) -> None:

@@ -12,7 +12,7 @@ import pytest
 import skyloop
 from skyloop.processing import Status
 from tests.cli.conftest import Run
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 pytestmark = pytest.mark.process
 

@@ -22,7 +22,7 @@ from skyloop.cli.text import console as skyloop_console
 from skyloop.cli.text import named
 from skyloop.vehicles.video.devices import CameraDevice, cameras, described
 from tests.cli.conftest import FAST_SIM, Run
-from tests.processes.conftest import Process, in_terminal
+from tests.integration.processes.conftest import Process, in_terminal
 
 ROOT = Path(__file__).parents[2]
 HOVER = """

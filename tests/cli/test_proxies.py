@@ -21,7 +21,7 @@ from skyloop.cli.text import columns
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from tests.cli.conftest import FAST_SIM, Run
-from tests.processes.conftest import Process, eventually, in_terminal
+from tests.integration.processes.conftest import Process, eventually, in_terminal
 
 pytestmark = pytest.mark.process
 

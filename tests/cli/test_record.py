@@ -12,7 +12,7 @@ import pytest
 from skyloop.cli import record as module
 from skyloop.recording.options import RecorderState, Status
 from tests.cli.conftest import Run
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 from tests.recording import files
 
 pytestmark = pytest.mark.process

@@ -11,7 +11,7 @@ import pytest
 
 from skyloop.control import Photo, Route, RouteWaypoint, save_route
 from tests.cli.conftest import FAST_SIM, Run
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 TOUR = Route(
     waypoints=(RouteWaypoint(1, 0, 1), RouteWaypoint(1, 1, 1.3, actions=(Photo(),)), RouteWaypoint(0, 0, 1)),

@@ -14,8 +14,8 @@ from skyloop.cli.sim import address_from, ports_from
 from skyloop.errors import UsageError
 from skyloop.vehicles.ardrone.emulator import Ports
 from tests.cli.conftest import Run
-from tests.emulators.pilot import HERE, Pilot
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
+from tests.vehicles.ardrone.emulator.pilot import HERE, Pilot
 
 pytest.importorskip("av")
 

@@ -35,7 +35,7 @@ from skyloop.cli.teleop import Teleop
 from skyloop.messages import EmergencyStop, Fate, FlightState, Hover, Land, Outcome, Refusal, Takeoff, Velocity
 from tests.cli.conftest import Run
 from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 FLYING, LANDED, LANDING = FlightState.FLYING, FlightState.LANDED, FlightState.LANDING
 FORWARD = Deflection(forward=1)

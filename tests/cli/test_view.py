@@ -12,7 +12,7 @@ import pytest
 import skyloop
 from skyloop.recording.foxglove_access import ParameterDesk
 from tests.cli.conftest import Run
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 from tests.recording.live import fake_rerun
 
 pytestmark = pytest.mark.process

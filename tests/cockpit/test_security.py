@@ -165,7 +165,7 @@ def test_whatever_changes_something_needs_a_pilot(rest: str, method: str) -> Non
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wrong token is answered at once: these tests tell many. ``tests/security`` has how long it takes else."""
+    """A wrong token is answered at once: these tests tell many. How long it takes else: ``tests/promises/security``."""
     monkeypatch.setattr("skyloop.cockpit.access.LONGEST_S", 0.0)
 
 

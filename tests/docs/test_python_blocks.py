@@ -13,7 +13,7 @@ import skyloop
 from skyloop.control.controller import Controller, RunSummary
 from skyloop.messages import Feedback
 from tests.docs.pages import Block, blocks
-from tests.recordings import recorded
+from tests.support.recordings import recorded
 
 LONGEST_RUN_S = 10.0  # of a controller, whatever the example says
 BLOCKS = blocks("python")

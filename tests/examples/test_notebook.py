@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.processes.conftest import sockets
+from tests.integration.processes.conftest import sockets
 
 __all__ = ["sockets"]  # a fixture
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from tests.recordings import recorded
+from tests.support.recordings import recorded
 
 SERVER_INFO, MODEL_DEFINITIONS, FRAME = 1, 5, 7  # what the server sends
 CONNECT, REQUEST_MODELS = 0, 4  # what a client asks

@@ -17,7 +17,7 @@ from skyloop.errors import ClosedError, UnknownNameError, UnsupportedError, Usag
 from skyloop.messages import LogEntry
 from skyloop.motion_capture import BodyPose, TrackState
 from skyloop.transport.testing import wait_until
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 from tests.recording import files
 
 pytestmark = pytest.mark.process

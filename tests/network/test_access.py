@@ -1,6 +1,6 @@
 """Zenoh's access control as it is made from a roster: who may say and hear what, by Zenoh's own key expressions.
 
-What Zenoh makes of it is tried in tests/security.
+What Zenoh makes of it is tried in tests/promises/security.
 """
 
 from __future__ import annotations

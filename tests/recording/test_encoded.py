@@ -39,7 +39,7 @@ from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from tests.integration.fake_vehicle import FakeVehicle
 from tests.recording import files
-from tests.recordings import recorded
+from tests.support.recordings import recorded
 
 WAIT_S = 20.0
 IMAGE, VIDEO, FRAMES = (f"/alpha/{name}" for name in ("camera/front/image", "camera/front/video", "frames/front"))

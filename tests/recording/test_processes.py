@@ -21,7 +21,7 @@ from skyloop.recording.layout import META_END, ClockPair, End, FrameRecord
 from skyloop.recording.options import RecorderState
 from skyloop.recording.recorder import RecorderProcess
 from skyloop.transport.priority import SUPERSEDED
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 from tests.recording import files
 
 pytestmark = pytest.mark.process

@@ -1,10 +1,5 @@
 """An rclpy that keeps what is published."""
 
-import pytest
+from tests.support.fake_rclpy import rclpy
 
-from tests.ros.fake_rclpy import Fake, install
-
-
-@pytest.fixture
-def rclpy(monkeypatch: pytest.MonkeyPatch) -> Fake:
-    return install(monkeypatch)
+__all__ = ["rclpy"]

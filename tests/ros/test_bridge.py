@@ -1,4 +1,4 @@
-"""The bridge between a proxy in this process and an rclpy that keeps what is published (tests/ros/fake_rclpy.py)."""
+"""The bridge between a proxy in this process and an rclpy that keeps what is published (``fake_rclpy.py``)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from skyloop.vehicles.ros2.node import (
     stay_on_this_machine,
 )
 from tests.integration.fake_vehicle import FakeVehicle
-from tests.ros.fake_rclpy import Fake, Message, Node
+from tests.support.fake_rclpy import Fake, Message, Node
 
 WAIT_S = 10.0
 

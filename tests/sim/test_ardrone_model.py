@@ -30,8 +30,8 @@ from skyloop.sim.parameters import GRAVITY_M_S2, with_ideal_sensors
 from skyloop.sim.streams import Floats
 from skyloop.sim.vehicles import AR_DRONE
 from tests.docs.pages import rows, section
-from tests.recordings import recorded
 from tests.sim.helpers import HALL, IDEAL, flying, steps
+from tests.support.recordings import recorded
 
 JUDGED = ("0.5sImpulseHalfMagNH1", "0.5sImpulseNH6", "1sImpulseNH1")
 FITTED = ("0.4sImpulseNoHover", "0.5sImpulseNH5", "1sImpulseHalfMagNH2", "1sImpulseNH3", "8sStepHalfMagNH1")

@@ -198,7 +198,8 @@ def _parameter(name: str, value: Any = None) -> Any:
     return SimpleNamespace(name=name, value=value)
 
 
-def install(monkeypatch: pytest.MonkeyPatch) -> Fake:
+@pytest.fixture
+def rclpy(monkeypatch: pytest.MonkeyPatch) -> Fake:
     """Install the fake, and return what it makes."""
     fake = Fake()
 

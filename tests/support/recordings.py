@@ -9,7 +9,7 @@ from typing import Final
 
 import pytest
 
-FIXTURES: Final = Path(os.environ.get("SKYLOOP_FIXTURES") or Path(__file__).parents[2] / "shared" / "fixtures")
+FIXTURES: Final = Path(os.environ.get("SKYLOOP_FIXTURES") or Path(__file__).parents[3] / "shared" / "fixtures")
 WHY: Final = f"needs data recorded from real vehicles, and {FIXTURES} is not there: set SKYLOOP_FIXTURES to its folder"
 #: Marks a test that needs recorded data which its module reads when it is imported.
 needs_recordings: Final = pytest.mark.skipif(not FIXTURES.is_dir(), reason=WHY)

@@ -18,7 +18,7 @@ from skyloop.errors import UsageError
 from skyloop.vision import CorrelationTracker, LongTermTracker, MedianFlowTracker, Tracker, TrackResult
 from skyloop.vision.appearance import colours
 from skyloop.vision.tracking import Box, Image, overlap
-from tests.recordings import recorded
+from tests.support.recordings import recorded
 
 EACH = pytest.mark.parametrize("make", [CorrelationTracker, MedianFlowTracker, LongTermTracker])
 Make = Callable[[], Tracker]

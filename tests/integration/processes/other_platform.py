@@ -1,4 +1,4 @@
-"""Runs the `skyloop` command as if this were another platform: ``python -m tests.processes.other_platform win32 list``.
+"""Runs the `skyloop` command as on another platform: ``python -m`` this module ``win32 list``.
 
 What Skyloop imports from others is imported first, then ``sys.platform`` is changed and the parts of Python are
 withheld that the other platform lacks. It shows what Skyloop itself needs, and nothing of the others' libraries there.

@@ -12,7 +12,7 @@ import pytest
 import skyloop
 from skyloop.errors import SkyloopError
 from skyloop.messages import EventKind
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 pytestmark = pytest.mark.process
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes.conftest import Process
-from tests.processes.test_mavlink import ADDRESS, KINDS
+from tests.integration.processes.conftest import Process
+from tests.integration.processes.test_mavlink import ADDRESS, KINDS
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
-HARDWARE = Path(__file__).parents[1] / "hardware"
+HARDWARE = Path(__file__).parents[2] / "hardware"
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,6 +1,6 @@
 """What works where there is no local transport: programs and the page reach drones of the network (docs/platforms.md).
 
-As on Windows, which lacks more than macOS does; see :mod:`tests.processes.other_platform` for what that shows.
+As on Windows, which lacks more than macOS does; ``other_platform.py`` says what that shows.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.network.config import free_port
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
 
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.process
@@ -24,7 +24,7 @@ TOKEN = "a-token-of-this-test-alone-0123456789"
 
 def test_programs_and_the_page_reach_drones_of_the_network(start: Callable[..., Process], tmp_path: Path) -> None:
     place = f"{LOCAL}:{free_port(LOCAL)}"
-    there = ("-m", "tests.processes.other_platform", "win32")
+    there = ("-m", "tests.integration.processes.other_platform", "win32")
     uri = "sim://?world=empty&cameras=front&speed=3"
     network = ("--network", "--no-multicast", "--listen", place)
     start("-m", "skyloop", "proxy", uri, "--name", "alpha", *network).until("ready")

@@ -23,7 +23,7 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from tests.processes.conftest import Process, eventually
+from tests.integration.processes.conftest import Process, eventually
 
 pytestmark = pytest.mark.process
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 
-from tests.third_party.conftest import HERE, INSTALLED, absent
-from tests.third_party.namespaces import Cable, cable
+from tests.integration.third_party.conftest import HERE, INSTALLED, absent
+from tests.integration.third_party.namespaces import Cable, cable
 
 VERSION = "2.5.0"
 DRONE, PILOT = "192.168.10.1", "192.168.10.2"

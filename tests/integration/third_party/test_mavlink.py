@@ -16,7 +16,7 @@ import pytest
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
-from tests.third_party.conftest import HERE, INSTALLED, PATIENCE_S, absent
+from tests.integration.third_party.conftest import HERE, INSTALLED, PATIENCE_S, absent
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.third_party.conftest import HERE, Emulated, node_modules
+from tests.integration.third_party.conftest import HERE, Emulated, node_modules
 
 VERSION = "0.3.3"
 OPTIONS_OF_FULL_NAVDATA = {"rawMeasures", "physMeasures", "pwm", "altitude", "magneto", "windSpeed", "wifi", "gps"}

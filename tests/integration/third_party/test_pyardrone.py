@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.third_party.conftest import HERE, INSTALLED, Emulated, absent
+from tests.integration.third_party.conftest import HERE, INSTALLED, Emulated, absent
 
 VERSION = "0.6.1"
 

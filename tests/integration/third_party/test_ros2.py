@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from skyloop.vehicles.ros2.node import LOOPBACK_PROFILE, OLD_PROFILES_VARIABLE, PROFILES_VARIABLE
-from tests.third_party.conftest import HERE, absent
+from tests.integration.third_party.conftest import HERE, absent
 
 SECONDS = 30.0
 IN_VIEW = 0.9

@@ -12,7 +12,7 @@ from skyloop.errors import LinkError
 from skyloop.network.keys import KeyRing, Lab, load
 from skyloop.network.keys.agreement import Agreement, Proof
 from skyloop.network.keys.identity import make_identity
-from tests.keys.conftest import NOW
+from tests.network.keys.conftest import NOW
 
 TERMS = ("alpha", "run", "jane", "id")
 

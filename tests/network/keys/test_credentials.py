@@ -17,7 +17,7 @@ from skyloop.errors import FileFormatError, UsageError
 from skyloop.network.keys import Lab, load
 from skyloop.network.keys.credentials import expiry_warning
 from skyloop.network.keys.identity import make_identity
-from tests.keys.conftest import NOW
+from tests.network.keys.conftest import NOW
 
 DAY = timedelta(days=1)
 

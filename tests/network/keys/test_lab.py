@@ -12,7 +12,7 @@ import pytest
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.network.keys import KeyRole, Lab, Roster, load
 from skyloop.network.keys.identity import make_identity
-from tests.keys.conftest import NOW
+from tests.network.keys.conftest import NOW
 
 DAY = timedelta(days=1)
 

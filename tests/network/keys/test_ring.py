@@ -10,7 +10,7 @@ import pytest
 
 from skyloop.network.keys import KeyRing, Lab, load
 from skyloop.network.keys.identity import make_identity
-from tests.keys.conftest import NOW
+from tests.network.keys.conftest import NOW
 
 DAY, HOUR = timedelta(days=1), timedelta(hours=1)
 

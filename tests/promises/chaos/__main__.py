@@ -1,4 +1,4 @@
-"""``python -m tests.chaos``: flies, makes trouble, and tells what became of the promises."""
+"""``python -m tests.promises.chaos``: flies, makes trouble, and tells what became of the promises."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from skyloop.network.config import free_port
-from tests.chaos.judge import Verdict
-from tests.chaos.lanes import LOCAL, NETWORK, Fault, Lane, disk_full, foreign_clock, torment
-from tests.chaos.mavlink_lanes import HANDS, MAVLINK, MavlinkLane, PageLane
-from tests.chaos.processes import Resources
+from tests.promises.chaos.judge import Verdict
+from tests.promises.chaos.lanes import LOCAL, NETWORK, Fault, Lane, disk_full, foreign_clock, torment
+from tests.promises.chaos.mavlink_lanes import HANDS, MAVLINK, MavlinkLane, PageLane
+from tests.promises.chaos.processes import Resources
 
-EPILOG = "Example: python -m tests.chaos --seconds 180 --seed 7; ends with 1 if a promise was broken, and says which."
+EPILOG = (
+    "Example: python -m tests.promises.chaos --seconds 180 --seed 7; ends with 1 if a promise broke."
+)
 CALM_S = 5.0  #: before the first fault and after the last
 DISK = "8m"
 #: The lane beside each that has no faults: what happens to it as well is the machine's doing.
@@ -39,7 +41,7 @@ MORE_DESCRIPTORS, MORE_THREADS, MORE_MB = 8, 3, 48.0
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Returns 0 if every promise was kept."""
-    parser = argparse.ArgumentParser(prog="python -m tests.chaos", description=__doc__, epilog=EPILOG)
+    parser = argparse.ArgumentParser(prog="python -m tests.promises.chaos", description=__doc__, epilog=EPILOG)
     parser.add_argument("--seconds", type=float, default=180.0, help="how long to make trouble [180]")
     parser.add_argument("--seed", type=int, default=1, help="of the order and length of the faults [1]")
     parser.add_argument("--lanes", nargs="+", choices=CONTROLS, default=list(CONTROLS), help="fly only these [all]")

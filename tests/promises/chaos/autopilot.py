@@ -1,4 +1,4 @@
-"""An emulated ArduCopter that journals what it does: ``python -m tests.chaos.autopilot NAME FOLDER PROXY``.
+"""An emulated ArduCopter that journals what it does: ``python -m tests.promises.chaos.autopilot NAME FOLDER PROXY``.
 
 It outlives its proxy. ``PROXY`` is the proxy's UDP port, or a path at which a serial port is made for it. Lines on
 standard input order what befalls the vehicle and its link (:meth:`JournalledAutopilot.order`).
@@ -21,9 +21,9 @@ from skyloop.sim.options import SimOptions
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from tests.chaos.journal import Journal
-from tests.chaos.radio import FORCE, Radio
-from tests.chaos.vehicle import NUMBER_RAD_S
+from tests.promises.chaos.journal import Journal
+from tests.promises.chaos.radio import FORCE, Radio
+from tests.promises.chaos.vehicle import NUMBER_RAD_S
 
 STATION: Final = 250  #: system id of another ground station
 LAND: Final = 9

@@ -1,4 +1,4 @@
-"""``skyloop host`` with one MAVLink vehicle: ``python -m tests.chaos.fleet NAME FOLDER ADDRESS``.
+"""``skyloop host`` with one MAVLink vehicle: ``python -m tests.promises.chaos.fleet NAME FOLDER ADDRESS``.
 
 The failsafes of its proxy are journalled.
 """
@@ -14,7 +14,7 @@ from skyloop.host.fleet import Defaults, Fleet, VehicleSettings
 from skyloop.host.serve import serve
 from skyloop.messages import Hover, Land
 from skyloop.vehicles.mavlink.driver import MavlinkDriver
-from tests.chaos.journal import Journal
+from tests.promises.chaos.journal import Journal
 
 
 def main() -> None:

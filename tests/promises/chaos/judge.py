@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from tests.chaos.journal import Entry
-from tests.chaos.vehicle import NUMBERS
+from tests.promises.chaos.journal import Entry
+from tests.promises.chaos.vehicle import NUMBERS
 
 HOVER_AFTER_S: Final = 0.5  #: the proxy's defaults: failsafe.hover_after_s …
 LAND_AFTER_S: Final = 5.0  #: … failsafe.land_after_s …

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from tests.chaos.journal import Entry, Journal, read
-from tests.chaos.judge import Verdict, faults_of, judge
-from tests.chaos.processes import Process, Resources
+from tests.promises.chaos.journal import Entry, Journal, read
+from tests.promises.chaos.judge import Verdict, faults_of, judge
+from tests.promises.chaos.processes import Process, Resources
 
 RECOVERS_WITHIN_S: Final = 20.0
 TIME_NAMESPACE_S: Final = 5000
@@ -26,7 +26,7 @@ TAIL_BYTES: Final = 30_000  #: of a journal: the last 15 s and more
 class Lane:
     """One vehicle with its pilot. ``network``: an address at which they meet, else on this host."""
 
-    transit_s = 0.0  #: see :func:`tests.chaos.judge.judge`
+    transit_s = 0.0  #: see :func:`tests.promises.chaos.judge.judge`
 
     def __init__(self, name: str, folder: Path, *, network: str | None = None) -> None:
         self.name = name
@@ -51,7 +51,7 @@ class Lane:
 
     def run(self, module: str, *arguments: str, prefix: Sequence[str] = (), remote: bool = False) -> Process:
         """A program of this package beside the lane."""
-        command = (*prefix, sys.executable, "-m", f"tests.chaos.{module}", *arguments)
+        command = (*prefix, sys.executable, "-m", f"tests.promises.chaos.{module}", *arguments)
         return Process(*command, log=self.folder / f"{self.name}.log", environment=self.environment(remote=remote))
 
     def environment(self, *, remote: bool = False) -> dict[str, str]:

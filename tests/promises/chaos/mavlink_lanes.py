@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from tests.chaos.judge import SLACK_S
-from tests.chaos.lanes import Fault, Lane, fork, pilot_stop, proxy_kill, tail
-from tests.chaos.processes import Process
+from tests.promises.chaos.judge import SLACK_S
+from tests.promises.chaos.lanes import Fault, Lane, fork, pilot_stop, proxy_kill, tail
+from tests.promises.chaos.processes import Process
 
-PAGE: Final = Path(__file__).resolve().parents[2] / "cockpit-page"
+PAGE: Final = Path(__file__).resolve().parents[3] / "cockpit-page"
 ESBUILD: Final = PAGE / "node_modules" / ".bin" / "esbuild"
 REST_S: Final = 4.0  #: the pause between a landing and the next take-off: any flight in it is unasked for
 COMES_WITHIN_S: Final = 40.0

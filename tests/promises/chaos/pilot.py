@@ -1,4 +1,4 @@
-"""A pilot that calls 32 times a second, for ever: ``python -m tests.chaos.pilot NAME FOLDER``; ``--help`` tells more.
+"""A pilot that calls 32 times a second, for ever: ``python -m tests.promises.chaos.pilot NAME FOLDER``; see ``--help``.
 
 It journals each take-off that it asks for, and the beginning and the end of each other call, with its number. On
 SIGUSR1 it forks, and the child ends by ``sys.exit``.
@@ -18,8 +18,8 @@ from pathlib import Path
 import skyloop
 from skyloop.client import Drone
 from skyloop.errors import SkyloopError
-from tests.chaos.journal import Journal, read
-from tests.chaos.vehicle import NUMBER_RAD_S, NUMBERS
+from tests.promises.chaos.journal import Journal, read
+from tests.promises.chaos.vehicle import NUMBER_RAD_S, NUMBERS
 
 PERIOD_S = 1.0 / 32.0
 #: A take-off that has not begun within this is requested again.

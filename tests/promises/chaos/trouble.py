@@ -1,4 +1,4 @@
-"""Programs that make trouble: ``python -m tests.chaos.trouble WHAT …``. Each says ``ready`` when it has begun."""
+"""Programs that make trouble: ``python -m tests.promises.chaos.trouble WHAT …``. Each says ``ready`` once begun."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A proxy whose vehicle journals what it is told: ``python -m tests.chaos.vehicle NAME FOLDER [LISTEN]``.
+"""A proxy whose vehicle journals what it is told: ``python -m tests.promises.chaos.vehicle NAME FOLDER [LISTEN]``.
 
 The vehicle stands for one that outlives its proxy: a new proxy finds it in the state in which the last one left it, and
 one that nobody steers hovers. ``LISTEN`` is an address of the network, where the proxy serves besides.
@@ -30,7 +30,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.proxy import serve as serving
-from tests.chaos.journal import Journal, read
+from tests.promises.chaos.journal import Journal, read
 
 PERIOD_S = 0.05
 LANDING_S = 1.0

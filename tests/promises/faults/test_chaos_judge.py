@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from skyloop.vehicles.mavlink.wire.codec import Codec, dialect
-from tests.chaos.journal import Entry
-from tests.chaos.judge import Fault, Verdict, faults_of, judge
-from tests.chaos.radio import frames_of, is_stop
+from tests.promises.chaos.journal import Entry
+from tests.promises.chaos.judge import Fault, Verdict, faults_of, judge
+from tests.promises.chaos.radio import frames_of, is_stop
 
 START_NS = 10**12
 

@@ -12,7 +12,7 @@ from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink.emulator import Kind
 from tests.cockpit.fake import cockpit
 from tests.cockpit.test_control import page
-from tests.faults.test_vehicle_of_others import KINDS, Scene, taken_off
+from tests.promises.faults.test_vehicle_of_others import KINDS, Scene, taken_off
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -17,7 +17,7 @@ from skyloop.clock import clock_identity
 from skyloop.proxy import Proxy, proxy
 from skyloop.transport.memory import MemoryServer
 from tests.integration.fake_vehicle import FakeVehicle
-from tests.processes.conftest import Process, eventually
+from tests.integration.processes.conftest import Process, eventually
 
 AHEAD_S = 1000
 UNSHARE = ("unshare", "--time", "--monotonic", str(AHEAD_S))

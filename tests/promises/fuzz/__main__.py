@@ -1,4 +1,4 @@
-"""``python -m tests.fuzz``: fuzzes all targets, or those that are named, each for a while and some side by side."""
+"""``python -m tests.promises.fuzz``: fuzzes all targets, or those named, each for a while some side by side."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 
-from tests.fuzz.targets import CORPUS, TARGETS, seeds
+from tests.promises.fuzz.targets import CORPUS, TARGETS, seeds
 
-EPILOG = "Example: python -m tests.fuzz --seconds 600 recording; ends with 1 if something was found, and keeps it."
+EPILOG = (
+    "Example: python -m tests.promises.fuzz --seconds 600 recording; ends with 1 if something was found, and keeps it."
+)
 MEMORY_MB = 1024  #: of a process; more is a finding
 SLOW_S = 10  #: an input that takes longer is a finding
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Returns 0 if nothing was found."""
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__, epilog=EPILOG)
+    parser = argparse.ArgumentParser(prog="python -m tests.promises.fuzz", description=__doc__, epilog=EPILOG)
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"of {', '.join(TARGETS)} [all]")
     parser.add_argument("--seconds", type=int, default=60, help="for each target [60]")
     parser.add_argument("--keep", action="store_true", help="add what leads into new corners to the corpus")
@@ -55,11 +57,11 @@ def _fuzz(name: str, seconds: int, keep: bool) -> bool:
         options = [f"-max_total_time={seconds}", f"-rss_limit_mb={MEMORY_MB}", f"-timeout={SLOW_S}", "-max_len=16384"]
         # A finding goes where the ordinary tests replay it.
         options.append(f"-artifact_prefix={kept}/found-")
-        command = [sys.executable, "-m", "tests.fuzz.run", name, str(found), str(given), *options]
+        command = [sys.executable, "-m", "tests.promises.fuzz.run", name, str(found), str(given), *options]
         result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
         if keep and result.returncode == 0:
             merge = ["-merge=1", "-max_len=2048", "-rss_limit_mb=2048"]
-            command = [sys.executable, "-m", "tests.fuzz.run", name, str(kept), str(found), *merge]
+            command = [sys.executable, "-m", "tests.promises.fuzz.run", name, str(kept), str(found), *merge]
             subprocess.run(command, capture_output=True, check=False)
     lines = result.stdout.splitlines()
     done = [line for line in lines if line.startswith("Done ")]

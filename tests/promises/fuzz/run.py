@@ -1,4 +1,4 @@
-"""Fuzzes one target with atheris: ``python -m tests.fuzz.run TARGET FOLDER … [-OPTION=VALUE …]`` (libFuzzer's)."""
+"""Fuzzes one target with atheris: ``python -m tests.promises.fuzz.run TARGET FOLDER … [-OPTION=VALUE …]``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def main() -> None:
                     importlib.import_module(f"{package}.{info.name}")
                 except ImportError:
                     continue  # of an extra that is not here
-    from tests.fuzz.targets import TARGETS
+    from tests.promises.fuzz.targets import TARGETS
 
     atheris.Setup(sys.argv, TARGETS[name])
     atheris.Fuzz()

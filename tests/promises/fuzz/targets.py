@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from skyloop.errors import DecodeError, FileFormatError, ParameterError, UsageError
 
-DATA: Final = Path(__file__).parents[1] / "data"
+DATA: Final = Path(__file__).parents[2] / "data"
 CORPUS: Final = Path(__file__).parent / "corpus"
 
 

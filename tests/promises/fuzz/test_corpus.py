@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-from tests.fuzz.run import PACKAGES
-from tests.fuzz.targets import TARGETS, seeds
+from tests.promises.fuzz.run import PACKAGES
+from tests.promises.fuzz.targets import TARGETS, seeds
 
 LONGEST_S = 5.0
 

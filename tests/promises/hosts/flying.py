@@ -8,8 +8,8 @@ from typing import Any
 
 import skyloop
 from skyloop.messages import Applied, Event, LinkState
-from tests.network.remote import Here
-from tests.processes.conftest import eventually
+from tests.integration.processes.conftest import eventually
+from tests.promises.hosts.remote import Here
 
 PERIOD_S = 0.05
 

@@ -1,7 +1,8 @@
 """What runs on hosts to find out what their network is like, without anything of Skyloop: echoes and streams.
 
-``python tests/network/probes.py echo PROTOCOL ADDRESS``, or ``send PROTOCOL ADDRESS COUNT PERIOD_S``, which prints a
-JSON list of when each probe came back, by its number: ``[number, sent_ns, heard_ns]``; or ``clock``, its own clock.
+``python tests/promises/hosts/probes.py echo PROTOCOL ADDRESS``, or ``send PROTOCOL ADDRESS COUNT PERIOD_S``, which
+prints a JSON list of when each probe came back, by its number: ``[number, sent_ns, heard_ns]``; or ``clock``, its own
+clock.
 """
 
 from __future__ import annotations

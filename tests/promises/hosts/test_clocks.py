@@ -8,8 +8,8 @@ from benchmarks.hosts.impairments import Impairments
 from benchmarks.hosts.namespaces import Lab
 from benchmarks.hosts.path import Path
 from skyloop.transport.testing import wait_until
-from tests.network import flying
-from tests.network.remote import Remote
+from tests.promises.hosts import flying
+from tests.promises.hosts.remote import Remote
 
 AHEAD_S = 1000
 AHEAD_NS = AHEAD_S * 1_000_000_000

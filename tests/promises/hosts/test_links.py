@@ -8,9 +8,9 @@ from collections.abc import Callable
 import pytest
 
 from skyloop.messages import Applied, Velocity
-from tests.network import flying
-from tests.network.conftest import Lan
-from tests.network.remote import Remote
+from tests.promises.hosts import flying
+from tests.promises.hosts.conftest import Lan
+from tests.promises.hosts.remote import Remote
 
 Start = Callable[..., object]
 OnHost = Callable[..., Remote]

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import pytest
 
 from benchmarks.hosts.namespaces import Lab
-from tests.network import flying
-from tests.network.conftest import FAST
-from tests.network.remote import Remote
-from tests.processes.conftest import Process
+from tests.integration.processes.conftest import Process
+from tests.promises.hosts import flying
+from tests.promises.hosts.conftest import FAST
+from tests.promises.hosts.remote import Remote
 
 Start = Callable[..., Process]
 OnHost = Callable[..., Remote]

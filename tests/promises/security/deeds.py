@@ -35,7 +35,7 @@ from skyloop.network.keys.agreement import Agreement
 from skyloop.network.sealing import Seal
 from skyloop.network.session import Session, acquire, release
 from skyloop.transport.base import EVENTS, FEEDBACK
-from tests.security.rig import DRONE, Intruder, Rig
+from tests.promises.security.rig import DRONE, Intruder, Rig
 
 LIAR = "f" * 16  #: RUN of a proxy that is none
 PUSH = Velocity(0.111)  #: a command that nobody else gives

@@ -17,7 +17,7 @@ from skyloop.messages import AnyRequest, Hello, ListParameters, Ping, Request, R
 from skyloop.network import layout, packets
 from skyloop.network.admission import Admission, JoinRequest
 from skyloop.network.keys import KeyRing, load
-from tests.security.rig import third_party
+from tests.promises.security.rig import third_party
 
 LISTS, PINGS = 16, 200
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from skyloop.transport.testing import wait_until
-from tests.security.deeds import DEEDS, Deed
-from tests.security.rig import Intruder, Rig, keys_of, make_lab
+from tests.promises.security.deeds import DEEDS, Deed
+from tests.promises.security.rig import Intruder, Rig, keys_of, make_lab
 
 #: The columns: whose key is used, and in words.
 COLUMNS = {

@@ -31,7 +31,7 @@ from skyloop.network.keys import Lab
 from skyloop.network.keys.identity import make_identity
 from skyloop.transport.base import COMMANDS
 from skyloop.transport.testing import ClientLog, wait_until
-from tests.security.rig import DRONE, Intruder, Rig, keys_of, make_lab, third_party
+from tests.promises.security.rig import DRONE, Intruder, Rig, keys_of, make_lab, third_party
 
 SHORT_MS = 700
 

@@ -275,7 +275,7 @@ def test_any_text_is_a_request_for_video_or_refused(text: str) -> None:
 
 def test_parameters_of_a_driver_travel_whatever_their_bounds_are() -> None:
     """They are no peer's: NaN and infinity in them are shown as they are."""
-    reply = decode((Path(__file__).parents[1] / "data/packets/golden/reply-value.bin").read_bytes())
+    reply = decode((Path(__file__).parents[2] / "data/packets/golden/reply-value.bin").read_bytes())
     assert isinstance(reply, Reply)
     parameter = Parameter("x", reply.body.parameter.type, math.inf, minimum=-math.inf)  # type: ignore[union-attr]
     sample = Reply(1, msgspec.structs.replace(reply.body, parameter=parameter))

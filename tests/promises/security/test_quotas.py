@@ -25,7 +25,7 @@ from skyloop.network.admission import (
 from skyloop.network.config import MAX_MESSAGE_UP
 from skyloop.network.discovery import RUNS_PER_NAME, _oldest_of_each, list_proxies
 from skyloop.transport.testing import wait_until
-from tests.security.rig import DRONE, Intruder, Rig, make_lab, third_party
+from tests.promises.security.rig import DRONE, Intruder, Rig, make_lab, third_party
 
 FLOOD = 4200  #: tokens
 

@@ -13,7 +13,7 @@ from skyloop.messages import Applied, Event, EventKind
 from skyloop.network.config import free_port
 from skyloop.network.keys import Lab
 from skyloop.network.keys.identity import make_identity
-from tests.processes.conftest import Process, eventually, sockets, start
+from tests.integration.processes.conftest import Process, eventually, sockets, start
 
 __all__ = ["sockets", "start"]  # fixtures
 pytestmark = pytest.mark.process
@@ -62,7 +62,12 @@ def test_observers_that_stop_reading_delay_no_command_and_no_emergency_stop(
         eye.on_command(applied.append, inline=True)
 
         attack = start(
-            "-m", "tests.security.stalled", f"quic/{place}?mixed_rel=1", str(lab.folder("olga")), "alpha", str(STALLED)
+            "-m",
+            "tests.promises.security.stalled",
+            f"quic/{place}?mixed_rel=1",
+            str(lab.folder("olga")),
+            "alpha",
+            str(STALLED),
         )
         attack.until(f"joined {STALLED}")
         attack.until("stalled")

@@ -17,7 +17,7 @@ from skyloop.vehicles.ardrone.configuration import (
     version_of,
 )
 from skyloop.vehicles.ardrone.wire.at import AtMessage
-from tests.drivers.ardrone.scripted import ns
+from tests.vehicles.ardrone.scripted import ns
 
 CLEAR: AtMessage = ("CTRL", (5, 0))
 SEND_ALL: AtMessage = ("CTRL", (4, 0))

@@ -28,8 +28,8 @@ from skyloop.vehicles.ardrone.telemetry import (
 )
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, State, decode, encode
 from skyloop.vehicles.ardrone.wire.options import Demo, Gps, PhysMeasures, RawMeasures, Time, VisionDetect, Wifi
-from tests.drivers.ardrone.scripted import ns
-from tests.recordings import recorded
+from tests.support.recordings import recorded
+from tests.vehicles.ardrone.scripted import ns
 
 
 @functools.cache

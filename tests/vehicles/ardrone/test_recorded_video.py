@@ -19,9 +19,9 @@ from skyloop.messages import LinkState
 from skyloop.vehicles.ardrone.driver import ArdroneDriver
 from skyloop.vehicles.ardrone.wire.navdata import Navdata, decode
 from skyloop.vehicles.ardrone.wire.options import Demo, Time
-from tests.drivers.ardrone.scripted import ScriptedDrone
-from tests.drivers.ardrone.video_ports import HOST, LONG, SHORT, TcpPort, digest, frames, pieces, true_pictures
-from tests.recordings import recorded
+from tests.support.recordings import recorded
+from tests.vehicles.ardrone.scripted import ScriptedDrone
+from tests.vehicles.ardrone.video_ports import HOST, LONG, SHORT, TcpPort, digest, frames, pieces, true_pictures
 
 
 @functools.cache

@@ -25,8 +25,8 @@ from skyloop.vehicles.ardrone.options import ArdroneOptions
 from skyloop.vehicles.ardrone.wire.at import Ref
 from skyloop.vehicles.ardrone.wire.navdata import State, encode
 from skyloop.vehicles.ardrone.wire.options import Demo, Time
-from tests.drivers.ardrone.scripted import IDS, Rig, ScriptedDrone, ns
-from tests.recordings import content, needs_recordings
+from tests.support.recordings import content, needs_recordings
+from tests.vehicles.ardrone.scripted import IDS, Rig, ScriptedDrone, ns
 
 RECORDED = content("ardrone2/navdata-full-landed.bin")
 

@@ -21,7 +21,7 @@ from skyloop.messages import (
 from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController, StickLimits
 from skyloop.vehicles.ardrone.wire.at import Ref
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, State
-from tests.drivers.ardrone.scripted import ns
+from tests.vehicles.ardrone.scripted import ns
 
 GROUND = Condition(State(0), ControlState.LANDED)
 AIR = Condition(State.FLYING, ControlState.HOVERING)

@@ -13,7 +13,7 @@ from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports, with_ardrones
 from skyloop.vehicles.ardrone.video import VideoReceiver
-from tests.drivers.ardrone.video_ports import HOST, Viewer
+from tests.vehicles.ardrone.video_ports import HOST, Viewer
 
 
 @pytest.mark.parametrize(

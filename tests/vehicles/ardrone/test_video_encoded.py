@@ -13,7 +13,7 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.messages import Intrinsics
 from skyloop.vehicles.ardrone.video import EncodedStream, VideoReceiver
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType
-from tests.drivers.ardrone.video_ports import HOST, LONG, PATIENCE_S, SHORT, TcpPort, Viewer, frames, recording
+from tests.vehicles.ardrone.video_ports import HOST, LONG, PATIENCE_S, SHORT, TcpPort, Viewer, frames, recording
 
 INTRINSICS = Intrinsics(1.0, 2.0, 3.0, 4.0)
 

@@ -15,7 +15,8 @@ from skyloop.drivers.live_frames import LATE_NS
 from skyloop.drivers.live_video import VideoCounters, VideoEvent
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.vehicles.ardrone.video import VideoReceiver
-from tests.drivers.ardrone.video_ports import (
+from tests.support.recordings import needs_recordings
+from tests.vehicles.ardrone.video_ports import (
     HOST,
     LONG,
     SHORT,
@@ -26,7 +27,6 @@ from tests.drivers.ardrone.video_ports import (
     receiver_of,
     true_pictures,
 )
-from tests.recordings import needs_recordings
 
 pytestmark = needs_recordings
 

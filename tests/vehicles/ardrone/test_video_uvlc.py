@@ -18,7 +18,7 @@ from skyloop.drivers.live_video import VideoEvent
 from skyloop.vehicles.ardrone.emulator.video import encode
 from skyloop.vehicles.ardrone.video import WAKE, UvlcVideo
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, is_intra, is_p264
-from tests.drivers.ardrone.video_ports import HOST, PATIENCE_S, Viewer, digest, receiver_of
+from tests.vehicles.ardrone.video_ports import HOST, PATIENCE_S, Viewer, digest, receiver_of
 
 P264 = bytes.fromhex("00020100") + bytes(60)  # 15 zeros, then 1000000
 

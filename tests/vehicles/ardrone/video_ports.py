@@ -15,7 +15,7 @@ from skyloop.clock import ManualClock
 from skyloop.drivers.live_video import Picture, VideoEvent
 from skyloop.vehicles.ardrone.video import VideoReceiver
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
-from tests.recordings import recorded
+from tests.support.recordings import recorded
 
 HOST = "127.0.0.1"
 LONG, SHORT = "video-8s.pave", "video-64-byte-headers.pave"

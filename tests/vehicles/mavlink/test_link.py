@@ -35,7 +35,7 @@ from skyloop.vehicles.mavlink.protocol import MavlinkSession
 from skyloop.vehicles.mavlink.wire.codec import Codec
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import Landed
-from tests.drivers.mavlink.scripted import ARDUPILOT, Vehicle, options
+from tests.vehicles.mavlink.scripted import ARDUPILOT, Vehicle, options
 
 PATIENCE_S = 15.0
 

@@ -35,8 +35,8 @@ from skyloop.vehicles.mavlink.telemetry import VehicleState
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message, chunks_of
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS
-from tests.drivers.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
-from tests.recordings import recorded
+from tests.support.recordings import recorded
+from tests.vehicles.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
 
 AUTOPILOTS = pytest.mark.parametrize("autopilot", [ARDUPILOT, PX4])
 

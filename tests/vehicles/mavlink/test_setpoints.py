@@ -25,7 +25,7 @@ from skyloop.messages import (
 from skyloop.vehicles.mavlink.wire.axes import angles_of, from_wire
 from skyloop.vehicles.mavlink.wire.codec import Message, chunks_of
 from skyloop.vehicles.mavlink.wire.modes import Landed
-from tests.drivers.mavlink.scripted import ARDUPILOT, PX4, Bench, Vehicle
+from tests.vehicles.mavlink.scripted import ARDUPILOT, PX4, Bench, Vehicle
 
 ARM, MODE, TAKEOFF = 400, 176, 22
 FORCE = 21196.0

@@ -24,9 +24,9 @@ from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink import emulator
 from skyloop.vehicles.mavlink.driver import MavlinkDriver
 from skyloop.vehicles.mavlink.emulator import Kind, Ports, TransportStream
-from tests.drivers.ardrone.video_ports import TcpPort
-from tests.drivers.mavlink.film import FPS, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
-from tests.drivers.mavlink.rtsp_server import HOST, RtspServer
+from tests.drivers.film import FPS, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
+from tests.drivers.rtsp_server import HOST, RtspServer
+from tests.vehicles.ardrone.video_ports import TcpPort
 
 PATIENCE_S = 30.0
 CLOSE_S = 6.0  #: closing waits 4 s at most; the rest is for a busy machine

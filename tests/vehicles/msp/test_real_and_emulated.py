@@ -22,9 +22,9 @@ from skyloop.vehicles.msp.emulator.board import bit
 from skyloop.vehicles.msp.wire.firmwares import flag_names
 from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import Function, Status, channels, pack_channels
-from tests.autopilots.real_betaflight import real_betaflight
-from tests.drivers.msp.rig import world
-from tests.drivers.msp.sitl import MSP_PORT, Sitl
+from tests.vehicles.msp.rig import world
+from tests.vehicles.msp.sitl import MSP_PORT, Sitl
+from tests.vehicles.sim.firmware.real_betaflight import real_betaflight
 
 PATIENCE_S: Final = 20.0
 

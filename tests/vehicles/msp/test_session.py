@@ -19,7 +19,7 @@ from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
 from skyloop.vehicles.msp.telemetry import Motion
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
 from skyloop.vehicles.msp.wire.messages import FailsafeConfig, Function, ModeRange, OnLoss, channels
-from tests.drivers.msp.bench import TICK_S, Bench, options
+from tests.vehicles.msp.bench import TICK_S, Bench, options
 
 
 def test_it_learns_the_throttle_and_holds_its_height() -> None:

@@ -260,7 +260,7 @@ def test_a_lens_that_is_not_known_is_refused_when_it_is_told(model: str, given: 
 
 
 def test_transforms_as_the_bytes_of_their_type() -> None:
-    """As rclpy 9.1.2 wrote and read them; what rosbags reads is tested in tests/third_party/test_ros2.py."""
+    """As rclpy 9.1.2 wrote and read them; what rosbags reads is tested in ``third_party/test_ros2.py``."""
     packed = encode_transforms([Transform(5 * 10**9 + 6, "odom", "base_link", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))])
     head = b"\x00\x01\x00\x00" + struct.pack("<IiI", 1, 5, 6)
     texts = struct.pack("<I", 5) + b"odom\0\0\0\0" + struct.pack("<I", 10) + b"base_link\0" + b"\0\0" * 1

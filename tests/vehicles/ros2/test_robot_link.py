@@ -12,8 +12,8 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError
 from skyloop.messages import Land, LinkState, Takeoff, Velocity
 from skyloop.vehicles.ros2.driver import Ros2Driver
-from tests.ros.fake_rclpy import Fake, Node
-from tests.ros.test_robot import image, odometry
+from tests.support.fake_rclpy import Fake, Node
+from tests.vehicles.ros2.test_robot import image, odometry
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,7 @@ from skyloop.messages import AnyAction, Feedback, FlightState
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.protocol import TelloSession
 from skyloop.vehicles.tello.wire import Sdk
-from tests.emulators.tello_rig import PILOT, Bench
+from tests.vehicles.tello.emulator.rig import PILOT, Bench
 
 STATE_TICKS = 5
 

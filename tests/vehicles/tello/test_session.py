@@ -24,9 +24,9 @@ from skyloop.messages import (
 )
 from skyloop.vehicles.tello.options import TelloOptions, VelocityAxes
 from skyloop.vehicles.tello.wire import Sdk
-from tests.drivers.tello.rig import Rig
-from tests.emulators.tello_rig import PILOT
-from tests.wire.tello.test_state import strings
+from tests.vehicles.tello.emulator.rig import PILOT
+from tests.vehicles.tello.rig import Rig
+from tests.vehicles.tello.wire.test_state import strings
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.1, 0.3])

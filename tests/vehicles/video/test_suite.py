@@ -9,9 +9,9 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import parse_uri
-from tests.drivers.mavlink.film import HEIGHT, WIDTH, Film, Projector
-from tests.drivers.mavlink.rtsp_server import RtspServer
-from tests.recordings import FIXTURES, needs_recordings
+from tests.drivers.film import HEIGHT, WIDTH, Film, Projector
+from tests.drivers.rtsp_server import RtspServer
+from tests.support.recordings import FIXTURES, needs_recordings
 
 
 @needs_recordings

@@ -314,7 +314,7 @@ def _upper(rows: NDArray[np.uint8], image: Any) -> NDArray[np.uint8]:
 
 
 TYPE_NAME: Final = "tf2_msgs/msg/TFMessage"
-#: Of its definition, by REP 2011; ``tests/third_party/ros2_bag.py`` compares it with that of rosbags.
+#: Of its definition, by REP 2011; ``tests/integration/third_party/ros2_bag.py`` compares it with that of rosbags.
 TYPE_HASH: Final = bytes.fromhex("e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087")
 _LITTLE_ENDIAN_CDR: Final = b"\x00\x01\x00\x00"
 

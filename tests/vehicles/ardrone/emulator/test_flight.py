@@ -24,7 +24,7 @@ from skyloop.vehicles.ardrone.emulator.configuration import Configuration
 from skyloop.vehicles.ardrone.emulator.flight import CALIBRATION_RATE_RAD_S, Progress, limits_of, set_point
 from skyloop.vehicles.ardrone.wire.at import Pcmd, Ref
 from skyloop.vehicles.ardrone.wire.navdata import State
-from tests.emulators.rig import RESTING, Bench
+from tests.vehicles.ardrone.emulator.rig import RESTING, Bench
 
 S = FlightState
 TAKE_OFF, LAND, EMERGENCY = int(Ref.TAKEOFF), 0, int(Ref.EMERGENCY)

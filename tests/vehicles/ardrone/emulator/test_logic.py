@@ -11,7 +11,7 @@ from skyloop.vehicles.ardrone.emulator.logic import LedAnimation, VideoSettings
 from skyloop.vehicles.ardrone.wire.at import to_bits
 from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec, parse_dump
 from skyloop.vehicles.ardrone.wire.navdata import State
-from tests.emulators.rig import Bench
+from tests.vehicles.ardrone.emulator.rig import Bench
 
 ALIVE = 0x0F800090  # of a drone that is well: altitude control, camera ready, its threads
 

@@ -15,7 +15,7 @@ from skyloop.vehicles.ardrone.emulator.video import DroneClock
 from skyloop.vehicles.ardrone.wire import options as o
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, decode, encode
 from skyloop.vehicles.emulation.video import VideoStatus
-from tests.emulators.rig import RESTING
+from tests.vehicles.ardrone.emulator.rig import RESTING
 
 EVERY = list(range(28))
 MOVING = replace(

@@ -22,7 +22,7 @@ from skyloop.vehicles.ardrone.wire.options import (
     Wifi,
     Zimmu3000,
 )
-from tests.recordings import content, needs_recordings
+from tests.support.recordings import content, needs_recordings
 
 RECORDED = content("ardrone2/navdata-full-landed.bin")
 BOOTSTRAPS = [

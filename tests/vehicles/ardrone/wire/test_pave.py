@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.vehicles.ardrone.wire.pave import DEFAULT_MAX_PAYLOAD, FrameType, PaveFrame, PaveParser
-from tests.recordings import content, needs_recordings
+from tests.support.recordings import content, needs_recordings
 
 pytestmark = needs_recordings
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveParser, build_header
-from tests.recordings import recorded
+from tests.support.recordings import recorded
 
 
 def test_the_first_header_of_a_real_drone_of_today() -> None:

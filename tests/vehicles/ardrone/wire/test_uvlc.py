@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from skyloop.errors import DecodeError
 from skyloop.vehicles.ardrone.wire.uvlc import MAX_PACKET, UvlcDecoder, UvlcPicture, is_p264
 from skyloop.vehicles.ardrone.wire.uvlc_codes import SIZES, PictureType
-from tests.wire.ardrone.uvlc_bits import (
+from tests.vehicles.ardrone.wire.uvlc_bits import (
     END,
     GREY,
     NOT_CODED,

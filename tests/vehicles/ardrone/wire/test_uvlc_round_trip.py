@@ -12,7 +12,7 @@ from skyloop.errors import UsageError
 from skyloop.vehicles.ardrone.emulator.video import MAX_DATAGRAM, encode
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture
 from skyloop.vehicles.ardrone.wire.uvlc_codes import SIZES
-from tests.wire.ardrone.uvlc_bits import GREY, header, level, macroblock, packet, picture, run
+from tests.vehicles.ardrone.wire.uvlc_bits import GREY, header, level, macroblock, packet, picture, run
 
 Picture = NDArray[np.uint8]
 Planes = NDArray[np.float64]

@@ -13,7 +13,7 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import geodetic
 from skyloop.vehicles.mavlink.wire.axes import to_wire
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from tests.emulators.mavlink.rig import HOME_M, Rig
+from tests.vehicles.mavlink.emulator.rig import HOME_M, Rig
 
 
 def rig() -> Rig:

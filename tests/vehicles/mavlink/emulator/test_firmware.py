@@ -20,7 +20,7 @@ from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with
 from skyloop.vehicles.mavlink.emulator.links import Streams
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from tests.emulators.mavlink.rig import Rig
+from tests.vehicles.mavlink.emulator.rig import Rig
 
 KINDS = pytest.mark.parametrize("kind", list(Kind))
 

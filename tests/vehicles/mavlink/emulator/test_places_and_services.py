@@ -10,7 +10,7 @@ from skyloop.vehicles.mavlink.emulator import Kind
 from skyloop.vehicles.mavlink.emulator.manoeuvres import geodetic, on_earth, place_of
 from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from tests.emulators.mavlink.rig import HOME_M, Rig
+from tests.vehicles.mavlink.emulator.rig import HOME_M, Rig
 
 BOTH = pytest.mark.parametrize("kind", list(Kind))
 FILE_SYSTEM = {"terminate": 1, "reset": 2, "list": 3, "open": 4, "write": 7, "nonsense": 99}

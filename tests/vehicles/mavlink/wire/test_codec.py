@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from skyloop.errors import UsageError
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from tests.recordings import recorded
+from tests.support.recordings import recorded
 
 FLIGHT = "mavlink/arduplane-flight.tlog"
 KEY = bytes(range(32))

@@ -17,7 +17,7 @@ from skyloop.vehicles.sim.firmware import coupling
 from skyloop.vehicles.sim.firmware.ardupilot import VARIABLE, ArduCopter
 from skyloop.vehicles.sim.firmware.coupling import STOPPED, WAIT_S
 from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
-from tests.autopilots.rig import COMMANDS, Rig, flying, program
+from tests.vehicles.sim.firmware.rig import COMMANDS, Rig, flying, program
 
 pytestmark = pytest.mark.process
 

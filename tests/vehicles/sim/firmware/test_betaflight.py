@@ -18,7 +18,7 @@ from skyloop.vehicles.sim.firmware.betaflight import LEAST_SPACING_S, SETTINGS, 
 from skyloop.vehicles.sim.firmware.coupling import STOPPED
 from skyloop.vehicles.sim.firmware.ports import bound
 from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
-from tests.autopilots.rig import COMMANDS, FIX, Rig, flying, program
+from tests.vehicles.sim.firmware.rig import COMMANDS, FIX, Rig, flying, program
 
 pytestmark = pytest.mark.process
 

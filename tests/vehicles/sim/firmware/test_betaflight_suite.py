@@ -9,7 +9,7 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import VehicleUri
-from tests.autopilots.real_betaflight import real_betaflight
+from tests.vehicles.sim.firmware.real_betaflight import real_betaflight
 
 
 @pytest.mark.process

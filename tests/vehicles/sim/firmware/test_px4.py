@@ -20,7 +20,7 @@ from skyloop.vehicles.sim.firmware.coupling import STOPPED
 from skyloop.vehicles.sim.firmware.ports import bound
 from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
 from skyloop.vehicles.sim.firmware.px4 import STEP_US, STEPS, VARIABLE, Px4
-from tests.autopilots.rig import COMMANDS, FIX, Rig, flying, program
+from tests.vehicles.sim.firmware.rig import COMMANDS, FIX, Rig, flying, program
 
 pytestmark = pytest.mark.process
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from skyloop.messages import FlightState
 from skyloop.messages.geometry import wrap_angle
 from skyloop.vehicles.tello.wire import SILENCE_S, Sdk
-from tests.emulators.tello_rig import PILOT, Bench
+from tests.vehicles.tello.emulator.rig import PILOT, Bench
 
 
 def test_nothing_is_answered_before_command() -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
 from skyloop.vehicles.tello.wire import State, build, parse
-from tests.recordings import recorded
+from tests.support.recordings import recorded
 
 
 def strings() -> list[str]:
