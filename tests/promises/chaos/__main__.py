@@ -22,9 +22,7 @@ from tests.promises.chaos.lanes import LOCAL, NETWORK, Fault, Lane, disk_full, f
 from tests.promises.chaos.mavlink_lanes import HANDS, MAVLINK, MavlinkLane, PageLane
 from tests.promises.chaos.processes import Resources
 
-EPILOG = (
-    "Example: python -m tests.promises.chaos --seconds 180 --seed 7; ends with 1 if a promise broke."
-)
+EPILOG = "Example: python -m tests.promises.chaos --seconds 180 --seed 7; ends with 1 if a promise broke."
 CALM_S = 5.0  #: before the first fault and after the last
 DISK = "8m"
 #: The lane beside each that has no faults: what happens to it as well is the machine's doing.
