@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import rotors
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS
-from tests.docs.pages import rows, section
+from tests.support.pages import rows, section
 
 PAGE = "docs/rotors.md"
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.swarm_flight import SwarmFlight, fly, missed, report
 from skyloop.client.monitoring import Distribution
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 DRONES = 10
 

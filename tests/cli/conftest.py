@@ -8,25 +8,12 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
 from skyloop.cli import main
-from tests.integration.processes.conftest import Process
-
-FAST_SIM = "sim://?world=empty&cameras=none&speed=6&wind=0"
-
-
-class Ended(NamedTuple):
-    """How a command ended."""
-
-    code: int
-    out: str
-    err: str
-
-
-Run = Callable[..., Ended]
+from tests.support.commands import Ended, Run
+from tests.support.processes import Process
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import skyloop
 from skyloop.cli import app as cli
 from skyloop.cli.commands import COMMANDS, Task
 from skyloop.errors import LinkError, ParameterError, UnknownNameError
-from tests.cli.conftest import Run
+from tests.support.commands import Run
 
 runner = CliRunner(env={"COLUMNS": "80", "TERM": "dumb"})
 

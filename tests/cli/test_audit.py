@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from tests.cli.conftest import FAST_SIM, Run
-from tests.integration.processes.conftest import Process
+from tests.support.commands import FAST_SIM, Run
+from tests.support.processes import Process
 
 Start = Callable[..., Process]
 

@@ -10,8 +10,8 @@ import pytest
 
 from skyloop.calibration import load_calibration
 from skyloop.vision import Board
-from tests.cli.conftest import Run
-from tests.vision.board_pictures import PINHOLE, photograph, poses
+from tests.support.board_pictures import PINHOLE, photograph, poses
+from tests.support.commands import Run
 
 
 @pytest.fixture(scope="module")

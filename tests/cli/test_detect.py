@@ -11,9 +11,9 @@ import skyloop
 from skyloop.cli.process import DetectionProcessor
 from skyloop.messages import Annotation, Polyline, Text
 from skyloop.vision import Detection
-from tests.cli.conftest import Run
-from tests.integration.processes.conftest import Process
-from tests.vision.networks import write
+from tests.support.commands import Run
+from tests.support.networks import write
+from tests.support.processes import Process
 
 pytestmark = pytest.mark.process
 

@@ -14,7 +14,7 @@ import pytest
 from skyloop.cli import doctor, main
 from skyloop.cli.doctor import Finding, Health, as_text
 from skyloop.errors import MissingExtraError
-from tests.cli.conftest import Run
+from tests.support.commands import Run
 
 
 @pytest.fixture(autouse=True)

@@ -9,8 +9,8 @@ from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.vehicles.msp.emulator import BetaflightFirmware
-from tests.cli.conftest import Run
-from tests.vehicles.msp.rig import world
+from tests.support.betaflight import world
+from tests.support.commands import Run
 
 
 @pytest.mark.parametrize(

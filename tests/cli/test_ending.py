@@ -9,8 +9,8 @@ from collections.abc import Callable
 import pytest
 
 import skyloop
-from tests.cli.conftest import FAST_SIM, Run
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.commands import FAST_SIM, Run
+from tests.support.processes import Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.daily]
 

@@ -18,7 +18,7 @@ from skyloop.client.drone import Drone, open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError
 from skyloop.messages import EmergencyStop, FlightState, Hover, RequestAuthority, ReturnToStart
 from skyloop.transport.base import Peer
-from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
+from tests.support.scripted_proxy import QUICK, WAIT_S, ScriptedProxy, background, scripted
 
 LANDED, LANDING, FLYING = FlightState.LANDED, FlightState.LANDING, FlightState.FLYING
 

@@ -13,10 +13,10 @@ import skyloop
 from skyloop.cli.fly import make, what_failed
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
-from tests.cli.conftest import Run
-from tests.client.scripted import flown, scripted
-from tests.integration.processes.conftest import Process
+from tests.support.commands import Run
+from tests.support.processes import Process
 from tests.support.recordings import recorded
+from tests.support.scripted_proxy import flown, scripted
 
 GOOD = """
 import skyloop

@@ -16,8 +16,8 @@ from skyloop.cli.app import build
 from skyloop.cli.fly_follow import SIDES
 from skyloop.clock import nanoseconds
 from skyloop.messages import Feedback
-from tests.cli.conftest import Run
-from tests.integration.processes.conftest import Process
+from tests.support.commands import Run
+from tests.support.processes import Process
 
 
 @pytest.mark.parametrize(

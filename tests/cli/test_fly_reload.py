@@ -13,9 +13,9 @@ from skyloop.cli.fly import Flight
 from skyloop.client import Drone
 from skyloop.control import Controller
 from skyloop.messages import Applied, Feedback, FlightState, Hover, Velocity
-from tests.cli.conftest import Run
-from tests.client.scripted import WAIT_S, background, flown, scripted
-from tests.integration.processes.conftest import Process
+from tests.support.commands import Run
+from tests.support.processes import Process
+from tests.support.scripted_proxy import WAIT_S, background, flown, scripted
 
 MINE = """
 import skyloop

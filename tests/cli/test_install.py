@@ -16,8 +16,8 @@ from skyloop.cli import install
 from skyloop.cli.app import build
 from skyloop.cli.app import run as run_app
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UnknownNameError, UnsupportedError
-from tests.cli.conftest import Run
-from tests.docs.pages import ROOT
+from tests.support.commands import Run
+from tests.support.pages import ROOT
 
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 

@@ -10,7 +10,7 @@ import pytest
 
 from skyloop.network.keys import Lab, load
 from skyloop.network.keys.identity import make_identity
-from tests.cli.conftest import Run
+from tests.support.commands import Run
 
 DAY = timedelta(days=1)
 

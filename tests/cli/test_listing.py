@@ -15,7 +15,7 @@ from skyloop.messages import FlightState
 from skyloop.proxy import Proxy
 from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.local import LocalServer
-from tests.proxy.fake import FakeDriver
+from tests.support.proxy_bench import FakeDriver
 
 NAMES = ["alpha", "bravo", "carol"]
 

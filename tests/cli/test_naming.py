@@ -18,7 +18,7 @@ from skyloop.cli.app import build
 from skyloop.cli.commands import COMMANDS
 from skyloop.cli.ending import AllOption
 from skyloop.errors import Hint, LinkError, SkyloopError, UnknownNameError, UsageError
-from tests.cli.conftest import Run
+from tests.support.commands import Run
 
 #: Commands that name a running drone.
 OF_DRONES = ("fly", "teleop", "land", "stop", "watch", "cockpit", "process", "param", "audit", "record")

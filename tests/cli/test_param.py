@@ -12,8 +12,8 @@ import skyloop
 from skyloop.cli.param import allowed, details, parse_value, show, table
 from skyloop.errors import UsageError
 from skyloop.messages import Parameter, ParameterType, Value
-from tests.cli.conftest import Run
-from tests.integration.processes.conftest import Process
+from tests.support.commands import Run
+from tests.support.processes import Process
 
 BOOL = Parameter("sim.link", ParameterType.BOOL, True)
 INT = Parameter("a.count", ParameterType.INT, 3, minimum=1.0)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 
-from tests.cli.conftest import Run
-from tests.integration.processes.conftest import Process
+from tests.support.commands import Run
+from tests.support.processes import Process
 
 
 def test_the_checklist_for_people_and_programs(run: Run, start: Callable[..., Process]) -> None:

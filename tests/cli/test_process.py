@@ -11,8 +11,8 @@ import pytest
 
 import skyloop
 from skyloop.processing import Status
-from tests.cli.conftest import Run
-from tests.integration.processes.conftest import Process
+from tests.support.commands import Run
+from tests.support.processes import Process
 
 pytestmark = pytest.mark.process
 

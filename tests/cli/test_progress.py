@@ -21,8 +21,8 @@ from skyloop.cli.install import EXTRAS
 from skyloop.cli.text import console as skyloop_console
 from skyloop.cli.text import named
 from skyloop.vehicles.video.devices import CameraDevice, cameras, described
-from tests.cli.conftest import FAST_SIM, Run
-from tests.integration.processes.conftest import Process, in_terminal
+from tests.support.commands import FAST_SIM, Run
+from tests.support.processes import Process, in_terminal
 
 ROOT = Path(__file__).parents[2]
 HOVER = """

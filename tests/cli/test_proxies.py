@@ -20,8 +20,8 @@ from skyloop.cli.sim import address
 from skyloop.cli.text import columns
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
-from tests.cli.conftest import FAST_SIM, Run
-from tests.integration.processes.conftest import Process, eventually, in_terminal
+from tests.support.commands import FAST_SIM, Run
+from tests.support.processes import Process, eventually, in_terminal
 
 pytestmark = pytest.mark.process
 

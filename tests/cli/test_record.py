@@ -11,9 +11,9 @@ import pytest
 
 from skyloop.cli import record as module
 from skyloop.recording.options import RecorderState, Status
-from tests.cli.conftest import Run
-from tests.integration.processes.conftest import Process
-from tests.recording import files
+from tests.support import recording_files as files
+from tests.support.commands import Run
+from tests.support.processes import Process
 
 pytestmark = pytest.mark.process
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import skyloop.ros
-from tests.cli.conftest import Run
+from tests.support.commands import Run
 
 
 def test_without_rclpy_it_says_what_to_install(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

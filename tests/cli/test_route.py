@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from skyloop.control import Photo, Route, RouteWaypoint, save_route
-from tests.cli.conftest import FAST_SIM, Run
-from tests.integration.processes.conftest import Process
+from tests.support.commands import FAST_SIM, Run
+from tests.support.processes import Process
 
 TOUR = Route(
     waypoints=(RouteWaypoint(1, 0, 1), RouteWaypoint(1, 1, 1.3, actions=(Photo(),)), RouteWaypoint(0, 0, 1)),

@@ -7,7 +7,7 @@ import json
 import pytest
 import zenoh
 
-from tests.cli.conftest import Run
+from tests.support.commands import Run
 
 
 def test_the_printed_configuration_is_one(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

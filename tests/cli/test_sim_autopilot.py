@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.cli.conftest import Run
+from tests.support.commands import Run
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ import pytest
 from skyloop.cli.sim import address_from, ports_from
 from skyloop.errors import UsageError
 from skyloop.vehicles.ardrone.emulator import Ports
-from tests.cli.conftest import Run
-from tests.integration.processes.conftest import Process
-from tests.vehicles.ardrone.emulator.pilot import HERE, Pilot
+from tests.support.ardrone_pilot import HERE, Pilot
+from tests.support.commands import Run
+from tests.support.processes import Process
 
 pytest.importorskip("av")
 

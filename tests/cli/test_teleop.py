@@ -33,9 +33,9 @@ from skyloop.cli.keyboard import (
 )
 from skyloop.cli.teleop import Teleop
 from skyloop.messages import EmergencyStop, Fate, FlightState, Hover, Land, Outcome, Refusal, Takeoff, Velocity
-from tests.cli.conftest import Run
-from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
-from tests.integration.processes.conftest import Process
+from tests.support.commands import Run
+from tests.support.processes import Process
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, flown, scripted
 
 FLYING, LANDED, LANDING = FlightState.FLYING, FlightState.LANDED, FlightState.LANDING
 FORWARD = Deflection(forward=1)

@@ -11,9 +11,9 @@ import pytest
 
 import skyloop
 from skyloop.recording.foxglove_access import ParameterDesk
-from tests.cli.conftest import Run
-from tests.integration.processes.conftest import Process
 from tests.recording.live import fake_rerun
+from tests.support.commands import Run
+from tests.support.processes import Process
 
 pytestmark = pytest.mark.process
 

@@ -34,8 +34,8 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.transport.base import results
-from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
 from tests.client.test_results import Sender
+from tests.support.scripted_proxy import QUICK, WAIT_S, ScriptedProxy, background, scripted
 
 
 @pytest.fixture

@@ -47,7 +47,7 @@ from skyloop.messages import (
 from skyloop.messages.config import MAX_REASON
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.proxy.core.command_checks import TAKEOFF_NS
-from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
+from tests.support.scripted_proxy import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
 
 
 @pytest.fixture

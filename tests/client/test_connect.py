@@ -25,7 +25,7 @@ from skyloop.messages import FlightState, LinkState
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.network.config import FabricSettings
 from skyloop.transport.local import LocalServer
-from tests.client.scripted import ScriptedProxy
+from tests.support.scripted_proxy import ScriptedProxy
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the local transport needs Linux")
 ROOT = Path(__file__).parents[2]
@@ -37,7 +37,7 @@ import os, sys
 sys.path.insert(0, {root!r})
 from skyloop.network.config import FabricSettings
 from skyloop.transport.local import LocalServer
-from tests.client.scripted import ScriptedProxy
+from tests.support.scripted_proxy import ScriptedProxy
 name, descriptor = sys.argv[sys.argv.index("--name") + 1], int(sys.argv[-1])
 proxy = ScriptedProxy()
 proxy.server = LocalServer(name)

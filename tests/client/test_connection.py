@@ -41,7 +41,7 @@ from skyloop.messages import (
 from skyloop.messages.frame import EncodedFrame
 from skyloop.transport.base import EVENTS, FEEDBACK, ClientHandler, TransportClient, video
 from skyloop.transport.memory import Faults
-from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
+from tests.support.scripted_proxy import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
 
 
 @pytest.fixture
@@ -450,7 +450,7 @@ def test_the_offset_between_clocks(proxy: ScriptedProxy, monkeypatch: pytest.Mon
     class ProxyTime:
         monotonic_ns = staticmethod(lambda: real() + ahead_ns)
 
-    monkeypatch.setattr("tests.client.scripted.time", ProxyTime)
+    monkeypatch.setattr("tests.support.scripted_proxy.time", ProxyTime)
     drone = open_drone(dial, app="me", policy=QUICK)
     try:
         assert abs(drone._core.connection.offset_ns - ahead_ns) < 50_000_000

@@ -36,7 +36,7 @@ from skyloop.messages import (
     VehiclePose,
 )
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, video
-from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, background, flown, scripted
 
 
 @pytest.fixture

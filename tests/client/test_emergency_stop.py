@@ -32,7 +32,7 @@ from skyloop.messages import (
     decode,
 )
 from skyloop.transport.base import Peer
-from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, flown, scripted
 
 STICKS = Velocity(0.5)
 

@@ -32,7 +32,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, background, flown, scripted
 
 FLYING, LANDED, LANDING = FlightState.FLYING, FlightState.LANDED, FlightState.LANDING
 

@@ -15,7 +15,7 @@ from skyloop.messages import LogEntry, Severity, encode
 from skyloop.messages.codec import MAX_BODY
 from skyloop.messages.relayed import MAX_LOG_TEXT, MAX_VALUES
 from skyloop.transport.base import LOGS
-from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, flown, scripted
 
 
 @pytest.fixture

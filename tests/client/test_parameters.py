@@ -21,7 +21,7 @@ from skyloop.messages import (
     SetParameter,
     Value,
 )
-from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, background, flown, scripted
 
 
 @pytest.fixture

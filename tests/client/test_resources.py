@@ -11,7 +11,7 @@ import pytest
 
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError
-from tests.client.scripted import QUICK, scripted
+from tests.support.scripted_proxy import QUICK, scripted
 
 
 def descriptors() -> int:

@@ -17,7 +17,7 @@ from skyloop.errors import ClosedError, DecodeError, NoAnswerError, UsageError
 from skyloop.messages import Feedback, ProcessorResult, encode
 from skyloop.messages.relayed import pack
 from skyloop.transport.base import RESULTS, results
-from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, background, flown, scripted
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import pytest
 
 from skyloop.cockpit.child import CockpitProcess
 from tests.cockpit import firefox
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, ConsoleMessage, Page, Playwright

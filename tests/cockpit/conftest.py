@@ -9,8 +9,8 @@ import pytest
 
 from skyloop.cockpit.fleet import Fleet
 from tests.cockpit.browser import Deck, browser_and_cockpit
-from tests.cockpit.fake import Node, Nodes, cockpit
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import Node, Nodes, cockpit
+from tests.support.testclient import TestClient
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

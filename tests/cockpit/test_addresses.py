@@ -17,7 +17,7 @@ from skyloop.cockpit.security import own_names
 from skyloop.cockpit.server import Access
 from skyloop.errors import UsageError
 from skyloop.messages import Role
-from tests.cockpit.fake import ORIGIN, FakeDrone, cockpit, fake_fleet
+from tests.support.cockpit import ORIGIN, FakeDrone, cockpit, fake_fleet
 
 HERE = "127.0.0.1"
 

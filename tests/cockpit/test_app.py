@@ -30,8 +30,8 @@ from skyloop.messages import (
     Text,
     Velocity,
 )
-from tests.cockpit.fake import FakeDrone, cockpit, fake_fleet, flying, open_socket, until
-from tests.cockpit.testclient import TestClient, WebSocketTestSession
+from tests.support.cockpit import FakeDrone, cockpit, fake_fleet, flying, open_socket, until
+from tests.support.testclient import TestClient, WebSocketTestSession
 
 
 @pytest.fixture

@@ -32,8 +32,8 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from tests.cockpit.fake import PATIENCE_S, Node, Nodes, cockpit, open_socket, this_user, until
-from tests.cockpit.testclient import TestClient, WebSocketTestSession
+from tests.support.cockpit import PATIENCE_S, Node, Nodes, cockpit, open_socket, this_user, until
+from tests.support.testclient import TestClient, WebSocketTestSession
 
 
 def links() -> int:

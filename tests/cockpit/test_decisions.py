@@ -14,11 +14,11 @@ from skyloop.cockpit.commands import LATE_S, UNTOUCHED_S, Fly, HandWatch
 from skyloop.cockpit.control_session import GONE_S
 from skyloop.cockpit.fleet import Fleet
 from skyloop.messages import Failsafe, FlightState, Hover, Land, Position, Velocity
-from tests.cockpit.fake import ORIGIN, Node, Nodes, cockpit, until
 from tests.cockpit.follower import StandIns
 from tests.cockpit.test_control import Page, count, page
 from tests.cockpit.test_follow import BOX, FORWARD, Marker
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import ORIGIN, Node, Nodes, cockpit, until
+from tests.support.testclient import TestClient
 
 FAR = {"name": "far", "speed": 1.0, "waypoints": [{"x": 30.0, "y": 0.0, "z": 1.0}]}
 

@@ -29,8 +29,8 @@ from skyloop.cockpit.page_stream import (
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.messages import CameraInfo, Encoding, FrameHeader
-from tests.cockpit.fake import FakeDrone, FakeStream, cockpit, fake_fleet, open_socket, until
-from tests.cockpit.testclient import TestClient, WebSocketTestSession
+from tests.support.cockpit import FakeDrone, FakeStream, cockpit, fake_fleet, open_socket, until
+from tests.support.testclient import TestClient, WebSocketTestSession
 
 CAMERA = CameraInfo("front", 640, 480, 30.0)
 LATE_NS = round(LATE_S * 1e9) + 1

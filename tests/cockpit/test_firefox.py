@@ -11,7 +11,7 @@ import skyloop
 from skyloop.messages import FlightState
 from tests.cockpit import fingers
 from tests.cockpit.browser import IN_FIREFOX, Deck, DronePage
-from tests.recording.flights import Plan, write_flight
+from tests.support.recorded_flights import Plan, write_flight
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -19,8 +19,8 @@ from skyloop.messages import LinkState
 from skyloop.transport.base import FEEDBACK, ClientHandler, TransportClient
 from skyloop.transport.local import LocalServer
 from skyloop.transport.testing import ServerLog
-from tests.cockpit.fake import FakeDrone, Node, Nodes, cockpit, open_socket, until
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import FakeDrone, Node, Nodes, cockpit, open_socket, until
+from tests.support.testclient import TestClient
 
 
 def dial(_: ClientHandler) -> TransportClient:

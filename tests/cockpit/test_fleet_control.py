@@ -14,9 +14,9 @@ from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.fleet import Fleet, observe
 from skyloop.errors import LinkError
 from skyloop.messages import EmergencyStop, FlightState, Land, Role
-from tests.cockpit.fake import Node, Nodes, cockpit, open_socket, this_user, until
 from tests.cockpit.test_control import Page, count, page
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import Node, Nodes, cockpit, open_socket, this_user, until
+from tests.support.testclient import TestClient
 
 
 @pytest.fixture

@@ -22,10 +22,10 @@ from skyloop.cockpit.follow_session import NO_CONTROL
 from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Annotation, FlightState, Hover, Velocity
 from skyloop.processing import Settings, Worker
-from tests.cockpit.fake import Node, Nodes, cockpit, until
 from tests.cockpit.follower import StandIn, StandIns
 from tests.cockpit.test_control import Page, count, page
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import Node, Nodes, cockpit, until
+from tests.support.testclient import TestClient
 
 BOX = [4.0, 4.0, 10.0, 12.0]
 FORWARD = Velocity(forward=0.25)

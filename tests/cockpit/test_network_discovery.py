@@ -19,7 +19,7 @@ from skyloop.network.config import free_port
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.local import LocalServer
 from skyloop.transport.testing import ServerLog, wait_until
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 
 @pytest.fixture(autouse=True)

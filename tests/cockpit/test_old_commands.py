@@ -44,9 +44,9 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
-from tests.cockpit.fake import Node, until
 from tests.cockpit.test_control import count, page
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import Node, until
+from tests.support.testclient import TestClient
 
 NOW_S = 1000.0
 ORDERS: list[tuple[Callable[..., AnyCommand], tuple[object, ...]]] = [

@@ -18,7 +18,7 @@ import pytest
 import skyloop
 from skyloop.messages import FlightState
 from tests.cockpit.browser import Deck, DronePage
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cockpit.fake import FakeDrone, cockpit, fake_fleet
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import FakeDrone, cockpit, fake_fleet
+from tests.support.testclient import TestClient
 
 SCRIPT = b"export const seen = 1;\n" * 200
 PAGE = '<script src="/static/cockpit.js"></script><link href="/static/gone.css">'

@@ -14,7 +14,7 @@ import skyloop
 from skyloop.cockpit.addresses import bind
 from skyloop.messages import FlightState
 from tests.cockpit.browser import PATIENCE_S, Deck, DronePage
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -18,8 +18,8 @@ from skyloop.proxy import Proxy
 from skyloop.transport.local import LocalServer
 from tests.cockpit.browser import WATCHED, Deck, DronePage
 from tests.cockpit.test_page_faults import stopped
-from tests.integration.processes.conftest import Process
-from tests.vehicles.tello.addresses import Addresses
+from tests.support.processes import Process
+from tests.support.tello_addresses import Addresses
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

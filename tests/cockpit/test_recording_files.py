@@ -23,9 +23,9 @@ from skyloop.messages import Role
 from skyloop.proxy.proxy import Proxy
 from skyloop.recording.reader import Recording
 from skyloop.transport.memory import MemoryServer
-from tests.cockpit.fake import ORIGIN, FakeRecorder, Node, Nodes, cockpit, this_user, until
-from tests.cockpit.testclient import TestClient
-from tests.recording.flights import Plan, write_flight
+from tests.support.cockpit import ORIGIN, FakeRecorder, Node, Nodes, cockpit, this_user, until
+from tests.support.recorded_flights import Plan, write_flight
+from tests.support.testclient import TestClient
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError
 from skyloop.recording import Recorder, record
 from skyloop.recording.reader import Described, describe
-from tests.cockpit.fake import ORIGIN, FakeRecorder, Node, Nodes, cockpit, open_socket, until
-from tests.cockpit.testclient import TestClient, WebSocketTestSession
+from tests.support.cockpit import ORIGIN, FakeRecorder, Node, Nodes, cockpit, open_socket, until
+from tests.support.testclient import TestClient, WebSocketTestSession
 
 
 @pytest.fixture

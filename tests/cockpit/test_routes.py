@@ -17,9 +17,9 @@ from skyloop.cockpit.routes import MOST_CHECKED, CheckedRoutes, RouteFiles
 from skyloop.control.route import Conditions, Route, RouteWaypoint, check_route
 from skyloop.errors import RefusedError, UnknownNameError, UsageError
 from skyloop.messages import AnyAction, FlightState, Hover
-from tests.cockpit.fake import ORIGIN, Node, Nodes, cockpit, until
 from tests.cockpit.test_control import Page, page
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import ORIGIN, Node, Nodes, cockpit, until
+from tests.support.testclient import TestClient
 
 TRIANGLE: dict[str, Any] = {
     "name": "triangle",

@@ -18,7 +18,7 @@ from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.security import bind_address, foreign, needed, own_names
 from skyloop.errors import UsageError
 from skyloop.messages import FlightState, Role
-from tests.cockpit.fake import (
+from tests.support.cockpit import (
     ORIGIN,
     OWN,
     SOCKETS,
@@ -31,7 +31,7 @@ from tests.cockpit.fake import (
     open_socket,
     until,
 )
-from tests.cockpit.testclient import TestClient
+from tests.support.testclient import TestClient
 
 NAMES = own_names("127.0.0.1", 8123)
 STREAMS = ["overview", "drones/alpha/telemetry", "drones/alpha/video/front", "drones/alpha/control"]

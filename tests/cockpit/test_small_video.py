@@ -15,8 +15,8 @@ import pytest
 from skyloop.cockpit.encoded_feed import FPS, WIDTHS, CameraFeed, SmallFeed, rounded_width
 from skyloop.cockpit.small_video import MAX_SHOWN
 from skyloop.messages import CameraInfo
-from tests.cockpit.fake import FakeDrone, cockpit, fake_fleet, open_socket, until
-from tests.cockpit.testclient import TestClient, WebSocketTestSession
+from tests.support.cockpit import FakeDrone, cockpit, fake_fleet, open_socket, until
+from tests.support.testclient import TestClient, WebSocketTestSession
 
 SIZE = (640, 480)
 

@@ -12,9 +12,9 @@ from skyloop.cockpit import station
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.errors import DriverError, UnsupportedError
 from skyloop.messages import AnyAction, EmergencyStop, Fate, FlightState, Hover, Outcome, Refusal, Velocity
-from tests.cockpit.fake import Node, open_socket, until
 from tests.cockpit.test_control import Page, count, page
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import Node, open_socket, until
+from tests.support.testclient import TestClient
 
 
 @contextmanager

@@ -17,9 +17,9 @@ from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
 from skyloop.errors import DecodeError
 from skyloop.messages import Event, EventKind, FlightState
-from tests.cockpit.fake import Node, until
 from tests.cockpit.test_control import Page, page
-from tests.cockpit.testclient import TestClient
+from tests.support.cockpit import Node, until
+from tests.support.testclient import TestClient
 
 S = 1_000_000_000
 

@@ -14,7 +14,7 @@ from skyloop.messages import CameraInfo, Capabilities, Feedback, Intrinsics, Par
 from skyloop.messages.parameter import MAX_WORLD_TEXT, WORLD, Solid, WorldGeometry, decode_world, encode_world
 from skyloop.sim.geometry import geometry_of
 from skyloop.sim.world_file import load_world, shipped_worlds
-from tests.cockpit.fake import FakeDrone, cockpit, fake_fleet
+from tests.support.cockpit import FakeDrone, cockpit, fake_fleet
 
 
 def drone_with(**values: Value) -> Any:

@@ -45,7 +45,7 @@ from skyloop.sim.camera import BOTTOM_CAMERA
 from skyloop.sim.geometry import geometry_of
 from skyloop.sim.world_file import load_world
 from skyloop.stepping.rehearsal import Radio, rehearse
-from tests.client.scripted import WAIT_S, flown, scripted
+from tests.support.scripted_proxy import WAIT_S, flown, scripted
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from skyloop.control.controller import misspelt
 from skyloop.errors import AuthorityError, UnknownNameError, UsageError
 from skyloop.messages import EventKind, Feedback, FlightState, Hover, Velocity
 from skyloop.transport.base import video
-from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, background, flown, scripted
 
 
 @pytest.fixture

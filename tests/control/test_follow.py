@@ -24,7 +24,7 @@ from skyloop.messages import (
     Severity,
     Text,
 )
-from tests.vision.draw import INTRINSICS, facing, picture
+from tests.support.marker_pictures import INTRINSICS, facing, picture
 
 FORWARD = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
 

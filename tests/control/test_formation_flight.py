@@ -21,7 +21,7 @@ from skyloop.errors import NoAnswerError, SwarmError, UnknownNameError, UsageErr
 from skyloop.messages import AnyAction, Feedback, FlightState, LinkState, Vector, Velocity
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.memory import MemoryServer
-from tests.integration.fake_vehicle import FakeVehicle
+from tests.support.fake_vehicle import FakeVehicle
 
 NAMES = ("a", "b", "c")
 PERIOD_S = 0.01

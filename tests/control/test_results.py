@@ -12,8 +12,8 @@ from skyloop.control import Controller, RunSummary
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback
 from skyloop.transport.base import RESULTS, results
-from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
 from tests.client.test_results import Sender
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, background, flown, scripted
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 
 from skyloop.drivers.live_video import VideoCounters
-from tests.docs.pages import rows, section
+from tests.support.pages import rows, section
 
 
 def test_the_table_of_counters() -> None:

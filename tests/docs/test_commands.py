@@ -10,7 +10,7 @@ import pytest
 from typer.main import get_command
 
 from skyloop.cli.app import build
-from tests.docs.pages import PAGES, ROOT, blocks, spans
+from tests.support.pages import PAGES, ROOT, blocks, spans
 
 SHELL = [
     line.strip()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.pages import ROOT, rows
+from tests.support.pages import ROOT, rows
 
 PAGE = ROOT / "docs" / "examples.md"
 EXAMPLES = sorted(path for path in (ROOT / "examples").iterdir() if path.suffix in (".py", ".ipynb"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.pages import PAGES, ROOT, prose, spans
+from tests.support.pages import PAGES, ROOT, prose, spans
 
 MOST_BYTES = 300_000
 LARGE = {"cockpit-follow.webp": 700_000}  # a film of the page, whose text has to be read

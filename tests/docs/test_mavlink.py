@@ -9,7 +9,7 @@ import pytest
 from skyloop.vehicles.mavlink import options
 from skyloop.vehicles.mavlink.options import OWN_LIMITS
 from skyloop.vehicles.mavlink.protocol import DEGRADED_NS, FIRST_WORD_NS, LOST_NS, PARAMETERS_NS
-from tests.docs.pages import rows, section
+from tests.support.pages import rows, section
 
 PAGE = "docs/mavlink.md"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.pages import PAGES, ROOT, rows, section, spans
+from tests.support.pages import PAGES, ROOT, rows, section, spans
 
 SECURITY = "docs/security.md"
 _TEST = re.compile(r"test_\w+")

@@ -12,7 +12,7 @@ import pytest
 import skyloop
 from skyloop.control.controller import Controller, RunSummary
 from skyloop.messages import Feedback
-from tests.docs.pages import Block, blocks
+from tests.support.pages import Block, blocks
 from tests.support.recordings import recorded
 
 LONGEST_RUN_S = 10.0  # of a controller, whatever the example says

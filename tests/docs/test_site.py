@@ -10,7 +10,7 @@ import pytest
 
 import skyloop
 from skyloop.cli.commands import COMMANDS
-from tests.docs.pages import ROOT, blocks
+from tests.support.pages import ROOT, blocks
 
 DOCS = ROOT / "docs"
 REFERENCE = {path.stem: path.read_text() for path in (DOCS / "api").glob("*.rst")}

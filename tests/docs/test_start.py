@@ -15,7 +15,7 @@ import pytest
 
 import skyloop
 from skyloop.control.loading import load_controller
-from tests.docs.pages import ROOT, Block, blocks
+from tests.support.pages import ROOT, Block, blocks
 
 START = ROOT / "docs" / "start"
 MOST_LINES = 130  # two screens of reading, and a table of what goes wrong

@@ -19,7 +19,7 @@ from skyloop.control.chase_law import LOSSES, TargetPhase
 from skyloop.sim import load_world
 from skyloop.sim.labels import TargetBox
 from skyloop.stepping.rehearsal import rehearse
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 SECOND_NS = 1_000_000_000
 SCRIPT = str(Path(__file__).parents[2] / "scripts" / "demo_follow.py")

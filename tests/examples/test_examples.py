@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from tests.integration.processes.conftest import Process, eventually, sockets, start
+from tests.support.processes import Process, eventually, sockets, start
 
 __all__ = ["sockets", "start"]  # fixtures
 

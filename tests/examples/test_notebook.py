@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.integration.processes.conftest import sockets
+from tests.support.processes import sockets
 
 __all__ = ["sockets"]  # a fixture
 

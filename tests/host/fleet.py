@@ -15,7 +15,7 @@ from skyloop.host.vehicle import SharedVehicle
 from skyloop.messages import AnyAction, EventKind, Failsafe, FlightState, Land, Role, Takeoff, Value, Velocity
 from skyloop.transport.local import dial
 from skyloop.transport.testing import wait_until
-from tests.proxy.fake import App, FakeDriver
+from tests.support.proxy_bench import App, FakeDriver
 
 PATIENT: dict[str, Value] = {"failsafe.hover_after_s": 1.5, "authority.timeout_s": 5.0, "command.max_age_s": 5.0}
 

@@ -32,7 +32,7 @@ from skyloop.transport.base import OVERVIEW
 from skyloop.transport.local import LocalServer, list_names
 from skyloop.transport.testing import wait_until
 from tests.host.fleet import Flight, Hosting, closing_reason
-from tests.proxy.fake import WAIT_S, FakeDriver
+from tests.support.proxy_bench import WAIT_S, FakeDriver
 
 
 def test_one_that_is_removed_the_moment_before_it_starts_does_not_go_on_to_serve(hosting: Hosting) -> None:

@@ -22,7 +22,7 @@ from skyloop.host.threads import (
 )
 from skyloop.proxy import Proxy
 from skyloop.transport.testing import wait_until
-from tests.proxy.fake import Bench
+from tests.support.proxy_bench import Bench
 
 
 @dataclass(eq=False)

@@ -21,7 +21,7 @@ from skyloop.network.config import free_port
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import Dialer, TransportServer
 from skyloop.transport.memory import MemoryServer
-from tests.integration.fake_vehicle import FakeVehicle
+from tests.support.fake_vehicle import FakeVehicle
 
 pytest.importorskip("cv2", reason="encoded video needs the extra 'network'")
 WAIT_S = 10.0

@@ -26,8 +26,8 @@ from skyloop.transport.local import LocalServer
 from skyloop.transport.local import dial as dial_local
 from skyloop.transport.memory import MemoryServer
 from skyloop.transport.testing import wait_until
-from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, scripted
-from tests.proxy.fake import FakeDriver
+from tests.support.proxy_bench import FakeDriver
+from tests.support.scripted_proxy import QUICK, WAIT_S, ScriptedProxy, scripted
 
 
 def _memory() -> tuple[TransportServer, Dialer]:

@@ -24,8 +24,8 @@ from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.vehicles.mavlink.emulator.manoeuvres import ORIGIN
 from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
-from tests.client.scripted import WAIT_S
-from tests.vehicles.tello.addresses import Addresses
+from tests.support.scripted_proxy import WAIT_S
+from tests.support.tello_addresses import Addresses
 
 SIM = "sim://?world=empty&seed=2&wind=0&noise=0&cameras=none"
 KINDS = {kind.value: kind for kind in Kind}

@@ -36,7 +36,7 @@ from skyloop.proxy.core.flight import BELIEF_NS
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import video
 from skyloop.transport.memory import MemoryServer
-from tests.integration.fake_vehicle import FakeVehicle
+from tests.support.fake_vehicle import FakeVehicle
 
 WAIT_S = 10.0
 

@@ -8,7 +8,7 @@ from skyloop.client.connection import Scheduler
 from skyloop.client.drone import open_drone
 from skyloop.messages import EventKind, Failsafe, FlightState, Hover, Land, Refusal, Takeoff
 from skyloop.transport.testing import wait_until
-from tests.proxy.fake import Bench
+from tests.support.proxy_bench import Bench
 
 WAIT_S = 10.0
 

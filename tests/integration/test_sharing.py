@@ -20,7 +20,7 @@ from skyloop.messages import Event, EventKind
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.memory import MemoryServer
 from skyloop.transport.testing import wait_until
-from tests.integration.fake_vehicle import FakeVehicle
+from tests.support.fake_vehicle import FakeVehicle
 
 WAIT_S = 10.0
 

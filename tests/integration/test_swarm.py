@@ -35,7 +35,7 @@ from skyloop.messages import AnyAction, FlightState, Hover, Land, LinkState, Vel
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.memory import MemoryServer
 from skyloop.transport.testing import wait_until
-from tests.integration.fake_vehicle import FakeVehicle
+from tests.support.fake_vehicle import FakeVehicle
 
 NAMES = ("alpha", "bravo", "charlie")
 QUICK = RedialPolicy(first_s=0.005, cap_s=0.05, hello_s=0.3, thresholds=Thresholds(late_s=0.1, silent_s=0.3))

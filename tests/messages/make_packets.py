@@ -9,7 +9,7 @@ import msgspec
 
 from skyloop.messages import Kind, encode
 from skyloop.messages.codec import HEADER, MAX_BODY, SIGNATURE, VERSION
-from tests.messages.samples import SAMPLES
+from tests.support.samples import SAMPLES
 
 FOLDER = Path(__file__).parents[1] / "data" / "packets"
 

@@ -40,7 +40,7 @@ from skyloop.messages import (
 from skyloop.messages.codec import HEADER, HEADER_SIZE, KINDS, MAX_BODY, SIGNATURE, VERSION
 from skyloop.messages.fields import LATEST_NS
 from skyloop.messages.frame import MAX_PIECE
-from tests.messages.samples import CAMERA, SAMPLES
+from tests.support.samples import CAMERA, SAMPLES
 
 PACKETS = Path(__file__).parents[1] / "data" / "packets"
 LONGEST_DECODE_S = 1.0

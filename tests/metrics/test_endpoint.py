@@ -18,7 +18,7 @@ from prometheus_client.parser import text_string_to_metric_families as parse_pla
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.metrics import FAMILIES, Endpoint, Reading, proxy_readings, serve, serve_proxies, serving_beside
 from skyloop.metrics.endpoint import MAX_SCRAPES, parse_where
-from tests.proxy.fake import Bench
+from tests.support.proxy_bench import Bench
 
 OPEN = {"Accept": "application/openmetrics-text; version=1.0.0"}
 

@@ -18,8 +18,8 @@ from skyloop.network.config import free_port
 from skyloop.network.session import Session
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.testing import header, picture
-from tests.client.scripted import WAIT_S, scripted
-from tests.proxy.fake import Bench
+from tests.support.proxy_bench import Bench
+from tests.support.scripted_proxy import WAIT_S, scripted
 
 Values = dict[tuple[str, ...], float]
 

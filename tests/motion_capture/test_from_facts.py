@@ -12,8 +12,8 @@ import pytest
 from skyloop.errors import LinkError
 from skyloop.motion_capture import BodyPose, TrackState, mocap
 from skyloop.transport.testing import wait_until
-from tests.integration.processes.conftest import Process
 from tests.motion_capture.moving import BODIES, frame_of, pose
+from tests.support.processes import Process
 
 pytest.importorskip("motioncapture", reason="needs the motioncapture package: skyloop install mocap")
 pytestmark = pytest.mark.process

@@ -14,8 +14,8 @@ from skyloop.motion_capture import BodyPose, MotionCapture, TrackState, mocap
 from skyloop.motion_capture.pose import z_up
 from skyloop.motion_capture.source import ChildSource
 from skyloop.transport.testing import wait_until
-from tests.integration.processes.conftest import Process
 from tests.motion_capture import natnet
+from tests.support.processes import Process
 from tests.support.recordings import recorded
 
 pytest.importorskip("motioncapture", reason="needs the motioncapture package: skyloop install mocap")

@@ -17,8 +17,8 @@ from skyloop.errors import ClosedError, UnknownNameError, UnsupportedError, Usag
 from skyloop.messages import LogEntry
 from skyloop.motion_capture import BodyPose, TrackState
 from skyloop.transport.testing import wait_until
-from tests.integration.processes.conftest import Process
-from tests.recording import files
+from tests.support import recording_files as files
+from tests.support.processes import Process
 
 pytestmark = pytest.mark.process
 TRUE = "sim://?world=empty&cameras=none&wind=0&truth=1"

@@ -21,9 +21,9 @@ from skyloop.motion_capture.source import ChildSource
 from skyloop.motion_capture.vrpn import COOKIE, SETTLE_S, SensorSelection, TrackerPose, split_name
 from skyloop.motion_capture.worker import RawFrame
 from skyloop.transport.testing import wait_until
-from tests.integration.processes.conftest import Process
 from tests.motion_capture import vrpn as server
 from tests.motion_capture.moving import BODIES, pose
+from tests.support.processes import Process
 
 TRACKER = BODIES[0]
 SECOND = 1_000_000_000

@@ -11,7 +11,7 @@ import pytest
 
 import skyloop
 from skyloop.messages import Annotation
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "detector_on_another_host.py"
 pytestmark = pytest.mark.process

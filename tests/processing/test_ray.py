@@ -18,7 +18,7 @@ import pytest
 import skyloop.ray
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.processing import Settings, Status
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 ROOT = Path(__file__).parents[2]
 OWN = ROOT / ".third-party" / "ray" / "bin" / "python"  #: Ray in an environment of its own, as it is large

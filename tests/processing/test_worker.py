@@ -16,9 +16,9 @@ from skyloop.client.drone import open_drone
 from skyloop.errors import NameTakenError, UsageError
 from skyloop.messages import Annotation, LogEntry, Polyline, Severity
 from skyloop.processing import Output, Settings, Worker
-from tests.client.scripted import QUICK
-from tests.integration.fake_vehicle import FakeVehicle
 from tests.integration.test_inprocess import WAIT_S, Node
+from tests.support.fake_vehicle import FakeVehicle
+from tests.support.scripted_proxy import QUICK
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.proxy.fake import Bench
+from tests.support.proxy_bench import Bench
 
 
 @pytest.fixture

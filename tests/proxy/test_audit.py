@@ -15,7 +15,7 @@ from skyloop.proxy import Proxy
 from skyloop.proxy.records import AuditTrail, Entry, Tenure, audit_path, entry_of, read, tenures
 from skyloop.proxy.serve import keep_trail
 from skyloop.transport.local import LocalServer
-from tests.proxy.fake import Bench, FakeDriver
+from tests.support.proxy_bench import Bench, FakeDriver
 
 NOON = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from skyloop.messages import EmergencyStop, EventKind, FlightState, Hover, Land, LinkState, Takeoff, Velocity
-from tests.proxy.fake import ALL, Bench
+from tests.support.proxy_bench import ALL, Bench
 
 ATTITUDE_ONLY = ("idle", "attitude", "emergency_stop", "reset_emergency")
 

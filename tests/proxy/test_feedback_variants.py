@@ -10,7 +10,7 @@ from skyloop.messages import EventKind, Feedback, Role, encode
 from skyloop.proxy import topics
 from skyloop.proxy.topics import MAX_VARIANTS
 from skyloop.transport.base import FEEDBACK
-from tests.proxy.fake import App, Bench
+from tests.support.proxy_bench import App, Bench
 
 SLOW = "feedback?max_hz=4"
 

@@ -32,7 +32,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.command import ENDINGS
 from skyloop.proxy.core.command_checks import SETTLED_NS, TAKEOFF_NS, Intent, Intents
-from tests.proxy.fake import ALL, App, Bench
+from tests.support.proxy_bench import ALL, App, Bench
 
 NOW = 100 * NS_PER_S
 S = FlightState

@@ -6,7 +6,7 @@ from skyloop.clock import nanoseconds
 from skyloop.errors import shortened
 from skyloop.messages import EventKind, LinkState
 from skyloop.proxy.serve import GRACE_NS, LinkLines
-from tests.proxy.fake import Bench
+from tests.support.proxy_bench import Bench
 
 WAITING = (LinkState.CONNECTING, "waiting for it", "plug it in")
 LOST = (LinkState.LOST, "no heartbeat", "plug it in")

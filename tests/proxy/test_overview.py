@@ -24,7 +24,7 @@ from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import OVERVIEW
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.memory import MemoryServer
-from tests.proxy.fake import App, Bench
+from tests.support.proxy_bench import App, Bench
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from skyloop.messages import (
 from skyloop.proxy.core.airspace import Airspace, Verdict
 from skyloop.proxy.core.settings import AirspaceSettings, Limits
 from skyloop.zones import Box, Cylinder, Space
-from tests.proxy.fake import ALL, App, Bench
+from tests.support.proxy_bench import ALL, App, Bench
 
 NOW = 100 * NS_PER_S
 LIMITS = Limits(climb=1.0, yaw_rate=1.5, speed=2.0, altitude=5.0)

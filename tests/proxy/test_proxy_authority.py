@@ -20,7 +20,7 @@ from skyloop.messages import (
     Takeover,
     Velocity,
 )
-from tests.proxy.fake import Bench
+from tests.support.proxy_bench import Bench
 
 
 def test_two_pilots_and_three_observers(bench: Bench) -> None:

@@ -34,7 +34,7 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from tests.proxy.fake import WAIT_S, App, Bench
+from tests.support.proxy_bench import WAIT_S, App, Bench
 
 
 def test_a_command_reaches_the_vehicle_and_is_echoed(bench: Bench) -> None:

@@ -27,7 +27,7 @@ from skyloop.messages import (
 )
 from skyloop.proxy.serve import end_all
 from skyloop.transport.testing import wait_until
-from tests.proxy.fake import App, Bench
+from tests.support.proxy_bench import App, Bench
 
 LONG_S = 30.0
 

@@ -20,7 +20,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from tests.proxy.fake import App, Bench
+from tests.support.proxy_bench import App, Bench
 
 VELOCITY = {"idle", "velocity", "emergency_stop", "reset_emergency"}
 ATTITUDE = {"idle", "attitude", "emergency_stop", "reset_emergency"}

@@ -26,7 +26,7 @@ from skyloop.messages import (
 )
 from skyloop.proxy.core.flight import BELIEF_NS, Whose
 from skyloop.transport.testing import wait_until
-from tests.proxy.fake import ALL, App, Bench
+from tests.support.proxy_bench import ALL, App, Bench
 
 
 def steps(app: App) -> list[tuple[object, object]]:

@@ -34,7 +34,7 @@ from skyloop.messages import (
     Welcome,
 )
 from skyloop.proxy.requests import MAX_KEPT, MAX_PENDING
-from tests.proxy.fake import WAIT_S, App, Bench
+from tests.support.proxy_bench import WAIT_S, App, Bench
 
 FPS = Parameter("camera.fps", ParameterType.INT, 15, "1/s", 1, 30, 15)
 

@@ -35,7 +35,7 @@ from skyloop.messages import (
 from skyloop.messages.frame import MAX_ENCODED
 from skyloop.proxy import Proxy
 from skyloop.transport.memory import MemoryServer
-from tests.proxy.fake import WAIT_S, App, Bench, FakeDriver
+from tests.support.proxy_bench import WAIT_S, App, Bench, FakeDriver
 
 PIXELS = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
 

@@ -9,7 +9,7 @@ import pytest
 from skyloop.drivers.base import ExternalPose
 from skyloop.errors import DriverError
 from skyloop.messages import EventKind, GetStatistics, Role, Statistics, VehiclePose, encode
-from tests.proxy.fake import App, Bench
+from tests.support.proxy_bench import App, Bench
 
 POSE = VehiclePose(3_000, (1.0, 2.0, 3.0), (0.1, 0.3, 0.5, 0.8062257748298549), 0.001, 0.01)
 

@@ -32,7 +32,7 @@ from skyloop.proxy.core.airspace import Airspace
 from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, StartPoint
 from skyloop.proxy.core.settings import AirspaceSettings, Limits, ReturnSettings
 from skyloop.zones import Box, Cylinder, Space
-from tests.proxy.fake import ALL, App, Bench
+from tests.support.proxy_bench import ALL, App, Bench
 
 NOW = 100 * NS_PER_S
 S = NS_PER_S

@@ -31,7 +31,7 @@ from skyloop.proxy.core.airspace import MARGIN_M, Airspace, Verdict
 from skyloop.proxy.core.settings import AirspaceSettings, Limits
 from skyloop.stepping.rehearsal import Radio, rehearse
 from skyloop.zones import BOX, ROOM, ZONES, Box, Cylinder, Space, Zone, check_written, parse_zones, space_of
-from tests.proxy.fake import ALL, Bench
+from tests.support.proxy_bench import ALL, Bench
 
 BOX_M = Box((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0))
 

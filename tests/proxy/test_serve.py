@@ -17,8 +17,8 @@ from skyloop.errors import UsageError
 from skyloop.messages import EventKind, Takeoff
 from skyloop.proxy.serve import serve
 from skyloop.transport.local import dial
-from tests.proxy.fake import WAIT_S, App
 from tests.proxy.toy_process import Toy
+from tests.support.proxy_bench import WAIT_S, App
 
 pytestmark = [pytest.mark.process, pytest.mark.skipif(sys.platform != "linux", reason="the local transport is Linux's")]
 

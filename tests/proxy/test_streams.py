@@ -29,7 +29,7 @@ from skyloop.messages import (
 from skyloop.proxy import streams
 from skyloop.proxy.streams import KEY_NS, StreamForm
 from skyloop.pyav import H264Encoder
-from tests.proxy.fake import WAIT_S, App, Bench
+from tests.support.proxy_bench import WAIT_S, App, Bench
 
 av = pytest.importorskip("av", reason="H.264 needs the extra 'video'")
 TOPIC = "stream/front?kbit_s=300"

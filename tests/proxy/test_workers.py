@@ -25,7 +25,7 @@ from skyloop.messages import (
 from skyloop.messages.relayed import pack
 from skyloop.proxy.relay import MAX_JOINED, SILENT_S, WorkerRoster
 from skyloop.transport.base import RESULTS, results
-from tests.proxy.fake import App, Bench
+from tests.support.proxy_bench import App, Bench
 
 CODE = "Detector 0123"
 

@@ -12,7 +12,7 @@ from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Sink
 from skyloop.messages import AnyAction, FlightState, Land, LinkState, Takeoff
 from skyloop.proxy import serve as serving
-from tests.proxy.fake import FakeDriver
+from tests.support.proxy_bench import FakeDriver
 
 
 class Toy(FakeDriver):

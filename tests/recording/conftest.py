@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from skyloop.cli import main
-from tests.cli.conftest import Ended
-from tests.recording.flights import Plan, write_flight
+from tests.support.commands import Ended
+from tests.support.recorded_flights import Plan, write_flight
 
 
 @pytest.fixture(scope="session")

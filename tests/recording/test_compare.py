@@ -14,8 +14,8 @@ from skyloop.messages import Feedback
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
 from skyloop.recording.review.tables import tables
-from tests.cli.conftest import Ended
-from tests.recording.flights import MS, Plan, feedback_at, write_flight
+from tests.support.commands import Ended
+from tests.support.recorded_flights import MS, Plan, feedback_at, write_flight
 
 Log = Callable[..., Ended]
 

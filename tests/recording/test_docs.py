@@ -10,7 +10,7 @@ from skyloop.cli.app import build
 from skyloop.recording import layout
 from skyloop.recording.backlog import RESERVE
 from skyloop.recording.options import CHOICES, MB, RecorderState
-from tests.docs.pages import ROOT, rows, section
+from tests.support.pages import ROOT, rows, section
 
 PAGE = "docs/recording.md"
 TEXT = (ROOT / PAGE).read_text()

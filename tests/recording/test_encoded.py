@@ -37,8 +37,8 @@ from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports, with_ardrones
 from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
-from tests.integration.fake_vehicle import FakeVehicle
-from tests.recording import files
+from tests.support import recording_files as files
+from tests.support.fake_vehicle import FakeVehicle
 from tests.support.recordings import recorded
 
 WAIT_S = 20.0

@@ -43,10 +43,10 @@ from skyloop.recording.layout import META_END, META_RECORDING, End, FrameRecord,
 from skyloop.recording.options import CHOICES, Options, RecorderState, channels_of
 from skyloop.recording.taps import Gaps, Video, encoder
 from skyloop.transport.memory import MemoryServer
-from tests.integration.fake_vehicle import PERIOD_S, FakeVehicle
-from tests.recording import files
 from tests.recording.disks import Disk
-from tests.recording.files import read_image
+from tests.support import recording_files as files
+from tests.support.fake_vehicle import PERIOD_S, FakeVehicle
+from tests.support.recording_files import read_image
 
 WAIT_S = 10.0
 INTRINSICS = Intrinsics(30.0, 30.0, 16.0, 12.0)

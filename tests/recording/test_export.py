@@ -21,8 +21,8 @@ from skyloop.recording.review import video
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.tables import Table, export_csv, export_npz, export_parquet, read, tables
 from skyloop.recording.review.video import export_mp4
-from tests.cli.conftest import Ended
-from tests.recording.flights import BEGIN_NS, MS, Plan, write_flight
+from tests.support.commands import Ended
+from tests.support.recorded_flights import BEGIN_NS, MS, Plan, write_flight
 
 Log = Callable[..., Ended]
 TABLES = {"feedback", "commands", "events", "parameters", "logs", "results", "frames.front", "drops"}

@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 from skyloop.messages import Annotation, CameraInfo, Feedback, Intrinsics, Severity
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.recording import foxglove
-from tests.messages.samples import CAMERA, SAMPLES
-from tests.recording.files import read_image, read_pose
+from tests.support.recording_files import read_image, read_pose
+from tests.support.samples import CAMERA, SAMPLES
 
 AT_NS = 1_700_000_000_123_456_789
 angles = st.floats(-math.pi, math.pi)

@@ -16,8 +16,8 @@ from rich.console import Console
 from skyloop.cli import log_tables
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.summary import summarise
-from tests.cli.conftest import Ended
-from tests.recording.flights import Plan, write_flight
+from tests.support.commands import Ended
+from tests.support.recorded_flights import Plan, write_flight
 
 Log = Callable[..., Ended]
 

@@ -44,7 +44,7 @@ from skyloop.recording.layout import (
     to_metadata,
     to_plain,
 )
-from tests.messages.samples import CAMERA, SAMPLES, TILT
+from tests.support.samples import CAMERA, SAMPLES, TILT
 
 header = SAMPLES["frame"]
 assert isinstance(header, FrameHeader)

@@ -26,8 +26,8 @@ from skyloop.recording.layout import (
 )
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.tables import tables
-from tests.cli.conftest import Ended
-from tests.recording.flights import Plan, feedback_at
+from tests.support.commands import Ended
+from tests.support.recorded_flights import Plan, feedback_at
 
 OLD = Path(__file__).parents[1] / "data" / "recordings" / "layout-1.mcap"
 PLAN = Plan(seconds=1.0, frame_ms=250, lossy=False)

@@ -23,8 +23,8 @@ from skyloop.recording.reader import Recording
 from skyloop.recording.review.episodes import Episode, Form, episodes, form_of
 from skyloop.recording.review.lerobot import export_lerobot
 from skyloop.recording.review.tables import Table, tables
-from tests.cli.conftest import Ended
-from tests.recording.flights import BEGIN_NS, HEIGHT, MS, WIDTH, Plan, feedback_at, picture_at, write_flight
+from tests.support.commands import Ended
+from tests.support.recorded_flights import BEGIN_NS, HEIGHT, MS, WIDTH, Plan, feedback_at, picture_at, write_flight
 
 Log = Callable[..., Ended]
 CHANNELS = (Channel.FEEDBACK, Channel.COMMANDS, Channel.LOGS, Channel.FRAMES)
@@ -182,7 +182,7 @@ def test_what_can_not_be_learnt_from_is_told(tmp_path: Path, recording: Path) ->
 def test_recordings_that_do_not_go_together_are_refused(
     tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tests.recording.flights.action_at", lambda plan, at_ms: Attitude(roll=0.1))
+    monkeypatch.setattr("tests.support.recorded_flights.action_at", lambda plan, at_ms: Attitude(roll=0.1))
     other = write_flight(tmp_path / "other.mcap", PLAN)
     with pytest.raises(UsageError, match=r"other.mcap has attitude .* and .*flight.mcap velocity"):
         export_lerobot([Recording.open(recording), Recording.open(other)], tmp_path / "a")

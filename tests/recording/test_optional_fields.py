@@ -43,8 +43,8 @@ from skyloop.recording.translation import Picture, Translator
 from skyloop.vehicles.replay.playback import Playback
 from skyloop.vehicles.replay.player import StepPlayer
 from skyloop.vehicles.replay.source import ReplaySource
-from tests.messages.samples import SAMPLES, TILT
-from tests.recording.flights import BEGIN_NS, CAPABILITIES, UNIX_NS, Plan, feedback_at, picture_at
+from tests.support.recorded_flights import BEGIN_NS, CAPABILITIES, UNIX_NS, Plan, feedback_at, picture_at
+from tests.support.samples import SAMPLES, TILT
 
 CLOCK = ClockPair(BEGIN_NS, UNIX_NS, 1)
 

@@ -12,8 +12,8 @@ from skyloop.messages import Feedback
 from skyloop.recording import foxglove, layout
 from skyloop.recording.layout import META_CLOCK, META_END, META_RECORDING, ClockPair, DroneRecord, End, Start
 from skyloop.recording.output import Message, RecordingFile
-from tests.recording import files
 from tests.recording.disks import Disk
+from tests.support import recording_files as files
 
 START = Start(1, "0.1", (DroneRecord("alpha"),), 5)
 CLOCK = ClockPair(0, 1_000_000_000_000_000_000, 1, "boot")

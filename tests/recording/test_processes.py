@@ -21,8 +21,8 @@ from skyloop.recording.layout import META_END, ClockPair, End, FrameRecord
 from skyloop.recording.options import RecorderState
 from skyloop.recording.recorder import RecorderProcess
 from skyloop.transport.priority import SUPERSEDED
-from tests.integration.processes.conftest import Process
-from tests.recording import files
+from tests.support import recording_files as files
+from tests.support.processes import Process
 
 pytestmark = pytest.mark.process
 SIM = "sim://?world=empty&cameras=front&wind=0"

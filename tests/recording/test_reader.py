@@ -22,7 +22,17 @@ from skyloop.recording.plain import Course, reported_ns, shifted
 from skyloop.recording.reader import Item, Recording
 from skyloop.recording.review.tables import tables
 from skyloop.vehicles.replay.source import ReplaySource
-from tests.recording.flights import BEGIN_NS, HEIGHT, MS, UNIX_NS, WIDTH, Plan, feedback_at, picture_at, write_flight
+from tests.support.recorded_flights import (
+    BEGIN_NS,
+    HEIGHT,
+    MS,
+    UNIX_NS,
+    WIDTH,
+    Plan,
+    feedback_at,
+    picture_at,
+    write_flight,
+)
 
 
 def counts(path: Path) -> Counter[str]:
@@ -244,7 +254,7 @@ def test_a_course_goes_on_when_the_proxys_computer_starts_again() -> None:
 def test_a_flight_whose_proxy_started_again_is_replayed_and_exported_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tests.recording.flights._events", lambda *_: iter(()))  # whose clock is the first one
+    monkeypatch.setattr("tests.support.recorded_flights._events", lambda *_: iter(()))  # whose clock is the first one
 
     def after(at_ms: int) -> Feedback | None:
         if at_ms < 1000:

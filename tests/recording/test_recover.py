@@ -12,8 +12,8 @@ from mcap.reader import make_reader
 from skyloop.errors import UsageError
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.summary import problems, recover
-from tests.cli.conftest import Ended
-from tests.recording.flights import Plan, write_flight
+from tests.support.commands import Ended
+from tests.support.recorded_flights import Plan, write_flight
 
 Log = Callable[..., Ended]
 

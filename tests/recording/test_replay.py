@@ -27,7 +27,7 @@ from skyloop.recording.review.compare import compare
 from skyloop.stepping.replay import SteppedReplay, connector
 from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.replay.driver import ReplayDriver
-from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, Plan, write_flight
+from tests.support.recorded_flights import BEGIN_NS, CAPABILITIES, MS, Plan, write_flight
 
 WAIT_S = 10.0
 

@@ -24,8 +24,8 @@ from skyloop.recording.review import charts
 from skyloop.recording.review import flight as facts
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.tables import Table
-from tests.cli.conftest import Ended
-from tests.recording.flights import Plan, feedback_at, write_flight
+from tests.support.commands import Ended
+from tests.support.recorded_flights import Plan, feedback_at, write_flight
 
 Log = Callable[..., Ended]
 

@@ -20,8 +20,8 @@ from skyloop.errors import FileFormatError, UsageError
 from skyloop.recording.reader import Recording
 from skyloop.recording.review import video as copying
 from skyloop.recording.review.video import Videos, contents, export_mp4, numbered
-from tests.cli.conftest import Ended
 from tests.recording.streams import GROUP, STEP_NS, Unit, film, write_film
+from tests.support.commands import Ended
 
 Image = NDArray[np.uint8]
 STEP_S = STEP_NS / 1e9

@@ -25,7 +25,7 @@ from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import Channel, ClockPair, FrameRecord, ResultRecord
 from skyloop.recording.output import Message
 from skyloop.recording.translation import Path, Picture, Translator
-from tests.messages.samples import CAMERA
+from tests.support.samples import CAMERA
 
 UNIX = 1_000_000_000_000_000_000
 CLOCK = ClockPair(0, UNIX, 1)

@@ -29,8 +29,8 @@ from skyloop.recording.layout import META_END, META_RECORDING, ClockPair, DroneR
 from skyloop.recording.options import MB, Options, Room, judge_room
 from skyloop.recording.translation import Picture, Translator
 from skyloop.recording.writer import FileWriter
-from tests.recording import files
 from tests.recording.disks import Disk
+from tests.support import recording_files as files
 
 CLOCK = ClockPair(0, 1_000_000_000_000_000_000, 1)
 ABLE = Capabilities("test")

@@ -28,8 +28,8 @@ from skyloop.vehicles.ros2.node import (
     ros_name,
     stay_on_this_machine,
 )
-from tests.integration.fake_vehicle import FakeVehicle
 from tests.support.fake_rclpy import Fake, Message, Node
+from tests.support.fake_vehicle import FakeVehicle
 
 WAIT_S = 10.0
 

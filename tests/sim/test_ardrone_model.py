@@ -29,8 +29,8 @@ from skyloop.sim.identification import (
 from skyloop.sim.parameters import GRAVITY_M_S2, with_ideal_sensors
 from skyloop.sim.streams import Floats
 from skyloop.sim.vehicles import AR_DRONE
-from tests.docs.pages import rows, section
 from tests.sim.helpers import HALL, IDEAL, flying, steps
+from tests.support.pages import rows, section
 from tests.support.recordings import recorded
 
 JUDGED = ("0.5sImpulseHalfMagNH1", "0.5sImpulseNH6", "1sImpulseNH1")

@@ -28,7 +28,7 @@ from skyloop.sim.rotor_dynamics import (
     spin,
 )
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
-from tests.docs.pages import rows, section
+from tests.support.pages import rows, section
 
 VEHICLES = [RACER, IRIS, CRAZYFLIE]
 CONSTANTS = [constants_of(vehicle) for vehicle in VEHICLES]

@@ -61,8 +61,8 @@ from skyloop.proxy.proxy import Proxy
 from skyloop.recording.options import RecorderState, Status
 from skyloop.transport.base import ClientHandler, TransportClient
 from skyloop.transport.memory import MemoryServer
-from tests.cockpit.testclient import TestClient, WebSocketTestSession
-from tests.integration.fake_vehicle import NEXT
+from tests.support.fake_vehicle import NEXT
+from tests.support.testclient import TestClient, WebSocketTestSession
 
 OWN = "http://127.0.0.1:8123"
 SOCKETS = "ws://127.0.0.1:8123/ws"

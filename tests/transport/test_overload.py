@@ -16,7 +16,7 @@ from skyloop.transport.local import LocalServer, dial
 from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 from skyloop.transport.priority import SUPERSEDED, PacketBacklog
 from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
-from tests.proxy.fake import Bench
+from tests.support.proxy_bench import Bench
 
 FLY, LAND = Velocity(forward=1.0), Land()
 BLOCK = encode(Request(1, Ping(1)))

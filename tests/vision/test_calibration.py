@@ -14,7 +14,7 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.messages import Intrinsics
 from skyloop.vision import Board, BoardFinder, BoardView, Collector, calibrate, unproject
-from tests.vision.board_pictures import FISHEYE, PINHOLE, SIZE, photograph, poses
+from tests.support.board_pictures import FISHEYE, PINHOLE, SIZE, photograph, poses
 
 CHARUCO, CHESSBOARD = Board(), Board(kind="chessboard")
 FILE = Calibration(width=640, height=480, model="pinhole", fx=500.0, fy=501.0, cx=320.0, cy=240.0, rms_px=0.2, views=9)

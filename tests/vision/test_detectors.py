@@ -17,7 +17,7 @@ from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 from skyloop.vision import Layout, ObjectDetector, OnnxDetector
 from skyloop.vision.detector_layouts import class_count, decode, grid_places, tell_layout
 from skyloop.vision.object_tracks import suppress
-from tests.vision.networks import write
+from tests.support.networks import write
 
 W, H = 96, 64
 N = grid_places(W, H)[0]

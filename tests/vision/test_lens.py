@@ -13,7 +13,7 @@ from skyloop.messages import Intrinsics
 from skyloop.sim.camera import FRONT_CAMERA
 from skyloop.vision import project, undistort, unproject
 from skyloop.vision.lens import normalised
-from tests.vision.board_pictures import FISHEYE, PINHOLE
+from tests.support.board_pictures import FISHEYE, PINHOLE
 
 pixels = st.lists(st.tuples(st.floats(0, 639), st.floats(0, 479)), min_size=1, max_size=20)
 

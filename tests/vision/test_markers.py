@@ -13,7 +13,7 @@ import pytest
 from skyloop.errors import MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import CameraInfo, Intrinsics
 from skyloop.vision import MarkerDetector, MarkerSighting
-from tests.vision.draw import INTRINSICS, facing, picture, project, square
+from tests.support.marker_pictures import INTRINSICS, facing, picture, project, square
 
 FORWARD = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
 

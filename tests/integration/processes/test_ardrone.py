@@ -13,7 +13,7 @@ import skyloop
 from skyloop.control.follow import FollowMarker
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
 from skyloop.vehicles.ardrone.emulator.video import FRONT_1
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]
 

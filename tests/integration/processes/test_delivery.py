@@ -14,7 +14,7 @@ import pytest
 import skyloop
 from skyloop.messages import FlightState
 from skyloop.transport.local import dial
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = pytest.mark.process
 

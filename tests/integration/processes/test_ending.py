@@ -12,7 +12,7 @@ import pytest
 import skyloop
 from skyloop.errors import SkyloopError
 from skyloop.messages import EventKind
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 pytestmark = pytest.mark.process
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.integration.processes.conftest import Process
 from tests.integration.processes.test_mavlink import ADDRESS, KINDS
+from tests.support.processes import Process
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 

@@ -17,8 +17,8 @@ import skyloop
 from skyloop.host.serve import Remove, Status, ask
 from skyloop.host.vehicle import VehicleStatus
 from skyloop.messages import EventKind, LinkState
-from tests.integration.processes.conftest import Process, eventually, skyloop_command
 from tests.integration.processes.test_mavlink import ADDRESS, wait_until_ready
+from tests.support.processes import Process, eventually, skyloop_command
 
 pytestmark = pytest.mark.process
 

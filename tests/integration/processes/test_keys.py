@@ -17,7 +17,7 @@ from skyloop.messages import EventKind
 from skyloop.network.config import free_port
 from skyloop.network.keys import Lab
 from skyloop.network.keys.identity import make_identity
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = pytest.mark.process
 LOCAL = "127.0.0.1"

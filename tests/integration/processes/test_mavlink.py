@@ -15,7 +15,7 @@ import skyloop
 from skyloop.control.follow import FollowMarker
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
 from skyloop.vehicles.mavlink.emulator import CAMERA
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.integration.processes.conftest import Process, skyloop_command
+from tests.support.processes import Process, skyloop_command
 
 
 def scraped(process: Process) -> str:

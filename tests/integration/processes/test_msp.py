@@ -10,7 +10,7 @@ import pytest
 
 import skyloop
 from skyloop.messages import Failsafe, FlightState, LinkState
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(240)]
 

@@ -18,7 +18,7 @@ from skyloop.errors import UnknownNameError
 from skyloop.messages import EventKind, LinkState
 from skyloop.network import FabricSettings
 from skyloop.network.config import free_port
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = pytest.mark.process
 LOCAL = "127.0.0.1"

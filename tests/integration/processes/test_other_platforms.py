@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.network.config import free_port
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.process

@@ -23,7 +23,7 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = pytest.mark.process
 

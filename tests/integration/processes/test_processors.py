@@ -13,7 +13,7 @@ import pytest
 import skyloop
 from skyloop.client import Drone, Result
 from skyloop.messages import LinkState
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = pytest.mark.process
 

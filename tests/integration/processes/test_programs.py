@@ -9,7 +9,7 @@ import pytest
 
 import skyloop
 from skyloop.errors import UnknownNameError
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = pytest.mark.process
 

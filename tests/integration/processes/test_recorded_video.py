@@ -11,7 +11,7 @@ import skyloop
 from skyloop.errors import UnsupportedError
 from skyloop.recording.reader import Recording
 from skyloop.vehicles.ardrone.wire.pave import PaveParser
-from tests.integration.processes.conftest import eventually
+from tests.support.processes import eventually
 from tests.support.recordings import recorded
 
 pytestmark = pytest.mark.process

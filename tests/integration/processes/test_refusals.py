@@ -12,7 +12,7 @@ import skyloop
 from skyloop.errors import ParameterError, UnknownNameError, UsageError
 from skyloop.messages import Command, EventKind, FlightState, Velocity, encode
 from skyloop.transport.local import dial
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.processes import Process, eventually
 
 pytestmark = pytest.mark.process
 

@@ -11,8 +11,8 @@ import pytest
 import skyloop
 from skyloop.control.follow import FollowMarker
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
-from tests.integration.processes.conftest import Process, eventually
-from tests.vehicles.tello.addresses import Addresses
+from tests.support.processes import Process, eventually
+from tests.support.tello_addresses import Addresses
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(240)]
 pytest.importorskip("av")

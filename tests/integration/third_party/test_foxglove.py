@@ -19,8 +19,8 @@ import pytest
 
 import skyloop
 from skyloop.messages import Polyline
-from tests.integration.processes.conftest import Process
 from tests.integration.third_party.conftest import HERE, PATIENCE_S, absent, node_modules
+from tests.support.processes import Process
 
 pytestmark = pytest.mark.process
 SIM = "sim://?world=room&seed=1&cameras=front"

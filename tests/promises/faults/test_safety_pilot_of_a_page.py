@@ -10,9 +10,9 @@ from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.fleet import Fleet
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink.emulator import Kind
-from tests.cockpit.fake import cockpit
 from tests.cockpit.test_control import page
 from tests.promises.faults.test_vehicle_of_others import KINDS, Scene, taken_off
+from tests.support.cockpit import cockpit
 
 pytestmark = pytest.mark.timeout(60)
 

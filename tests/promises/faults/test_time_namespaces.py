@@ -16,8 +16,8 @@ from skyloop.client.drone import open_drone
 from skyloop.clock import clock_identity
 from skyloop.proxy import Proxy, proxy
 from skyloop.transport.memory import MemoryServer
-from tests.integration.fake_vehicle import FakeVehicle
-from tests.integration.processes.conftest import Process, eventually
+from tests.support.fake_vehicle import FakeVehicle
+from tests.support.processes import Process, eventually
 
 AHEAD_S = 1000
 UNSHARE = ("unshare", "--time", "--monotonic", str(AHEAD_S))

@@ -241,7 +241,7 @@ def _hello() -> bytes:
 
 @cache
 def _bench() -> Any:
-    from tests.proxy.fake import Bench
+    from tests.support.proxy_bench import Bench
 
     bench = Bench()
     bench.__enter__()

@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.hosts.namespaces import Host, Lab, Segment, problem
 from benchmarks.measuring.workers import Workers
-from tests.integration.processes.conftest import Process
 from tests.promises.hosts.remote import Remote
+from tests.support.processes import Process
 
 #: A vehicle without cameras, in whose world time passes three times as fast: it flies no better, and takes off sooner.
 FAST = "sim://?world=empty&cameras=none&speed=3"

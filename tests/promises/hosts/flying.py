@@ -8,8 +8,8 @@ from typing import Any
 
 import skyloop
 from skyloop.messages import Applied, Event, LinkState
-from tests.integration.processes.conftest import eventually
 from tests.promises.hosts.remote import Here
+from tests.support.processes import eventually
 
 PERIOD_S = 0.05
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.integration.processes.conftest import Process
 from tests.promises.hosts import flying
 from tests.promises.hosts.conftest import Lan
 from tests.promises.hosts.remote import Remote, RemoteError
+from tests.support.processes import Process
 
 Start = Callable[..., Process]
 OnHost = Callable[..., Remote]

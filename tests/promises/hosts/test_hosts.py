@@ -18,7 +18,7 @@ from benchmarks.hosts.namespaces import Host, Lab
 from benchmarks.hosts.path import Path
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.transport.testing import wait_until
-from tests.integration.processes.conftest import Process
+from tests.support.processes import Process
 
 PROBES = str(File(__file__).parent / "probes.py")
 PERIOD_S = 0.005

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import pytest
 
 from benchmarks.hosts.namespaces import Lab
-from tests.integration.processes.conftest import Process
 from tests.promises.hosts import flying
 from tests.promises.hosts.conftest import FAST
 from tests.promises.hosts.remote import Remote
+from tests.support.processes import Process
 
 Start = Callable[..., Process]
 OnHost = Callable[..., Remote]

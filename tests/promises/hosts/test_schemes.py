@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from tests.integration.processes.conftest import Process
 from tests.promises.hosts import flying
 from tests.promises.hosts.conftest import FAST, Lan
 from tests.promises.hosts.remote import Remote, RemoteError
+from tests.support.processes import Process
 
 Start = Callable[..., Process]
 OnHost = Callable[..., Remote]

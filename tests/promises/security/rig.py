@@ -25,7 +25,7 @@ from skyloop.network.keys import KeyRing, Lab, load
 from skyloop.network.keys.identity import make_identity
 from skyloop.network.sealing import Open
 from skyloop.transport.base import Dialer
-from tests.proxy.fake import App, Bench
+from tests.support.proxy_bench import App, Bench
 
 DRONE = "alpha"
 ANSWER_S = 0.3

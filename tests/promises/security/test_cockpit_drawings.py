@@ -14,7 +14,7 @@ from skyloop.clock import ManualClock
 from skyloop.cockpit.feeds import KEPT_S, MAX_SERIES, MAX_SOURCES, MAX_WAYPOINTS, EventFeed, LogFeed, Newest
 from skyloop.cockpit.stream import DRAWN_BYTES, PageCounts, VideoSender
 from skyloop.messages import Annotation, LogEntry, Points
-from tests.cockpit.fake import FakeDrone
+from tests.support.cockpit import FakeDrone
 
 SOURCES = 3000
 LARGE = (Points(tuple((float(n), float(n)) for n in range(1500)), (255, 0, 0)),)

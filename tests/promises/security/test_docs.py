@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from skyloop.messages import Refusal
 from skyloop.messages.command import ENDINGS
-from tests.docs.pages import rows, section
 from tests.promises.security import test_doors, test_replays
 from tests.promises.security.deeds import DEEDS
 from tests.promises.security.test_attempts import COLUMNS, works
+from tests.support.pages import rows, section
 
 PAGE = "docs/security.md"
 DOORS = {

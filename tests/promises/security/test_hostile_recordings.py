@@ -36,8 +36,8 @@ from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import recover, summarise
 from skyloop.recording.review.tables import export_csv, export_npz, read
 from skyloop.vehicles.replay.source import ReplaySource
-from tests.cli.conftest import Ended
-from tests.recording.flights import Plan, write_flight
+from tests.support.commands import Ended
+from tests.support.recorded_flights import Plan, write_flight
 
 MAX_NS = (1 << 63) - 1
 RECORD = struct.Struct("<BQ")

@@ -48,7 +48,7 @@ from skyloop.messages.subscription import FrameFilter
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import ClockPair
 from skyloop.recording.translation import Translator
-from tests.messages.samples import SAMPLES
+from tests.support.samples import SAMPLES
 
 LONGEST_S = 1.0
 MOST_BYTES = 8_000_000

@@ -22,7 +22,7 @@ from skyloop.transport.local.directory import connect, find_directory
 from skyloop.transport.local.packets import Bye, hello, parse
 from skyloop.transport.local.sockets import Credentials, Socket
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
-from tests.proxy.fake import WAIT_S, Bench
+from tests.support.proxy_bench import WAIT_S, Bench
 
 SERVER = "skyloop.transport.local.server"
 

@@ -28,7 +28,7 @@ from skyloop.proxy.requests import MAX_MALFORMED
 from skyloop.proxy.topics import PLAIN, topic_problem
 from skyloop.transport.base import ANNOTATIONS, MAX_SUBSCRIPTIONS, RESULTS
 from skyloop.transport.testing import header, picture, wait_until
-from tests.proxy.fake import WAIT_S, App, Bench
+from tests.support.proxy_bench import WAIT_S, App, Bench
 
 CAMERAS = ("front", "bottom")
 

@@ -23,7 +23,7 @@ from skyloop.transport.local import LocalServer
 from skyloop.transport.local import dial as local_dial
 from skyloop.transport.memory import MemoryServer
 from skyloop.transport.testing import wait_until
-from tests.proxy.fake import App, Bench
+from tests.support.proxy_bench import App, Bench
 
 
 def memory() -> tuple[TransportServer, Dialer]:

@@ -37,7 +37,7 @@ from skyloop.vehicles.mavlink.options import options_of as mavlink_options
 from skyloop.vehicles.replay.options import options_of as replay_options
 from skyloop.vehicles.sim.options import firmware_options
 from skyloop.vehicles.video.options import options_of as video_options
-from tests.proxy.fake import App, Bench
+from tests.support.proxy_bench import App, Bench
 
 SECRET = "s3cr3t"
 CAMERA = f"rtsp://admin:{SECRET}@127.0.0.1:9/live"

@@ -13,7 +13,7 @@ from skyloop.messages import Applied, Event, EventKind
 from skyloop.network.config import free_port
 from skyloop.network.keys import Lab
 from skyloop.network.keys.identity import make_identity
-from tests.integration.processes.conftest import Process, eventually, sockets, start
+from tests.support.processes import Process, eventually, sockets, start
 
 __all__ = ["sockets", "start"]  # fixtures
 pytestmark = pytest.mark.process

@@ -41,12 +41,12 @@ from skyloop.recording.rerun_log import RerunLog, Shown
 from skyloop.recording.rerun_viewer import RerunViewer, export_rrd
 from skyloop.recording.translation import Picture
 from skyloop.recording.view import View
-from tests.cli.conftest import Ended
-from tests.recording.flights import CAPABILITIES, MS, UNIX_NS
 from tests.recording.live import fake_rerun
 from tests.recording.live.conftest import Fly
-from tests.recording.live.fake_rerun import Stream
 from tests.recording.streams import film, write_film
+from tests.support.commands import Ended
+from tests.support.fake_rerun import Stream
+from tests.support.recorded_flights import CAPABILITIES, MS, UNIX_NS
 
 CAMERA = "cameras/alpha/front"  # nobody knows where it is mounted
 RERUN = os.environ.get("SKYLOOP_RERUN") or (sys.executable if find_spec("rerun") else "")

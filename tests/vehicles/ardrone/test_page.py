@@ -12,7 +12,7 @@ from skyloop.vehicles.ardrone.setpoints import SetpointController
 from skyloop.vehicles.ardrone.telemetry import _REASONS
 from skyloop.vehicles.ardrone.video import cameras_of
 from skyloop.vehicles.ardrone.wire.configuration import format_value, keys_of
-from tests.docs.pages import rows, section
+from tests.support.pages import rows, section
 
 DRIVER = section("docs/ardrone.md", "## The driver")
 

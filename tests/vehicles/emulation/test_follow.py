@@ -19,7 +19,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports, with_ardrones
 from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
 from skyloop.vision import simulated_detector
-from tests.vehicles.tello.addresses import Addresses
+from tests.support.tello_addresses import Addresses
 
 pytest.importorskip("av")
 pytest.importorskip("cv2")

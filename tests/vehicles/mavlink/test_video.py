@@ -24,8 +24,8 @@ from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink import emulator
 from skyloop.vehicles.mavlink.driver import MavlinkDriver
 from skyloop.vehicles.mavlink.emulator import Kind, Ports, TransportStream
-from tests.drivers.film import FPS, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
-from tests.drivers.rtsp_server import HOST, RtspServer
+from tests.support.film import FPS, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
+from tests.support.rtsp_server import HOST, RtspServer
 from tests.vehicles.ardrone.video_ports import TcpPort
 
 PATIENCE_S = 30.0

@@ -22,7 +22,7 @@ from skyloop.vehicles.msp.emulator.board import bit
 from skyloop.vehicles.msp.wire.firmwares import flag_names
 from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import Function, Status, channels, pack_channels
-from tests.vehicles.msp.rig import world
+from tests.support.betaflight import world
 from tests.vehicles.msp.sitl import MSP_PORT, Sitl
 from tests.vehicles.sim.firmware.real_betaflight import real_betaflight
 

@@ -24,8 +24,8 @@ from skyloop.vehicles.msp.emulator import BetaflightFirmware
 from skyloop.vehicles.msp.link import MspLink
 from skyloop.vehicles.msp.wire.frames import Parser
 from skyloop.vehicles.msp.wire.messages import Function
+from tests.support.betaflight import world
 from tests.vehicles.msp.bench import Bench
-from tests.vehicles.msp.rig import world
 
 
 class Wire(threading.Thread):

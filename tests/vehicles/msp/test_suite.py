@@ -10,7 +10,7 @@ from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.vehicles.msp.emulator import BetaflightFirmware
-from tests.vehicles.msp.rig import Cameras, SeenDriver, world
+from tests.support.betaflight import Cameras, SeenDriver, world
 
 
 class TestBetaflight(DriverSuite):

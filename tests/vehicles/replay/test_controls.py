@@ -29,7 +29,7 @@ from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.replay.playback import PAUSED, POSITION, SPEED, Playback
 from skyloop.vehicles.replay.player import IDLE_S, Player
 from skyloop.vehicles.replay.source import ReplaySource, Timeline
-from tests.recording.flights import BEGIN_NS, MS, WIDTH, Plan, feedback_at, write_flight
+from tests.support.recorded_flights import BEGIN_NS, MS, WIDTH, Plan, feedback_at, write_flight
 
 Action = Callable[[Playback], object]
 END_S = 3.9  #: within 0.1 s of the end of the flight

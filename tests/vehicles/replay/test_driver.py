@@ -46,8 +46,8 @@ from skyloop.vehicles.replay.driver import ReplayDriver
 from skyloop.vehicles.replay.options import KNOWN
 from skyloop.vehicles.replay.publisher import ReplayPublisher
 from skyloop.vehicles.replay.source import ReplaySource, Timeline
-from tests.docs.pages import rows, section
-from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, UNIX_NS, Plan, feedback_at, write_flight
+from tests.support.pages import rows, section
+from tests.support.recorded_flights import BEGIN_NS, CAPABILITIES, MS, UNIX_NS, Plan, feedback_at, write_flight
 
 WAIT_S = 10.0
 

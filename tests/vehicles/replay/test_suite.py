@@ -11,7 +11,7 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import VehicleUri
-from tests.recording.flights import CAPABILITIES, Plan, write_flight
+from tests.support.recorded_flights import CAPABILITIES, Plan, write_flight
 
 PLANS = {
     "flown": Plan(),

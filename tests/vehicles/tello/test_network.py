@@ -17,7 +17,7 @@ from skyloop.messages import FlightState, LinkState, Refusal, Takeoff
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
-from tests.vehicles.tello.addresses import Addresses
+from tests.support.tello_addresses import Addresses
 
 pytest.importorskip("av")
 PATIENCE_S = 20.0

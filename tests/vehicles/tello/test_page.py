@@ -10,7 +10,7 @@ from skyloop.vehicles.tello import options
 from skyloop.vehicles.tello.parameters import SETTINGS, flip_parameter, scale_parameters
 from skyloop.vehicles.tello.protocol import ALIVE_NS, DEGRADED_NS, ENTER_NS, LOST_NS
 from skyloop.vehicles.tello.setpoints import Scale, sticks_of
-from tests.docs.pages import rows, section
+from tests.support.pages import rows, section
 
 
 def names(cell: str) -> list[str]:

@@ -12,7 +12,7 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
-from tests.vehicles.tello.addresses import Addresses
+from tests.support.tello_addresses import Addresses
 
 
 class TestTello(DriverSuite):

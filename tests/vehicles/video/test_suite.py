@@ -9,9 +9,9 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import parse_uri
-from tests.drivers.film import HEIGHT, WIDTH, Film, Projector
-from tests.drivers.rtsp_server import RtspServer
+from tests.support.film import HEIGHT, WIDTH, Film, Projector
 from tests.support.recordings import FIXTURES, needs_recordings
+from tests.support.rtsp_server import RtspServer
 
 
 @needs_recordings

@@ -21,7 +21,7 @@ from skyloop.vehicles.ardrone.wire import options as o
 from skyloop.vehicles.ardrone.wire.navdata import Navdata, State
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
-from tests.vehicles.ardrone.emulator.pilot import EMERGENCY, HERE, LAND, TAKE_OFF, Pilot
+from tests.support.ardrone_pilot import EMERGENCY, HERE, LAND, TAKE_OFF, Pilot
 
 av = pytest.importorskip("av")
 pytest.importorskip("cv2")

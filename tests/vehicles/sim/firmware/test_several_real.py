@@ -21,7 +21,7 @@ from benchmarks.autopilots import AgreementRow, compared, take_off, wait_ready
 from skyloop.errors import RefusedError
 from skyloop.messages import Event, FlightState, LinkState
 from skyloop.vehicles.sim.firmware import ardupilot, px4
-from tests.integration.processes.conftest import Process, eventually, sockets, start
+from tests.support.processes import Process, eventually, sockets, start
 
 __all__ = ["sockets", "start"]  # fixtures
 

@@ -16,7 +16,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.tello.emulator import FULL_KBPS, LEAST_KBPS, Faults, TelloFirmware, automatic_kbps, with_tellos
 from skyloop.vehicles.tello.wire import PIECE, AccessUnit, Assembly, parse
-from tests.vehicles.tello.addresses import Addresses
+from tests.support.tello_addresses import Addresses
 
 pytest.importorskip("av")
 
