@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.cli import main
-from tests.support.commands import Ended, Run
+from tests.support.commands import FAST_SIM, Ended, Run
 from tests.support.processes import Process
 
 
