@@ -16,7 +16,7 @@ from benchmarks.measuring.schedule import CHANNELS, MIDDLE, Turn
 from benchmarks.onlookers import cockpit_problem, recorder_problem, view_problem
 from benchmarks.slow import SLOW_VIDEO
 from skyloop.errors import UsageError
-from tests.benchmarks.test_measuring import plausible
+from tests.benchmarks.working import plausible
 
 SHORT_S = 0.5
 pytestmark = pytest.mark.process

@@ -21,7 +21,7 @@ from benchmarks.paper.marks import CORNERS
 from skyloop.control.position import Fix, fix_of
 from skyloop.errors import FileFormatError
 from skyloop.transport.testing import wait_until
-from tests.cli.test_demo import Running
+from tests.support.commands import Running
 
 MINUTES = 0.1
 PAPER = [sys.executable, "-m", "benchmarks.paper"]

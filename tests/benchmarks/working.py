@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from benchmarks.measuring.statistics import Summary
 from benchmarks.measuring.workers import Pipe
 
 
@@ -16,3 +17,9 @@ def is_silent(pipe: Pipe) -> None:
 def echo(pipe: Pipe, what: int | str) -> None:
     pipe.send(what)
     pipe.recv()
+
+
+def plausible(summary: Summary, sent: int) -> None:
+    assert 0.3 * sent <= summary.samples <= sent  # a crowded machine leaves some out
+    assert summary.samples + summary.lost == sent
+    assert 0 < summary.minimum_us <= summary.median_us <= summary.p99_us <= summary.p999_us <= summary.maximum_us < 1e6

@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import re
-import select
 import signal
 import subprocess
-import sys
-import time
 import urllib.request
-from collections.abc import Sequence
-from typing import Self
 
 import pytest
 from rich.console import Console
 
 from skyloop.cli.demo import DemoReport, Spread, true_range
 from skyloop.client import ChannelStats, Distribution
-
-DEMO = [sys.executable, "-m", "skyloop", "demo"]
+from tests.support.commands import DEMO, Running
 
 
 def shown(report: DemoReport) -> str:
@@ -85,36 +77,6 @@ def test_true_range() -> None:
     own = {"truth.x": 1.0, "truth.y": 2.0, "truth.z": 3.0}
     board = {"truth.target.x": 4.0, "truth.target.y": 6.0, "truth.target.z": 3}
     assert true_range({**own, **board, "sim.time_s": 1.0}) == pytest.approx(5.0)
-
-
-class Running:
-    """A demo as a child process, read as it prints."""
-
-    def __init__(self, *options: str, command: Sequence[str] = DEMO) -> None:
-        self.process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-        self.text = ""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.wait()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
-    def until(self, pattern: str, timeout_s: float) -> re.Match[str]:
-        """Read until it printed this; never waits longer than asked."""
-        assert self.process.stdout is not None
-        deadline = time.monotonic() + timeout_s
-        while (found := re.search(pattern, self.text)) is None:
-            left = deadline - time.monotonic()
-            assert left > 0, f"no {pattern!r} in time; it said: {self.text}"
-            if select.select([self.process.stdout], [], [], left)[0]:
-                more = os.read(self.process.stdout.fileno(), 4096).decode()
-                assert more, f"it ended without {pattern!r}; it said: {self.text}"
-                self.text += more
-        return found
 
 
 def run(*options: str) -> subprocess.CompletedProcess[str]:

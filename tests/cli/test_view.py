@@ -11,7 +11,7 @@ import pytest
 
 import skyloop
 from skyloop.recording.foxglove_access import ParameterDesk
-from tests.recording.live import fake_rerun
+from tests.support import fake_rerun
 from tests.support.commands import Run
 from tests.support.processes import Process
 

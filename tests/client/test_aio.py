@@ -34,8 +34,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.transport.base import results
-from tests.client.test_results import Sender
-from tests.support.scripted_proxy import QUICK, WAIT_S, ScriptedProxy, background, scripted
+from tests.support.scripted_proxy import QUICK, WAIT_S, ScriptedProxy, Sender, background, scripted
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -14,10 +13,9 @@ from numpy.typing import NDArray
 
 from skyloop.client import Drone, Result
 from skyloop.errors import ClosedError, DecodeError, NoAnswerError, UsageError
-from skyloop.messages import Feedback, ProcessorResult, encode
-from skyloop.messages.relayed import pack
-from skyloop.transport.base import RESULTS, results
-from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, background, flown, scripted
+from skyloop.messages import Feedback
+from skyloop.transport.base import RESULTS
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, Sender, background, flown, scripted
 
 
 @pytest.fixture
@@ -34,30 +32,6 @@ def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
 
 def until_subscribed(proxy: ScriptedProxy, drone: Drone, topic: str, count: int = 1) -> None:
     drone.wait(lambda _: proxy.server.subscribers(topic) == count, WAIT_S)
-
-
-class Sender:
-    """A worker played by the test: frames are numbered, and a tenth of a second apart."""
-
-    def __init__(self, proxy: ScriptedProxy, processor: str = "detector", worker: int = 7) -> None:
-        self.proxy = proxy
-        self.processor = processor
-        self.worker = worker
-        self.number = 0
-
-    def send(
-        self, seq: int, value: Any = None, *, age_s: float = 0.0, payload: bytes | None = None, **changes: Any
-    ) -> ProcessorResult:
-        self.number = changes.pop("number", self.number + 1)
-        now_ns = time.monotonic_ns()
-        captured_ns = now_ns - round(age_s * 1e9)
-        data = pack(value) if payload is None else payload
-        result = ProcessorResult(
-            self.processor, "front", seq, captured_ns, now_ns, 20_000_000, self.number, data, self.worker
-        )
-        for topic in (RESULTS, results(self.processor)):
-            self.proxy.server.publish(topic, encode(result))
-        return result
 
 
 def test_the_newest_one(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
 
+from tests.cockpit.browser import Deck, DronePage
 from tests.cockpit.firefox import bidi
 
 if TYPE_CHECKING:
@@ -94,3 +97,41 @@ def _firefox(page: Page) -> Iterator[Send]:
             call("input.performActions", context=tab, actions=[source])
 
         yield send
+
+
+PORTRAIT, LANDSCAPE, TABLET = (390, 844), (844, 390), (1024, 768)
+FINGER_PX = 44.0
+FELT = "window.felt = []; navigator.vibrate = (pattern) => felt.push(pattern);"
+#: What can be pressed and seen, and is smaller than a finger: name, width, height.
+SMALL = """(least) => [...document.querySelectorAll("button, .button, select, input")]
+  .filter((one) => one.checkVisibility({visibilityProperty: true, opacityProperty: true}))
+  .map((one) => [one.getAttribute("aria-label") ?? one.textContent, one.getBoundingClientRect()])
+  .map(([name, box]) => [name, box.width, box.height])
+  .filter(([, width, height]) => width > 0 && (width < least - 0.5 || height < least - 0.5))"""
+
+
+def touched(deck: Deck, drone: str, size: tuple[int, int]) -> DronePage:
+    """The page on a touch screen of this size."""
+    viewport = {"width": size[0], "height": size[1]}
+    return deck.page(drone, prepare=FELT, viewport=viewport, has_touch=True, is_mobile=True)
+
+
+def take_control(page: DronePage) -> None:
+    take = page.pane.get_by_role("button", name="Take control")
+    page.until(lambda: not take.is_disabled(), "the line to the cockpit is open")
+    take.tap()
+    page.until(lambda: page.pane.get_attribute("data-mine") == "true", "this page has control")
+
+
+def tap_until(page: DronePage, name: str, state: str) -> None:
+    """Tap again if it came too late to count, as on a busy machine."""
+    tapped_s = -math.inf
+
+    def reached() -> bool:
+        nonlocal tapped_s
+        if time.monotonic() - tapped_s > 4.0 and "ing" not in page.says(".pill").replace("hovering", ""):
+            tapped_s = time.monotonic()
+            page.pane.get_by_role("button", name=name).tap()
+        return state in page.says(".pill")
+
+    page.until(reached, f"it is {state} after {name}", timeout_s=30.0)

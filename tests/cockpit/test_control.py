@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any, Self
+from typing import Any
 
 import pytest
 from starlette.websockets import WebSocketDisconnect
@@ -21,7 +19,6 @@ from skyloop.control import Controller
 from skyloop.control.follow import FollowMarker
 from skyloop.errors import DecodeError, RefusedError
 from skyloop.messages import (
-    AnyAction,
     EmergencyStop,
     Feedback,
     FlightState,
@@ -32,73 +29,13 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from tests.support.cockpit import PATIENCE_S, Node, Nodes, cockpit, open_socket, this_user, until
-from tests.support.testclient import TestClient, WebSocketTestSession
+from tests.support.cockpit import Node, Nodes, cockpit, count, open_socket, page, this_user, until
+from tests.support.testclient import TestClient
 
 
 def links() -> int:
     """Connections of this process to proxies."""
     return sum(thread.name == "skyloop-link" for thread in threading.enumerate())
-
-
-class Page:
-    """A page's control socket."""
-
-    def __init__(self, socket: WebSocketTestSession) -> None:
-        self.socket = socket
-        self.told: list[dict[str, Any]] = []
-
-    def say(self, do: str, **values: Any) -> None:
-        """What a page says that sees and hears all: it has the cockpit's clock, being in one process with it."""
-        now_s = time.monotonic()
-        seen = {"seen_s": now_s} if do == "ping" else {}
-        self.socket.send_json({"do": do, "at_s": now_s, **seen, **values})
-
-    @contextmanager
-    def staying(self) -> Iterator[None]:
-        """It pings all the time."""
-        ended = threading.Event()
-
-        def stay() -> None:
-            while not ended.wait(0.1):
-                self.say("ping")
-
-        thread = threading.Thread(target=stay)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
-
-    def wait(self, kind: str, **values: Any) -> dict[str, Any]:
-        """The next message of that kind with these values."""
-        deadline = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline:
-            message: dict[str, Any] = self.socket.receive_json()
-            self.told.append(message)
-            if message["type"] == kind and values.items() <= message.items():
-                return message
-        raise AssertionError(f"no {kind} {values} but {self.told}")
-
-    def take_off(self) -> None:
-        self.say("takeoff")
-        self.wait("done", do="takeoff")
-
-    def take(self, priority: int = 4) -> Self:
-        self.say("take", priority=priority)
-        self.wait("authority", mine=True)
-        return self
-
-
-@contextmanager
-def page(client: TestClient, drone: str = "alpha") -> Iterator[Page]:
-    with open_socket(client, f"drones/{drone}/control") as socket:
-        yield Page(socket)
-
-
-def count(node: Node, action: AnyAction) -> int:
-    return list(node.flyer.applied).count(action)
 
 
 def test_a_flight_from_the_page(client: TestClient, node: Node) -> None:

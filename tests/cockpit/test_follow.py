@@ -23,12 +23,8 @@ from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Annotation, FlightState, Hover, Velocity
 from skyloop.processing import Settings, Worker
 from tests.cockpit.follower import StandIn, StandIns
-from tests.cockpit.test_control import Page, count, page
-from tests.support.cockpit import Node, Nodes, cockpit, until
+from tests.support.cockpit import BOX, FORWARD, Marker, Node, Nodes, Page, cockpit, count, page, until
 from tests.support.testclient import TestClient
-
-BOX = [4.0, 4.0, 10.0, 12.0]
-FORWARD = Velocity(forward=0.25)
 
 #: All that a cockpit has imported, then the real follower with detections; it prints what that imports besides.
 FIRST_TARGET = """
@@ -60,23 +56,6 @@ def stand_ins() -> StandIns:
 def client(node: Node, stand_ins: StandIns) -> Iterator[TestClient]:
     with cockpit(Fleet(Nodes(node), look_s=0.05), follower=stand_ins) as client:
         yield client
-
-
-class Marker(Page):
-    """A page that marks what it sees."""
-
-    def __init__(self, pilot: Page) -> None:
-        super().__init__(pilot.socket)
-        self.since_ns = 0
-
-    def select(self) -> None:
-        self.say("follow_select", camera="front")
-        self.since_ns = int(self.wait("follow", state="selecting")["since_ns"])
-
-    def mark(self, **values: Any) -> None:
-        """The first frame that is kept has a box."""
-        self.select()
-        self.say("follow", **({"camera": "front", "captured_ns": str(self.since_ns), "box": BOX} | values))
 
 
 @contextmanager

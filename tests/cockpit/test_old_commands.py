@@ -44,8 +44,7 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
-from tests.cockpit.test_control import count, page
-from tests.support.cockpit import Node, until
+from tests.support.cockpit import Node, count, page, until
 from tests.support.testclient import TestClient
 
 NOW_S = 1000.0

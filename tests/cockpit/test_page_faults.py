@@ -5,11 +5,8 @@ What is stopped is stopped for real: the cockpit's process, or the browser's tha
 
 from __future__ import annotations
 
-import os
 import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,24 +15,13 @@ import pytest
 import skyloop
 from skyloop.messages import FlightState
 from tests.cockpit.browser import Deck, DronePage
-from tests.support.processes import Process
+from tests.support.processes import Process, stopped
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 pytestmark = pytest.mark.process
 SMALL = "sim://?world=empty&cameras="
-
-
-@contextmanager
-def stopped(*pids: int) -> Iterator[None]:
-    for pid in pids:
-        os.kill(pid, signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        for pid in pids:
-            os.kill(pid, signal.SIGCONT)
 
 
 def own_cockpit(deck: Deck, folder: Path) -> Process:

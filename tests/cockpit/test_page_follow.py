@@ -16,8 +16,8 @@ from skyloop.client import Drone, Frame
 from skyloop.messages import Feedback, FlightState, Polyline, Text
 from tests.cockpit import fingers
 from tests.cockpit.browser import Deck, DronePage
-from tests.cockpit.test_page_touch import FINGER_PX, PORTRAIT, SMALL, tap_until, touched
-from tests.cockpit.test_page_touch import take_control as tap_control
+from tests.cockpit.fingers import FINGER_PX, PORTRAIT, SMALL, tap_until, touched
+from tests.cockpit.fingers import take_control as tap_control
 from tests.cockpit.walker import Box, Walker
 
 pytestmark = pytest.mark.process

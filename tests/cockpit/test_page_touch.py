@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -13,29 +12,15 @@ import skyloop
 from skyloop.messages import FlightState
 from tests.cockpit import fingers
 from tests.cockpit.browser import Deck, DronePage
+from tests.cockpit.fingers import FINGER_PX, LANDSCAPE, PORTRAIT, SMALL, TABLET, take_control, tap_until, touched
 
 if TYPE_CHECKING:
     pass
 
 pytestmark = pytest.mark.process
 
-PORTRAIT, LANDSCAPE, TABLET = (390, 844), (844, 390), (1024, 768)
 NARROW = (360, 740)
-FINGER_PX = 44.0
-FELT = "window.felt = []; navigator.vibrate = (pattern) => felt.push(pattern);"
-#: What can be pressed and seen, and is smaller than a finger: name, width, height.
-SMALL = """(least) => [...document.querySelectorAll("button, .button, select, input")]
-  .filter((one) => one.checkVisibility({visibilityProperty: true, opacityProperty: true}))
-  .map((one) => [one.getAttribute("aria-label") ?? one.textContent, one.getBoundingClientRect()])
-  .map(([name, box]) => [name, box.width, box.height])
-  .filter(([, width, height]) => width > 0 && (width < least - 0.5 || height < least - 0.5))"""
 STILL = "[scrollX, scrollY, document.scrollingElement.scrollTop, visualViewport.scale, visualViewport.pageTop].join()"
-
-
-def touched(deck: Deck, drone: str, size: tuple[int, int]) -> DronePage:
-    """The page on a touch screen of this size."""
-    viewport = {"width": size[0], "height": size[1]}
-    return deck.page(drone, prepare=FELT, viewport=viewport, has_touch=True, is_mobile=True)
 
 
 def in_flight_mode(page: DronePage) -> bool:
@@ -61,27 +46,6 @@ def within(inner: dict[str, float], outer: dict[str, float]) -> bool:
 def apart(one: dict[str, float], other: dict[str, float]) -> bool:
     beside = one["right"] <= other["left"] or other["right"] <= one["left"]
     return beside or one["bottom"] <= other["top"] or other["bottom"] <= one["top"]
-
-
-def take_control(page: DronePage) -> None:
-    take = page.pane.get_by_role("button", name="Take control")
-    page.until(lambda: not take.is_disabled(), "the line to the cockpit is open")
-    take.tap()
-    page.until(lambda: page.pane.get_attribute("data-mine") == "true", "this page has control")
-
-
-def tap_until(page: DronePage, name: str, state: str) -> None:
-    """Tap again if it came too late to count, as on a busy machine."""
-    tapped_s = -math.inf
-
-    def reached() -> bool:
-        nonlocal tapped_s
-        if time.monotonic() - tapped_s > 4.0 and "ing" not in page.says(".pill").replace("hovering", ""):
-            tapped_s = time.monotonic()
-            page.pane.get_by_role("button", name=name).tap()
-        return state in page.says(".pill")
-
-    page.until(reached, f"it is {state} after {name}", timeout_s=30.0)
 
 
 def check_arrangement(page: DronePage, size: tuple[int, int]) -> None:

@@ -17,8 +17,7 @@ from skyloop.messages import FlightState, Polyline
 from skyloop.proxy import Proxy
 from skyloop.transport.local import LocalServer
 from tests.cockpit.browser import WATCHED, Deck, DronePage
-from tests.cockpit.test_page_faults import stopped
-from tests.support.processes import Process
+from tests.support.processes import Process, stopped
 from tests.support.tello_addresses import Addresses
 
 if TYPE_CHECKING:

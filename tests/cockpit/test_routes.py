@@ -17,8 +17,7 @@ from skyloop.cockpit.routes import MOST_CHECKED, CheckedRoutes, RouteFiles
 from skyloop.control.route import Conditions, Route, RouteWaypoint, check_route
 from skyloop.errors import RefusedError, UnknownNameError, UsageError
 from skyloop.messages import AnyAction, FlightState, Hover
-from tests.cockpit.test_control import Page, page
-from tests.support.cockpit import ORIGIN, Node, Nodes, cockpit, until
+from tests.support.cockpit import ORIGIN, Node, Nodes, Page, cockpit, page, until
 from tests.support.testclient import TestClient
 
 TRIANGLE: dict[str, Any] = {

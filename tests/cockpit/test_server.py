@@ -16,8 +16,6 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +33,8 @@ from skyloop.cockpit.encoded_feed import _ENCODER, NICENESS
 from skyloop.cockpit.testing import HeadlessPage, Pages
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import FlightState
+from tests.support.cockpit import PILOT, ask, served
 
-PILOT = "pilot-token-0123456789"
 OBSERVER = "observer-token-0123456789"
 
 
@@ -128,38 +126,10 @@ def test_child_tells_why_it_did_not_start() -> None:
 # In this process ---------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def served(**options: Any) -> Iterator[str]:
-    """A cockpit on a thread; its address."""
-    ready, stop, told = threading.Event(), threading.Event(), []
-
-    def tell(address: str) -> None:
-        told.append(address)
-        ready.set()
-
-    thread = threading.Thread(target=serve_cockpit, kwargs={"on_ready": tell, "stop": stop, **options})
-    thread.start()
-    try:
-        assert ready.wait(10)
-        yield told[0].rstrip("/")
-    finally:
-        stop.set()
-        thread.join(10)
-    assert not thread.is_alive()
-
-
 def on_loopback(address: str) -> str:
     """The address of a server that listens everywhere, as this machine alone reaches it."""
     scheme, _, port = address.rpartition(":")
     return f"{scheme.partition('://')[0]}://127.0.0.1:{port}"
-
-
-def ask(address: str, path: str, token: str | None = None, tls: ssl.SSLContext | None = None) -> Any:
-    request = urllib.request.Request(f"{address}{path}")
-    if token is not None:
-        request.add_header("Authorization", f"Bearer {token}")
-    with urllib.request.urlopen(request, timeout=5, context=tls) as answer:
-        return json.load(answer)
 
 
 def test_pages_are_served_while_the_cockpit_warms_up(monkeypatch: pytest.MonkeyPatch, tokens: Path) -> None:

@@ -17,8 +17,7 @@ from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
 from skyloop.errors import DecodeError
 from skyloop.messages import Event, EventKind, FlightState
-from tests.cockpit.test_control import Page, page
-from tests.support.cockpit import Node, until
+from tests.support.cockpit import Node, Page, page, until
 from tests.support.testclient import TestClient
 
 S = 1_000_000_000

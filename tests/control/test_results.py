@@ -12,8 +12,7 @@ from skyloop.control import Controller, RunSummary
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback
 from skyloop.transport.base import RESULTS, results
-from tests.client.test_results import Sender
-from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, background, flown, scripted
+from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, Sender, background, flown, scripted
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from skyloop.pyav import new_decoder
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.emulation.encoders import Encoded, Encoder, Format
 from tests.support.film import FPS, GROUP, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
-from tests.support.rtsp_server import HOST, RtpPacker, RtspServer
+from tests.support.rtsp_server import HOST, RtpPacker, RtspServer, free_port
 
 av = pytest.importorskip("av")
 PATIENCE_S = 30.0
@@ -136,12 +136,6 @@ def test_sets_that_only_the_servers_description_has_go_in_front_of_each_key() ->
 
 
 # RTP without a server ------------------------------------------------------------------------------------------------
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((HOST, 0))
-        return int(probe.getsockname()[1])
 
 
 class RtpSender:

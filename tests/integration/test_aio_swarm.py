@@ -15,7 +15,7 @@ from skyloop import aio
 from skyloop.client import Drone
 from skyloop.errors import ClosedError, RefusedError, SwarmError, UnknownNameError, UsageError
 from skyloop.messages import FlightState, Hover, Land, Velocity
-from tests.integration.test_swarm import NAMES, Field
+from tests.integration.field import NAMES, Field
 
 WAIT_S = 30.0
 

@@ -35,24 +35,7 @@ from skyloop.messages import (
 from skyloop.proxy.core.flight import BELIEF_NS
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import video
-from skyloop.transport.memory import MemoryServer
-from tests.support.fake_vehicle import FakeVehicle
-
-WAIT_S = 10.0
-
-
-class Node:
-    """A proxy that can be killed and started again on the same address."""
-
-    def __init__(self, vehicle: FakeVehicle) -> None:
-        self.vehicle = vehicle
-        self.server = MemoryServer("alpha")
-        self.proxy = Proxy(vehicle, self.server, name="alpha")
-
-    def restart(self) -> None:
-        self.proxy.end()
-        self.proxy = Proxy(self.vehicle, self.server, name="alpha")
-        self.proxy.start()
+from tests.support.fake_vehicle import WAIT_S, FakeVehicle, Node
 
 
 @pytest.fixture

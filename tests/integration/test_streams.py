@@ -22,7 +22,7 @@ from skyloop.proxy.streams import IDLE_S, MAX_FORMS
 from skyloop.pyav import H264Encoder
 from skyloop.transport.base import Pixels
 from skyloop.transport.testing import wait_until
-from tests.integration.test_fabric import WAIT_S, Node, far, near_node, node, take
+from tests.support.nodes import WAIT_S, Node, far, near_node, node, take
 
 av = pytest.importorskip("av", reason="H.264 needs the extra 'video'")
 __all__ = ["far", "node"]

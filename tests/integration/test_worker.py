@@ -12,8 +12,7 @@ from skyloop.client import Drone, Result
 from skyloop.client.drone import open_drone
 from skyloop.client.publishing import Membership
 from skyloop.errors import NameTakenError, UnknownNameError, UsageError
-from tests.integration.test_inprocess import WAIT_S, Node
-from tests.support.fake_vehicle import FakeVehicle
+from tests.support.fake_vehicle import WAIT_S, FakeVehicle, Node
 from tests.support.scripted_proxy import QUICK
 
 

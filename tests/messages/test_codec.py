@@ -40,9 +40,8 @@ from skyloop.messages import (
 from skyloop.messages.codec import HEADER, HEADER_SIZE, KINDS, MAX_BODY, SIGNATURE, VERSION
 from skyloop.messages.fields import LATEST_NS
 from skyloop.messages.frame import MAX_PIECE
-from tests.support.samples import CAMERA, SAMPLES
+from tests.support.samples import CAMERA, PACKETS, SAMPLES
 
-PACKETS = Path(__file__).parents[1] / "data" / "packets"
 LONGEST_DECODE_S = 1.0
 
 

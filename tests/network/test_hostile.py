@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import random
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from typing import Any
 
 import pytest
-import zenoh
 
 from skyloop.messages import Command, Hello, ReleaseAuthority, Request, Takeoff, encode
 from skyloop.network import FabricServer, FabricSettings, dial, layout, packets
@@ -23,17 +20,9 @@ from skyloop.network.delivery import Outgoing
 from skyloop.network.registry import STALLED_S
 from skyloop.transport.base import FEEDBACK, MAX_PACKET, Peer, results, video
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
+from tests.network.stranger import stranger
 
 LOCAL = "127.0.0.1"
-
-
-def stranger(**sections: list[str]) -> zenoh.Session:
-    """Somebody with Zenoh and nothing else."""
-    config = zenoh.Config()
-    wishes: dict[str, Any] = {"mode": "peer", "scouting/multicast/enabled": False, "listen/endpoints": []}
-    for key, value in {**wishes, **{f"{name}/endpoints": value for name, value in sections.items()}}.items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
 
 
 class Scene:

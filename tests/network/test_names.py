@@ -24,7 +24,7 @@ from skyloop.network.config import Part, free_port
 from skyloop.network.discovery import renew
 from skyloop.transport.base import FEEDBACK, Dialer
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
-from tests.network.test_hostile import stranger
+from tests.network.stranger import stranger
 
 LOCAL = "127.0.0.1"
 

@@ -9,9 +9,10 @@ import pytest
 
 from skyloop.network import config, delivery, frames, layout, packets, registry, sealing
 from skyloop.transport.base import MAX_TOPIC
-from tests.messages.test_codec import PACKETS
-from tests.messages.test_wire_format import FABRIC
+from tests.support.pages import ROOT
+from tests.support.samples import PACKETS
 
+FABRIC = (ROOT / "docs" / "wire-format.md").read_text().partition("\n## The fabric transport\n")[2]
 GOLDEN: dict[str, packets.Message] = {
     "subscribe": packets.Subscribe("video/front?encoding=jpeg&quality=80", True),
     "taken": packets.Taken("feedback", 9),

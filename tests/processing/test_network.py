@@ -10,7 +10,7 @@ import pytest
 
 from skyloop.client import Drone, Frame, Result
 from skyloop.processing import Settings, Worker
-from tests.integration.test_fabric import WAIT_S, Node, far_node
+from tests.support.nodes import WAIT_S, Node, far_node
 
 
 class Number:

@@ -16,8 +16,7 @@ from skyloop.client.drone import open_drone
 from skyloop.errors import NameTakenError, UsageError
 from skyloop.messages import Annotation, LogEntry, Polyline, Severity
 from skyloop.processing import Output, Settings, Worker
-from tests.integration.test_inprocess import WAIT_S, Node
-from tests.support.fake_vehicle import FakeVehicle
+from tests.support.fake_vehicle import WAIT_S, FakeVehicle, Node
 from tests.support.scripted_proxy import QUICK
 
 

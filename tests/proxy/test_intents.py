@@ -514,7 +514,7 @@ def test_a_good_place_that_is_asked_for_in_a_take_off_is_flown_to_after_it(bench
 
 
 def test_a_place_that_came_to_lie_behind_a_zone_in_a_take_off_is_judged_again_when_it_begins(bench: Bench) -> None:
-    from tests.proxy.test_places import write
+    from tests.support.proxy_bench import write
 
     pilot = at_home(bench, S.TAKING_OFF)
     place = Position(3.0, 0.0, 1.0)

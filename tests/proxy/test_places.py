@@ -20,14 +20,13 @@ from skyloop.messages import (
     Land,
     Position,
     Refusal,
-    SetParameter,
     Severity,
     Velocity,
 )
 from skyloop.proxy.core.airspace import Airspace, Verdict
 from skyloop.proxy.core.settings import AirspaceSettings, Limits
 from skyloop.zones import Box, Cylinder, Space
-from tests.support.proxy_bench import ALL, App, Bench
+from tests.support.proxy_bench import ALL, App, Bench, write
 
 NOW = 100 * NS_PER_S
 LIMITS = Limits(climb=1.0, yaw_rate=1.5, speed=2.0, altitude=5.0)
@@ -233,11 +232,6 @@ def placed(bench: Bench, **more: Any) -> App:
     bench.driver.report(position_m=(0.0, 0.0, 1.0), yaw_rad=0.0, altitude_m=1.0, **more)
     bench.driver.told.clear()
     return pilot
-
-
-def write(bench: Bench, pilot: App, name: str, value: float | str) -> None:
-    pilot.ask(SetParameter(name, value, pilot.lease))
-    bench.driver.report()
 
 
 def test_a_vehicle_that_flies_to_places_is_told_the_place_with_its_limits() -> None:

@@ -26,15 +26,7 @@ from skyloop.messages import (
 )
 from skyloop.proxy.core.flight import BELIEF_NS, Whose
 from skyloop.transport.testing import wait_until
-from tests.support.proxy_bench import ALL, App, Bench
-
-
-def steps(app: App) -> list[tuple[object, object]]:
-    return [(event.data["step"], event.data["reason"]) for event in app.told(EventKind.FAILSAFE)]
-
-
-def messages(app: App, reason: str) -> list[str]:
-    return [event.text for event in app.told(EventKind.VEHICLE_MESSAGE) if event.data["reason"] == reason]
+from tests.support.proxy_bench import ALL, App, Bench, messages, steps
 
 
 def test_a_silent_pilot(bench: Bench) -> None:

@@ -25,8 +25,7 @@ from skyloop.messages import (
 )
 from skyloop.proxy.records import LIFE_S, FlightRecord
 from skyloop.transport.testing import wait_until
-from tests.proxy.test_proxy_ladder import messages, steps
-from tests.support.proxy_bench import Bench
+from tests.support.proxy_bench import Bench, messages, steps
 
 
 @pytest.mark.parametrize("state", [FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,19 +16,15 @@ import pytest
 import skyloop
 from skyloop.client import Drone
 from skyloop.client.drone import open_drone
-from skyloop.drivers.base import Sink
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UnknownNameError, UsageError
 from skyloop.messages import (
     Annotation,
     Applied,
-    CameraInfo,
-    Capabilities,
     Encoding,
     Event,
     EventKind,
     Feedback,
     FrameHeader,
-    Intrinsics,
     LogEntry,
     Parameter,
     Polyline,
@@ -44,56 +39,11 @@ from skyloop.recording.options import CHOICES, Options, RecorderState, channels_
 from skyloop.recording.taps import Gaps, Video, encoder
 from skyloop.transport.memory import MemoryServer
 from tests.recording.disks import Disk
+from tests.recording.vehicle import Vehicle, picture
 from tests.support import recording_files as files
-from tests.support.fake_vehicle import PERIOD_S, FakeVehicle
 from tests.support.recording_files import read_image
 
 WAIT_S = 10.0
-INTRINSICS = Intrinsics(30.0, 30.0, 16.0, 12.0)
-
-
-def picture(captured_ns: int) -> np.ndarray:
-    """What the vehicle's camera shows at a time, BGR, shape (24, 32, 3), uint8."""
-    number = captured_ns // 1_000_000
-    image = np.full((24, 32, 3), (number % 256, 128, 255 - number % 256), np.uint8)
-    image[: number % 24, : number % 32] = 0
-    return image
-
-
-class Vehicle(FakeVehicle):
-    """Knows where it is, and shows pictures in the encoding wanted."""
-
-    def __init__(self, encoding: Encoding = Encoding.BGR8) -> None:
-        super().__init__()
-        self.encoding = encoding
-
-    def capabilities(self) -> Capabilities:
-        able = super().capabilities()
-        camera = CameraInfo("front", 32, 24, 1 / PERIOD_S, self.encoding, INTRINSICS)
-        return Capabilities(able.vehicle, able.actions, (camera,))
-
-    def shown(self, captured_ns: int) -> bytes:
-        image = picture(captured_ns)
-        if self.encoding is Encoding.JPEG:
-            return cv2.imencode(".jpg", image)[1].tobytes()
-        if self.encoding is Encoding.RGB8:
-            return image[:, :, ::-1].tobytes()
-        return image[:, :, 0].tobytes() if self.encoding is Encoding.MONO8 else image.tobytes()
-
-    def _run(self, sink: Sink) -> None:
-        number = 0
-        while not self._ended.wait(PERIOD_S):
-            number += 1
-            now_ns = time.monotonic_ns()
-            place = (number * 0.01, 0.0, 1.0)
-            sink.feedback(
-                Feedback(
-                    captured_ns=now_ns, state=self.state, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.1, position_m=place
-                )
-            )
-            if sink.wants("front"):
-                pixels = np.frombuffer(self.shown(now_ns), np.uint8)
-                sink.frame("front", pixels, now_ns, width=32, height=24, encoding=self.encoding, intrinsics=INTRINSICS)
 
 
 Fly = Callable[..., Drone]

@@ -20,8 +20,7 @@ from skyloop.sim.render import PlanarRenderer, Scene, SceneState
 from skyloop.sim.render.compiled import Compiler, load_kernels
 from skyloop.sim.render.planar import dimmed
 from skyloop.sim.world import FigureTarget, Light, StillPath, World
-
-from .helpers import IDEAL, steps
+from tests.sim.helpers import IDEAL, steps
 
 OUTSIDE = '[room]\nsize = [12, 12, 6]\nfloor = "concrete"\nenclosed = false\n[[spawn]]\nposition = [-3, 0, 0]\n'
 PERSON = """[[target]]

@@ -14,7 +14,7 @@ from skyloop.messages.geometry import rotation_from_euler
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, planar
 from skyloop.sim.render.compiled import Compiler, Kernels, load_kernels
-from tests.sim.test_render import WORLD, state_at
+from tests.sim.furnished_room import WORLD, state_at
 
 STRONG = replace(FRONT_CAMERA, name="strong", distortion=(-0.3, 0.1, 0.01, -0.01, 0.0))
 

@@ -27,6 +27,8 @@ from skyloop.messages import (
     Vector,
     Velocity,
 )
+from skyloop.proxy.proxy import Proxy
+from skyloop.transport.memory import MemoryServer
 
 PERIOD_S = 0.02
 NEXT: dict[type[Action], FlightState] = {
@@ -92,3 +94,20 @@ class FakeVehicle(Driver):
             if sink.wants("front"):
                 picture = np.full((24, 32, 3), number % 256, np.uint8)
                 sink.frame("front", picture, now_ns, width=32, height=24)
+
+
+WAIT_S = 10.0
+
+
+class Node:
+    """A proxy that can be killed and started again on the same address."""
+
+    def __init__(self, vehicle: FakeVehicle) -> None:
+        self.vehicle = vehicle
+        self.server = MemoryServer("alpha")
+        self.proxy = Proxy(vehicle, self.server, name="alpha")
+
+    def restart(self) -> None:
+        self.proxy.end()
+        self.proxy = Proxy(self.vehicle, self.server, name="alpha")
+        self.proxy.start()

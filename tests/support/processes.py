@@ -10,12 +10,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
 import pytest
 
 STARTS_WITHIN_S = 20.0
+PILOTS = str(Path(__file__).parents[1] / "integration" / "processes" / "pilots.py")  #: applications to start by name
 
 
 @pytest.fixture(autouse=True)
@@ -134,3 +136,14 @@ def skyloop_command(*words: str, code: int = 0) -> str:
     )
     assert ended.returncode == code, ended.stdout.decode()
     return ended.stdout.decode()
+
+
+@contextmanager
+def stopped(*pids: int) -> Iterator[None]:
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for pid in pids:
+            os.kill(pid, signal.SIGCONT)

@@ -44,6 +44,7 @@ from skyloop.messages import (
     ResetEmergency,
     Role,
     Sample,
+    SetParameter,
     Takeoff,
     Value,
     Velocity,
@@ -358,3 +359,16 @@ class Bench:
 
     def tick(self) -> None:
         self.proxy.tick(self.clock())
+
+
+def write(bench: Bench, pilot: App, name: str, value: float | str) -> None:
+    pilot.ask(SetParameter(name, value, pilot.lease))
+    bench.driver.report()
+
+
+def steps(app: App) -> list[tuple[object, object]]:
+    return [(event.data["step"], event.data["reason"]) for event in app.told(EventKind.FAILSAFE)]
+
+
+def messages(app: App, reason: str) -> list[str]:
+    return [event.text for event in app.told(EventKind.VEHICLE_MESSAGE) if event.data["reason"] == reason]

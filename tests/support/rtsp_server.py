@@ -280,3 +280,9 @@ class RtspServer:
             if session in self._sessions:
                 self._sessions.remove(session)
         session.close()
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])

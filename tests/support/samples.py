@@ -1,5 +1,9 @@
 """One sample of everything, with no field left at its default: for the golden packets and the round trips."""
 
+from pathlib import Path
+from typing import Any
+
+import msgspec
 import numpy as np
 
 from skyloop.messages import (
@@ -70,6 +74,7 @@ from skyloop.messages import (
     Velocity,
     Welcome,
 )
+from skyloop.messages.codec import HEADER, SIGNATURE, VERSION
 from skyloop.messages.relayed import pack
 
 INTRINSICS = Intrinsics(fx=280.5, fy=281.5, cx=160.0, cy=120.0, distortion=(-0.1, 0.01, 0.0, 0.0, 0.001))
@@ -267,3 +272,17 @@ SAMPLES: dict[str, Sample] = {
     "reply-refused": Reply(5, Refused(Refusal.OUT_OF_RANGE, "limits.tilt is 0 to 0.6 rad, not 9")),
     "reply-statistics": Reply(8, Statistics({"commands.received": 320.0})),
 }
+
+
+PACKETS = Path(__file__).parents[1] / "data" / "packets"
+
+
+def packet(kind: int, body: Any) -> bytes:
+    data = msgspec.msgpack.encode(body)
+    return HEADER.pack(SIGNATURE, VERSION, kind, 0, len(data)) + data
+
+
+def log_entry(**changes: Any) -> bytes:
+    """A log entry that was never made as one, as somebody else's program sends it."""
+    fields = {"source": "me", "name": "x", "at_ns": 1, "text": None, "number": None, "values": None, "shape": []}
+    return packet(9, list((fields | changes).values()))

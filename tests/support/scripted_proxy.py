@@ -43,6 +43,7 @@ from skyloop.messages import (
     ParameterValue,
     Ping,
     Pong,
+    ProcessorResult,
     Refusal,
     Refused,
     ReleaseAuthority,
@@ -57,7 +58,8 @@ from skyloop.messages import (
     decode,
     encode,
 )
-from skyloop.transport.base import EVENTS, FEEDBACK, Peer
+from skyloop.messages.relayed import pack
+from skyloop.transport.base import EVENTS, FEEDBACK, RESULTS, Peer, results
 from skyloop.transport.memory import Faults, MemoryServer
 
 WAIT_S = 10.0
@@ -310,3 +312,27 @@ def background(*steps: Callable[[], object]) -> threading.Thread:
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     return thread
+
+
+class Sender:
+    """A worker played by the test: frames are numbered, and a tenth of a second apart."""
+
+    def __init__(self, proxy: ScriptedProxy, processor: str = "detector", worker: int = 7) -> None:
+        self.proxy = proxy
+        self.processor = processor
+        self.worker = worker
+        self.number = 0
+
+    def send(
+        self, seq: int, value: Any = None, *, age_s: float = 0.0, payload: bytes | None = None, **changes: Any
+    ) -> ProcessorResult:
+        self.number = changes.pop("number", self.number + 1)
+        now_ns = time.monotonic_ns()
+        captured_ns = now_ns - round(age_s * 1e9)
+        data = pack(value) if payload is None else payload
+        result = ProcessorResult(
+            self.processor, "front", seq, captured_ns, now_ns, 20_000_000, self.number, data, self.worker
+        )
+        for topic in (RESULTS, results(self.processor)):
+            self.proxy.server.publish(topic, encode(result))
+        return result

@@ -13,11 +13,10 @@ import skyloop
 from skyloop.control.follow import FollowMarker
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
 from skyloop.vehicles.ardrone.emulator.video import FRONT_1
-from tests.support.processes import Process, eventually
+from tests.support.processes import PILOTS, Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]
 
-PILOTS = str(Path(__file__).with_name("pilots.py"))
 MARKER = 7
 LINE = re.compile(r"at udp (\d+), navdata udp (\d+), video \w+ (\d+), control tcp (\d+)")
 

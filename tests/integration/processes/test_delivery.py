@@ -14,11 +14,10 @@ import pytest
 import skyloop
 from skyloop.messages import FlightState
 from skyloop.transport.local import dial
-from tests.support.processes import Process, eventually
+from tests.support.processes import PILOTS, Process, eventually
 
 pytestmark = pytest.mark.process
 
-PILOTS = str(Path(__file__).with_name("pilots.py"))
 FPS = 30
 
 

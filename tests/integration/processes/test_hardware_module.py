@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.integration.processes.test_mavlink import ADDRESS, KINDS
+from tests.integration.processes.firmware import ADDRESS, KINDS
 from tests.support.processes import Process
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]

@@ -17,7 +17,7 @@ import skyloop
 from skyloop.host.serve import Remove, Status, ask
 from skyloop.host.vehicle import VehicleStatus
 from skyloop.messages import EventKind, LinkState
-from tests.integration.processes.test_mavlink import ADDRESS, wait_until_ready
+from tests.integration.processes.firmware import ADDRESS, wait_until_ready
 from tests.support.processes import Process, eventually, skyloop_command
 
 pytestmark = pytest.mark.process

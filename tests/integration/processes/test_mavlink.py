@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import socket
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -15,14 +13,12 @@ import skyloop
 from skyloop.control.follow import FollowMarker
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
 from skyloop.vehicles.mavlink.emulator import CAMERA
-from tests.support.processes import Process, eventually
+from tests.integration.processes.firmware import ADDRESS, KINDS, wait_until_ready
+from tests.support.processes import PILOTS, Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]
 
-PILOTS = str(Path(__file__).with_name("pilots.py"))
 MARKER = 7
-ADDRESS = re.compile(r"mavlink://udpin:[0-9.]+:\d+")
-KINDS = ("arducopter", "px4")
 
 Firmware = Callable[..., tuple[Process, str]]
 
@@ -46,10 +42,6 @@ def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
         made.bind(("127.0.0.1", 0))
         return int(made.getsockname()[1])
-
-
-def wait_until_ready(drone: skyloop.Drone) -> None:
-    eventually(lambda: bool((drone.feedback().native or {}).get("mavlink.ready")), "it may be armed", 30.0)
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.1])

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
 import skyloop
 from skyloop.messages import Failsafe, FlightState, LinkState
-from tests.support.processes import Process, eventually
+from tests.support.processes import PILOTS, Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(240)]
-
-PILOTS = str(Path(__file__).with_name("pilots.py"))
 
 
 @pytest.fixture

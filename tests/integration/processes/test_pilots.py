@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -23,11 +22,9 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from tests.support.processes import Process, eventually
+from tests.support.processes import PILOTS, Process, eventually
 
 pytestmark = pytest.mark.process
-
-PILOTS = str(Path(__file__).with_name("pilots.py"))
 
 
 @pytest.mark.daily

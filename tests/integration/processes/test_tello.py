@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
 import skyloop
 from skyloop.control.follow import FollowMarker
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
-from tests.support.processes import Process, eventually
+from tests.support.processes import PILOTS, Process, eventually
 from tests.support.tello_addresses import Addresses
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(240)]
 pytest.importorskip("av")
 
-PILOTS = str(Path(__file__).with_name("pilots.py"))
 MARKER = 7
 SIGHTINGS = 40
 

@@ -27,9 +27,9 @@ from skyloop.recording.recorder import RecorderProcess
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter
 from skyloop.transport.memory import MemoryServer
-from tests.promises.security.test_hostile_samples import log_entry
 from tests.support import recording_files as files
 from tests.support.fake_vehicle import FakeVehicle
+from tests.support.samples import log_entry
 
 WAIT_S = 10.0
 CLOCK = ClockPair(0, 1_000_000_000_000_000_000, 1)

@@ -10,9 +10,8 @@ from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.fleet import Fleet
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink.emulator import Kind
-from tests.cockpit.test_control import page
-from tests.promises.faults.test_vehicle_of_others import KINDS, Scene, taken_off
-from tests.support.cockpit import cockpit
+from tests.promises.faults.scene import KINDS, Scene, taken_off
+from tests.support.cockpit import cockpit, page
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable
 from itertools import count
 from typing import Any, NamedTuple
@@ -299,3 +300,41 @@ DEEDS = (
     Deed("admit applications in the proxy's place", _let_in, _lets_in),
     Deed("appear as a proxy", _live_as_a_proxy, _lives),
 )
+
+
+#: The columns: whose key is used, and in words.
+COLUMNS = {
+    "nobody": "without keys",
+    "kim": "another pilot of it",
+    "bob": "a pilot of others",
+    "olga": "an observer",
+    "oscar": "an observer of others",
+    "bravo": "another drone's proxy",
+    "hub": "a router",
+    "eve": "revoked",
+}
+#: What works, by the deed's words; everything else has no effect.
+SEEN = {"nobody", "kim", "bob", "olga"}
+WORKS = {
+    "find the drone": {*SEEN, "oscar", "bravo", "hub"},
+    "answer discovery in the proxy's place": {"nobody"},  # with keys a proxy hands on nothing of others
+    "see its feedback": SEEN,
+    "see its video": SEEN,
+    "read its parameters": SEEN,
+    "request the authority": {"nobody", "kim"},
+    "stop its motors": {"nobody", "kim"},
+    "take over another pilot's liveliness token, and end it": set(),  # Zenoh: it lives while one of the two does
+}
+
+
+def works(deed: Deed, who: str) -> bool:
+    return who in WORKS.get(deed.what, {"nobody"})
+
+
+def comes_true(condition: Callable[[], bool], within_s: float) -> bool:
+    deadline = time.monotonic() + within_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.002)
+    return True

@@ -2,43 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from skyloop.transport.testing import wait_until
-from tests.promises.security.deeds import DEEDS, Deed
+from tests.promises.security.deeds import COLUMNS, DEEDS, Deed, comes_true, works
 from tests.promises.security.rig import Intruder, Rig, keys_of, make_lab
-
-#: The columns: whose key is used, and in words.
-COLUMNS = {
-    "nobody": "without keys",
-    "kim": "another pilot of it",
-    "bob": "a pilot of others",
-    "olga": "an observer",
-    "oscar": "an observer of others",
-    "bravo": "another drone's proxy",
-    "hub": "a router",
-    "eve": "revoked",
-}
-#: What works, by the deed's words; everything else has no effect.
-SEEN = {"nobody", "kim", "bob", "olga"}
-WORKS = {
-    "find the drone": {*SEEN, "oscar", "bravo", "hub"},
-    "answer discovery in the proxy's place": {"nobody"},  # with keys a proxy hands on nothing of others
-    "see its feedback": SEEN,
-    "see its video": SEEN,
-    "read its parameters": SEEN,
-    "request the authority": {"nobody", "kim"},
-    "stop its motors": {"nobody", "kim"},
-    "take over another pilot's liveliness token, and end it": set(),  # Zenoh: it lives while one of the two does
-}
-
-
-def works(deed: Deed, who: str) -> bool:
-    return who in WORKS.get(deed.what, {"nobody"})
 
 
 @pytest.fixture(scope="module")
@@ -73,15 +44,6 @@ def intruder(rig: Rig, who: str) -> Iterator[Intruder]:
     somebody = rig.intruder(who)
     yield somebody
     somebody.close()
-
-
-def comes_true(condition: Callable[[], bool], within_s: float) -> bool:
-    deadline = time.monotonic() + within_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.002)
-    return True
 
 
 @pytest.mark.parametrize("who", COLUMNS)

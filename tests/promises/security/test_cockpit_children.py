@@ -20,8 +20,7 @@ from skyloop.cockpit.reports import MAX_WAITING, Reports
 from skyloop.cockpit.security import foreign, own_names
 from skyloop.errors import LinkError, RefusedError, UsageError
 from skyloop.recording.reader import describe
-from tests.cockpit.test_server import served
-from tests.support.cockpit import FakeRecorder
+from tests.support.cockpit import FakeRecorder, served
 
 ASKED = 30
 NAMES = own_names("127.0.0.1", 8123)

@@ -25,7 +25,7 @@ from skyloop.cockpit.access import (
     TokenGate,
     WrongTokens,
 )
-from tests.cockpit.test_server import PILOT, ask, served
+from tests.support.cockpit import PILOT, ask, served
 
 GUESSERS = 8
 

@@ -18,7 +18,7 @@ from skyloop.control import PolicyNetwork
 from skyloop.errors import FileFormatError
 from skyloop.vision import LearnedTracker, OnnxDetector, onnx
 from skyloop.vision.simulated import SIMULATED_WEIGHTS
-from tests.control.test_onnx_policy import write as write_policy
+from tests.support.policies import write as write_policy
 
 pytestmark = pytest.mark.process
 TRY_ALONE = onnx.try_alone  # before the other tests' shortcut is in its place

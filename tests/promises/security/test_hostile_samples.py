@@ -41,14 +41,14 @@ from skyloop.messages import (
     decode,
     encode,
 )
-from skyloop.messages.codec import HEADER, HEADER_SIZE, KINDS, SIGNATURE, VERSION
+from skyloop.messages.codec import HEADER_SIZE, KINDS
 from skyloop.messages.fields import LATEST_NS
 from skyloop.messages.relayed import ARRAY, MAX_DEPTH, pack, unpack
 from skyloop.messages.subscription import FrameFilter
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import ClockPair
 from skyloop.recording.translation import Translator
-from tests.support.samples import SAMPLES
+from tests.support.samples import SAMPLES, log_entry, packet
 
 LONGEST_S = 1.0
 MOST_BYTES = 8_000_000
@@ -85,17 +85,6 @@ def put(value: Any, path: tuple[int | str, ...], hostile: Any) -> Any:
     changed = value.copy()
     changed[path[0]] = put(value[path[0]], path[1:], hostile)
     return changed
-
-
-def packet(kind: int, body: Any) -> bytes:
-    data = msgspec.msgpack.encode(body)
-    return HEADER.pack(SIGNATURE, VERSION, kind, 0, len(data)) + data
-
-
-def log_entry(**changes: Any) -> bytes:
-    """A log entry that was never made as one, as somebody else's program sends it."""
-    fields = {"source": "me", "name": "x", "at_ns": 1, "text": None, "number": None, "values": None, "shape": []}
-    return packet(9, list((fields | changes).values()))
 
 
 class Ears:

@@ -21,9 +21,8 @@ from skyloop.network.keys import Lab, load
 from skyloop.network.session import Session, acquire, release, renewed
 from skyloop.transport.base import FEEDBACK
 from skyloop.transport.testing import ClientLog, wait_until
-from tests.promises.security.deeds import DEEDS
+from tests.promises.security.deeds import DEEDS, WORKS, comes_true
 from tests.promises.security.rig import DRONE, Rig, keys_of, make_lab
-from tests.promises.security.test_attempts import WORKS, comes_true
 
 HARM = [deed for deed in DEEDS if "hub" not in WORKS.get(deed.what, ())]
 

@@ -12,7 +12,7 @@ from skyloop.client.drone import open_drone
 from skyloop.drivers.base import Driver
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.memory import MemoryServer
-from tests.recording.test_engine import Vehicle
+from tests.recording.vehicle import Vehicle
 
 WAIT_S = 10.0
 Fly = Callable[..., Drone]

@@ -24,11 +24,11 @@ from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.foxglove_access import MAX_HEAD, OriginDoor, ParameterDesk, hidden_host
 from skyloop.recording.layout import FrameRecord
 from skyloop.recording.translation import Picture
-from tests.integration.test_fabric import Node, far
 from tests.recording.live.conftest import WAIT_S, Fly
 from tests.recording.live.viewer import Viewer
 from tests.recording.streams import film
 from tests.support.fake_vehicle import PERIOD_S, FakeVehicle
+from tests.support.nodes import Node, far
 from tests.support.recording_files import read_image
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: skyloop install foxglove")

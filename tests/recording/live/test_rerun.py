@@ -41,9 +41,9 @@ from skyloop.recording.rerun_log import RerunLog, Shown
 from skyloop.recording.rerun_viewer import RerunViewer, export_rrd
 from skyloop.recording.translation import Picture
 from skyloop.recording.view import View
-from tests.recording.live import fake_rerun
 from tests.recording.live.conftest import Fly
 from tests.recording.streams import film, write_film
+from tests.support import fake_rerun
 from tests.support.commands import Ended
 from tests.support.fake_rerun import Stream
 from tests.support.recorded_flights import CAPABILITIES, MS, UNIX_NS

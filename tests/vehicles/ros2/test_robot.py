@@ -15,10 +15,10 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Encoding, FlightState, Hover, Idle, Land, LinkState, Takeoff, Velocity
-from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.vehicles.ros2.driver import Ros2Driver
 from skyloop.vehicles.ros2.options import Options, options_of
 from skyloop.vehicles.ros2.protocol import ANSWER_S, CaptureClock, RobotSession, battery_of, state_of
+from tests.vehicles.ros2.messages import image, odometry, stamp
 
 SERVED = "ros2://robot?takeoff=takeoff&land=land&width=4&height=2"
 EPOCH_NS = 1_700_000_000 * 10**9
@@ -88,26 +88,6 @@ def test_without_rclpy_the_error_says_what_to_install(monkeypatch: pytest.Monkey
 
 
 # Messages ------------------------------------------------------------------------------------------------------------
-
-
-def stamp(ns: int) -> Message:
-    return Message(stamp=Message(sec=ns // 10**9, nanosec=ns % 10**9))
-
-
-def vector(x: float, y: float, z: float) -> Message:
-    return Message(x=x, y=y, z=z)
-
-
-def odometry(ns: int, z: float = 0.0, pitch: float = 0.0, forward: float = 0.0) -> Message:
-    x, y, qz, w = quaternion_from_euler(0.0, pitch, 0.5)
-    pose = Message(position=vector(1.0, 2.0, z), orientation=Message(x=x, y=y, z=qz, w=w))
-    twist = Message(linear=vector(forward, 0.0, 0.0), angular=vector(0.0, 0.0, 0.1))
-    return Message(header=stamp(ns), pose=Message(pose=pose), twist=Message(twist=twist))
-
-
-def image(ns: int, width: int = 4, height: int = 2, encoding: str = "bgr8") -> Message:
-    data = np.zeros(width * height * 3, np.uint8)
-    return Message(header=stamp(ns), width=width, height=height, step=3 * width, encoding=encoding, data=data)
 
 
 def test_odometry_becomes_state_in_levelled_axes() -> None:

@@ -13,7 +13,7 @@ from skyloop.errors import DriverError
 from skyloop.messages import Land, LinkState, Takeoff, Velocity
 from skyloop.vehicles.ros2.driver import Ros2Driver
 from tests.support.fake_rclpy import Fake, Node
-from tests.vehicles.ros2.test_robot import image, odometry
+from tests.vehicles.ros2.messages import image, odometry
 
 
 @pytest.fixture(autouse=True)

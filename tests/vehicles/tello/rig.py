@@ -10,6 +10,7 @@ from skyloop.messages import AnyAction, Feedback, FlightState
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.protocol import TelloSession
 from skyloop.vehicles.tello.wire import Sdk
+from tests.support.recordings import recorded
 from tests.vehicles.tello.emulator.rig import PILOT, Bench
 
 STATE_TICKS = 5
@@ -107,3 +108,11 @@ class Rig:
     @property
     def reasons(self) -> list[object]:
         return [event.data.get("reason") for event in self.sink.events]
+
+
+def strings() -> list[str]:
+    return [
+        line
+        for line in recorded("tello/state_strings.txt").read_text().splitlines()
+        if line and not line.startswith("#")
+    ]

@@ -25,8 +25,7 @@ from skyloop.messages import (
 from skyloop.vehicles.tello.options import TelloOptions, VelocityAxes
 from skyloop.vehicles.tello.wire import Sdk
 from tests.vehicles.tello.emulator.rig import PILOT
-from tests.vehicles.tello.rig import Rig
-from tests.vehicles.tello.wire.test_state import strings
+from tests.vehicles.tello.rig import Rig, strings
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.1, 0.3])

@@ -20,8 +20,7 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
 from skyloop.messages import LinkState
 from skyloop.pyav import new_decoder
-from tests.drivers.test_live_camera import free_port
-from tests.support.rtsp_server import HOST
+from tests.support.rtsp_server import HOST, free_port
 
 av = pytest.importorskip("av")
 pytestmark = pytest.mark.process

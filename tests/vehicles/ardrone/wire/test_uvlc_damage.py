@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from skyloop.errors import DecodeError
 from skyloop.vehicles.ardrone.emulator.video import encode
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture
-from tests.vehicles.ardrone.wire.test_uvlc_round_trip import noise, scenery
 from tests.vehicles.ardrone.wire.uvlc_bits import START, aligned, packet
+from tests.vehicles.ardrone.wire.uvlc_pictures import noise, scenery
 
 SHOWN = (encode(scenery(88, 72), 9), encode(noise(88, 72), 9, quant=3), encode(scenery(176, 144), 9))
 packets = st.sampled_from(SHOWN)

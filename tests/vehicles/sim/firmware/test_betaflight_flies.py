@@ -21,8 +21,7 @@ from skyloop.errors import NoAnswerError, RefusedError
 from skyloop.messages import Failsafe, FlightState, LinkState
 from skyloop.vehicles.sim.firmware import ports
 from skyloop.vehicles.sim.firmware.betaflight import program_path
-from tests.integration.processes.test_pilots import PILOTS
-from tests.support.processes import Process, eventually, proxy, sockets, start
+from tests.support.processes import PILOTS, Process, eventually, proxy, sockets, start
 from tests.vehicles.sim.firmware.real_betaflight import real_betaflight
 
 __all__ = ["proxy", "sockets", "start"]  # fixtures

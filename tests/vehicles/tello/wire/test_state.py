@@ -10,15 +10,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
 from skyloop.vehicles.tello.wire import State, build, parse
-from tests.support.recordings import recorded
-
-
-def strings() -> list[str]:
-    return [
-        line
-        for line in recorded("tello/state_strings.txt").read_text().splitlines()
-        if line and not line.startswith("#")
-    ]
+from tests.vehicles.tello.rig import strings
 
 
 def test_every_recorded_string_decodes_in_full() -> None:
