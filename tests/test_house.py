@@ -1,4 +1,4 @@
-"""The borders between packages: only the client uses the private attributes of a drone or a swarm."""
+"""The borders between packages, and between tests: what each may use of another."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 from skyloop.client import Drone, Swarm
 
-SOURCE = Path(__file__).parents[1] / "src" / "skyloop"
+TESTS = Path(__file__).parent
+SOURCE = TESTS.parent / "src" / "skyloop"
 KINDS = (Drone, Swarm)
 #: The client, its asyncio face, and the one module through which other packages reach further.
 INSIDE = ("client/", "aio/", "extend.py")
@@ -66,3 +67,16 @@ def test_only_the_client_uses_private_attributes() -> None:
         for use in private_uses(path.read_text(), names)
     ]
     assert not found, "use skyloop.extend, or add to it"
+
+
+def test_no_test_module_imports_another() -> None:
+    """What several share lies in a conftest, a helper module beside them or, for several rooms, in ``tests/support``."""
+    found = []
+    for path in sorted(TESTS.rglob("*.py")):
+        for line in re.findall(r"^ *(?:from|import) (tests\b.*)", path.read_text(), re.MULTILINE):
+            module, _, names = line.partition(" import ")
+            room = path.relative_to(TESTS).parts[0]
+            theirs = module.split(".")[1:2] not in ([room], ["support"], ["conftest"])
+            if re.search(r"\btest_", module) or names.startswith("test_") or (theirs and module != f"tests.{room}"):
+                found.append(f"{path.relative_to(TESTS)}: {line}")
+    assert not found

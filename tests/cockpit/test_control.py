@@ -29,7 +29,8 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from tests.support.cockpit import Node, Nodes, cockpit, count, open_socket, page, this_user, until
+from tests.support.cockpit import Node, Nodes, cockpit, open_socket, this_user, until
+from tests.support.cockpit_page import count, page
 from tests.support.testclient import TestClient
 
 

@@ -15,7 +15,8 @@ from skyloop.cockpit.control_session import GONE_S
 from skyloop.cockpit.fleet import Fleet
 from skyloop.messages import Failsafe, FlightState, Hover, Land, Position, Velocity
 from tests.cockpit.follower import StandIns
-from tests.support.cockpit import BOX, FORWARD, ORIGIN, Marker, Node, Nodes, Page, cockpit, count, page, until
+from tests.support.cockpit import ORIGIN, Node, Nodes, cockpit, until
+from tests.support.cockpit_page import BOX, FORWARD, Marker, Page, count, page
 from tests.support.testclient import TestClient
 
 FAR = {"name": "far", "speed": 1.0, "waypoints": [{"x": 30.0, "y": 0.0, "z": 1.0}]}

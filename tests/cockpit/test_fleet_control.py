@@ -14,7 +14,8 @@ from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.fleet import Fleet, observe
 from skyloop.errors import LinkError
 from skyloop.messages import EmergencyStop, FlightState, Land, Role
-from tests.support.cockpit import Node, Nodes, Page, cockpit, count, open_socket, page, this_user, until
+from tests.support.cockpit import Node, Nodes, cockpit, open_socket, this_user, until
+from tests.support.cockpit_page import Page, count, page
 from tests.support.testclient import TestClient
 
 

@@ -23,7 +23,8 @@ from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Annotation, FlightState, Hover, Velocity
 from skyloop.processing import Settings, Worker
 from tests.cockpit.follower import StandIn, StandIns
-from tests.support.cockpit import BOX, FORWARD, Marker, Node, Nodes, Page, cockpit, count, page, until
+from tests.support.cockpit import Node, Nodes, cockpit, until
+from tests.support.cockpit_page import BOX, FORWARD, Marker, Page, count, page
 from tests.support.testclient import TestClient
 
 #: All that a cockpit has imported, then the real follower with detections; it prints what that imports besides.

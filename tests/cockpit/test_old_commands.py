@@ -44,7 +44,8 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
-from tests.support.cockpit import Node, count, page, until
+from tests.support.cockpit import Node, until
+from tests.support.cockpit_page import count, page
 from tests.support.testclient import TestClient
 
 NOW_S = 1000.0

@@ -17,7 +17,8 @@ from skyloop.cockpit.routes import MOST_CHECKED, CheckedRoutes, RouteFiles
 from skyloop.control.route import Conditions, Route, RouteWaypoint, check_route
 from skyloop.errors import RefusedError, UnknownNameError, UsageError
 from skyloop.messages import AnyAction, FlightState, Hover
-from tests.support.cockpit import ORIGIN, Node, Nodes, Page, cockpit, page, until
+from tests.support.cockpit import ORIGIN, Node, Nodes, cockpit, until
+from tests.support.cockpit_page import Page, page
 from tests.support.testclient import TestClient
 
 TRIANGLE: dict[str, Any] = {

@@ -33,7 +33,7 @@ from skyloop.cockpit.encoded_feed import _ENCODER, NICENESS
 from skyloop.cockpit.testing import HeadlessPage, Pages
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import FlightState
-from tests.support.cockpit import PILOT, ask, served
+from tests.support.cockpit_page import PILOT, ask, served
 
 OBSERVER = "observer-token-0123456789"
 

@@ -12,7 +12,8 @@ from skyloop.client.commands import CommandSender
 from skyloop.client.connection import Scheduler
 from skyloop.cockpit.control_session import GONE_S
 from skyloop.messages import Command, EmergencyStop, FlightState, Hover, RequestAuthority, Role, Velocity, decode
-from tests.support.cockpit import Node, page, until
+from tests.support.cockpit import Node, until
+from tests.support.cockpit_page import page
 from tests.support.testclient import TestClient
 
 S = 1_000_000_000

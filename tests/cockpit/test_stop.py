@@ -12,7 +12,8 @@ from skyloop.cockpit import station
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.errors import DriverError, UnsupportedError
 from skyloop.messages import AnyAction, EmergencyStop, Fate, FlightState, Hover, Outcome, Refusal, Velocity
-from tests.support.cockpit import Node, Page, count, open_socket, page, until
+from tests.support.cockpit import Node, open_socket, until
+from tests.support.cockpit_page import Page, count, page
 from tests.support.testclient import TestClient
 
 

@@ -17,7 +17,8 @@ from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
 from skyloop.errors import DecodeError
 from skyloop.messages import Event, EventKind, FlightState
-from tests.support.cockpit import Node, Page, page, until
+from tests.support.cockpit import Node, until
+from tests.support.cockpit_page import Page, page
 from tests.support.testclient import TestClient
 
 S = 1_000_000_000

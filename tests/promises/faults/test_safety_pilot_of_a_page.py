@@ -11,7 +11,8 @@ from skyloop.cockpit.fleet import Fleet
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink.emulator import Kind
 from tests.promises.faults.scene import KINDS, Scene, taken_off
-from tests.support.cockpit import cockpit, page
+from tests.support.cockpit import cockpit
+from tests.support.cockpit_page import page
 
 pytestmark = pytest.mark.timeout(60)
 

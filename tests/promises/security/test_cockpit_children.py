@@ -20,7 +20,8 @@ from skyloop.cockpit.reports import MAX_WAITING, Reports
 from skyloop.cockpit.security import foreign, own_names
 from skyloop.errors import LinkError, RefusedError, UsageError
 from skyloop.recording.reader import describe
-from tests.support.cockpit import FakeRecorder, served
+from tests.support.cockpit import FakeRecorder
+from tests.support.cockpit_page import served
 
 ASKED = 30
 NAMES = own_names("127.0.0.1", 8123)

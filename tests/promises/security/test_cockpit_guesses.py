@@ -25,7 +25,7 @@ from skyloop.cockpit.access import (
     TokenGate,
     WrongTokens,
 )
-from tests.support.cockpit import PILOT, ask, served
+from tests.support.cockpit_page import PILOT, ask, served
 
 GUESSERS = 8
 
