@@ -70,7 +70,7 @@ def test_only_the_client_uses_private_attributes() -> None:
 
 
 def test_no_test_module_imports_another() -> None:
-    """What several share lies in a conftest, a helper module beside them or, for several rooms, in ``tests/support``."""
+    """What several share lies in a conftest, in a helper beside them or, for several rooms, in ``tests/support``."""
     found = []
     for path in sorted(TESTS.rglob("*.py")):
         for line in re.findall(r"^ *(?:from|import) (tests\b.*)", path.read_text(), re.MULTILINE):

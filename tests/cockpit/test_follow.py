@@ -34,8 +34,8 @@ import skyloop.cockpit.app
 import skyloop.cockpit.target_tracker as tracker
 from skyloop.clock import nanoseconds
 from skyloop.vision import Detection
-from tests.control.target_world import PERIOD_S
-from tests.control.test_follow_target import flown, follower_of, the_box
+from tests.support.shown_target import flown, follower_of, the_box
+from tests.support.target_world import PERIOD_S
 assert "scipy" not in sys.modules, "the test would show nothing"
 tracker.warm_up()
 known = set(sys.modules)

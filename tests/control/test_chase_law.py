@@ -19,7 +19,7 @@ from skyloop.control.target_estimate import TargetEstimator, TargetState
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, Value, Velocity
 from skyloop.messages.geometry import wrap_angle
-from tests.control.target_world import PERIOD_S, PERSON, ChaseWorld, Path, camera_at, view_of, walk
+from tests.support.target_world import PERIOD_S, PERSON, ChaseWorld, Path, camera_at, view_of, walk
 
 PER_S = round(1 / PERIOD_S)
 

@@ -9,12 +9,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
 
-import numpy as np
 import pytest
 
-from benchmarks.tracking_scenes import texture
 from skyloop.client import Drone
-from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.frame import Frame
 from skyloop.clock import nanoseconds
 from skyloop.control import ChaseSettings, FollowTarget
 from skyloop.control.chase_law import FollowMode, TargetPhase
@@ -26,10 +24,7 @@ from skyloop.messages import (
     Attitude,
     CameraInfo,
     Capabilities,
-    Encoding,
     EventKind,
-    Feedback,
-    FrameHeader,
     Points,
     Polyline,
     Severity,
@@ -41,7 +36,8 @@ from skyloop.stepping.rehearsal import rehearse
 from skyloop.vision import simulated_detector
 from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import Box
-from tests.control.target_world import PERIOD_S, box_of, camera_at
+from tests.support.shown_target import flown, follower_of, picture, state, the_box
+from tests.support.target_world import PERIOD_S
 
 WORLD = """
 [room]
@@ -57,7 +53,6 @@ shape = "person"
 look = 4
 path = { kind = "waypoints", points = [[5, -2, 0], [5, 9, 0], [5.5, 9, 0], [5.5, -2, 0]], speed = 0.9 }
 """
-INTRINSICS = FRONT_CAMERA.intrinsics()
 
 
 @contextmanager
@@ -194,59 +189,6 @@ def test_detections_of_a_processor_are_taken() -> None:
 
 
 # Without a drone ---------------------------------------------------------------------------------------------------
-
-
-def state(at_s: float, **values: Any) -> Feedback:
-    known: dict[str, Any] = {
-        "roll_rad": 0.0,
-        "pitch_rad": 0.0,
-        "yaw_rad": 0.0,
-        "altitude_m": 1.2,
-        "velocity_m_s": (0.0, 0.0, 0.0),
-    }
-    return Feedback(captured_ns=nanoseconds(at_s), **(known | values))
-
-
-FOOT = np.array([4.0, -0.5, 0.0])
-
-
-def picture(
-    at_s: float, *, shown: bool = True, known: bool = True, intrinsics: Any = INTRINSICS, **values: Any
-) -> Frame:
-    """A frame with a thing in it, whose feedback is that of its capture."""
-    image = texture(np.random.default_rng(7), 320, 240)
-    box = the_box()
-    if shown:
-        x, y, width, height = (round(part) for part in box)
-        image[y : y + height, x : x + width] = texture(np.random.default_rng(3), width, height, (180, 90, 40))
-    history = FeedbackHistory()
-    if known:
-        history.add(state(at_s, **values))
-    at_ns = nanoseconds(at_s)
-    header = FrameHeader("front", 1, at_ns, at_ns, 320, 240, Encoding.BGR8, image.size, intrinsics)
-    return Arrival(header, image.reshape(-1), at_ns, 0, history).frame()
-
-
-def the_box() -> Box:
-    box = box_of(camera_at(), FOOT)
-    assert box is not None
-    return box
-
-
-def flown(
-    follower: TargetFollower, seconds: float, *, start: float = 1.0, shown: bool = True, **values: Any
-) -> list[Any]:
-    command: Any = None
-    for n in range(round(seconds / PERIOD_S)):
-        at_s = start + n * PERIOD_S
-        follower.feedback(state(at_s, **values))
-        drawn = follower.look(picture(at_s, shown=shown, **values))
-        command = follower.step(nanoseconds(at_s))
-    return [command, drawn]
-
-
-def follower_of(**values: Any) -> TargetFollower:
-    return TargetFollower(FRONT_CAMERA.info(), **({"box": the_box()} | values))
 
 
 def test_a_vehicle_without_velocity_is_flown_by_attitude() -> None:

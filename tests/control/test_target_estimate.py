@@ -13,7 +13,7 @@ from skyloop.clock import nanoseconds
 from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, TargetState, Traits
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
-from tests.control.target_world import PERIOD_S, PERSON, Path, box_of, camera_at, view_of, walk
+from tests.support.target_world import PERIOD_S, PERSON, Path, box_of, camera_at, view_of, walk
 
 CASE_OF_SIZE = replace(PERSON, on_ground=False)
 CASE_OF_GROUND = replace(UNKNOWN, radius_m=0.25)

@@ -17,7 +17,7 @@ from skyloop.control.target_view import Camera
 from skyloop.errors import UsageError
 from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import Box, Image, TrackResult, overlap
-from tests.control.target_world import PERIOD_S, SIZE, Path, box_of, camera_at, walk
+from tests.support.target_world import PERIOD_S, SIZE, Path, box_of, camera_at, walk
 
 WIDTH, HEIGHT = SIZE
 BLUE, RED = (180, 90, 40), (40, 60, 190)

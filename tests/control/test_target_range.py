@@ -23,7 +23,7 @@ from skyloop.messages.relayed import Shape
 from skyloop.stepping.rehearsal import rehearse
 from skyloop.vision import simulated_detector
 from skyloop.vision.tracking import Box
-from tests.control.target_world import PERIOD_S, ChaseWorld, box_of, camera_at, walk
+from tests.support.target_world import PERIOD_S, ChaseWorld, box_of, camera_at, walk
 
 PICTURE, PERSON = (3.5, 1.7, 0.6), (5.0, 0.0, 1.7)  # how far away, the lower edge's height, and how high [m]
 

@@ -15,7 +15,7 @@ from skyloop.control.target_scene import Scene, SceneObject, unlikeness
 from skyloop.control.target_view import Camera
 from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import overlap
-from tests.control.target_world import PERIOD_S, Path, box_of, camera_at, noisy, walk
+from tests.support.target_world import PERIOD_S, Path, box_of, camera_at, noisy, walk
 
 Looks = NDArray[np.float32]
 BLUE = np.array([40, 5, -40, 30, 0, -10], np.float32)

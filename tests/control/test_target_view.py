@@ -14,7 +14,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Feedback
 from skyloop.messages.geometry import wrap_angle
 from skyloop.sim.camera import FRONT_CAMERA
-from tests.control.target_world import SIZE, box_of, camera_at, state
+from tests.support.target_world import SIZE, box_of, camera_at, state
 
 ANGLES = {
     "roll": st.floats(-0.25, 0.25),
