@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.swarm_flight import SwarmFlight, fly, missed, report
-from skyloop.client.monitoring import Distribution
+from benchmarks.swarm_flight import fly, missed
 from tests.support.processes import Process
 
 DRONES = 10
@@ -43,18 +42,3 @@ def test_ten_drones_with_a_controller_each_from_one_process(drones: None) -> Non
         assert flight.feedback is not None
         assert flight.frames > 0
     assert missed(flights) == []
-
-
-def test_the_table_and_who_missed_it() -> None:
-    delays = Distribution(0.001, 0.002, 0.003, 0.001, 9)
-    good = SwarmFlight("a", 9, delays, delays, 5, 0, 0, 0.02, True)
-    flights = [
-        good,
-        SwarmFlight("b", 0, None, None, 0, 2, 1, None, False),
-        SwarmFlight("c", 9, delays, None, 0, 0, 0, 0.1, False),
-    ]
-    assert missed(flights) == ["b", "c"]
-    table = report(flights)
-    assert len({len(row) for row in table}) == 1
-    assert table[1] == ["a", "9", "1.00", "2.00", "3.00", "1.00", "2.00", "5", "0", "0", "20", "yes"]
-    assert table[2] == ["b", "0", "", "", "", "", "", "0", "2", "1", "missed", "no"]
