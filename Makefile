@@ -21,7 +21,7 @@ help:
 	@echo "make check                                   lint, format, types, import contracts, budgets"
 	@echo "make chaos [ARGS='--seconds 180']            drones flown while processes die, stall, starve and are flooded"
 	@echo "make fuzz [ARGS='--seconds 60 recording']    decoders, file readers and servers against hostile input"
-	@echo "make docs                                    the documentation as a site: build/site/index.html"
+	@echo "make docs                                    the tables of the code, and the documentation as a site: build/site"
 	@echo "make package                                 wheel and source package, checked, and the demo flown from the wheel"
 	@echo "make page                                    the cockpit's page anew from its sources, where node and npm are"
 	@echo "make format | stubs | coverage | pictures | lock | clean"
@@ -109,8 +109,9 @@ $(VENV)/.installed-docs: $(VENV)/.installed-dev requirements-docs.txt
 	$(PIP) --requirement requirements-docs.txt
 	@touch $@
 
-# A warning is an error, such as a link that leads nowhere.
+# The tables that are lists of the code anew, then the site. A warning is an error, such as a link that leads nowhere.
 docs: $(VENV)/.installed-docs
+	$(BIN)/python -m scripts.doc_tables
 	$(BIN)/python -m sphinx --quiet --jobs auto --fail-on-warning --keep-going --doctree-dir build/site-cache docs build/site
 	@echo "build/site/index.html"
 

@@ -7,13 +7,11 @@ from collections.abc import Mapping
 
 from skyloop.errors import UsageError
 
-_BLOCK = re.compile(r"(<!-- measured: (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
-
-def fill(page: str, blocks: Mapping[str, str]) -> str:
+def fill(page: str, blocks: Mapping[str, str], kind: str = "measured") -> str:
     """The page with these texts between ``<!-- measured: NAME -->`` and ``<!-- end -->``; other places stay.
 
-    Raises :class:`UsageError` for a text that the page has no place for.
+    ``kind`` stands before the name. Raises :class:`UsageError` for a text that the page has no place for.
     """
     placed: set[str] = set()
 
@@ -24,8 +22,8 @@ def fill(page: str, blocks: Mapping[str, str]) -> str:
         placed.add(name)
         return f"{match[1]}{blocks[name].strip()}\n{match[4]}"
 
-    filled = _BLOCK.sub(put, page)
+    filled = re.sub(rf"(<!-- {kind}: (\S+) -->\n)(.*?)(<!-- end -->)", put, page, flags=re.DOTALL)
     missing = sorted(set(blocks) - placed)
     if missing:
-        raise UsageError(f"the page has no place marked <!-- measured: {missing[0]} -->")
+        raise UsageError(f"the page has no place marked <!-- {kind}: {missing[0]} -->")
     return filled

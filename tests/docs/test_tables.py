@@ -8,11 +8,9 @@ from types import ModuleType
 
 import pytest
 
+from scripts.doc_tables import PAGES, made
 from skyloop.cockpit.server import _LARGEST_MESSAGE
 from skyloop.drivers.uri import parse_uri
-from skyloop.messages import Action, FlightState, Hover, Land, ResetEmergency, Takeoff, Velocity
-from skyloop.proxy.core.command_checks import STATE_POLICIES, StatePolicy
-from skyloop.proxy.parameters import OWN
 from skyloop.proxy.relay import MAX_ANNOTATION
 from skyloop.proxy.requests import MAX_MALFORMED, MAX_PENDING
 from skyloop.sim.world_file import shipped_worlds
@@ -34,6 +32,12 @@ def names(cell: str) -> list[str]:
     return re.findall(r"`([^`]+)`", cell)
 
 
+@pytest.mark.parametrize("page", list(PAGES))
+def test_what_is_made_of_the_code_is_up_to_date(page: str) -> None:
+    text, wanted = made(page)
+    assert text == wanted, "run python -m scripts.doc_tables"
+
+
 def test_the_extras() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     table = rows(section("docs/start/install.md", "# Installing"))
@@ -47,29 +51,6 @@ def test_the_budgets_of_paths() -> None:
     table = rows(section("docs/architecture.md", "### How long the paths are"))
     assert [row[0] for row in table] == [f"`{name}`" for name in budgets]
     assert [row[2:] for row in table] == [[str(number) for number in budget.values()] for budget in budgets.values()]
-
-
-def test_the_proxys_parameters() -> None:
-    table = rows(section("docs/proxy.md", "## Parameters"))
-    assert table == [
-        [f"`{p.name}`", f"{p.value:g}", p.unit, f"{p.minimum:g} to {p.maximum:g}", p.description]
-        if isinstance(p.value, float)
-        else [f"`{p.name}`", str(p.value), p.unit, "", p.description]
-        for p in OWN
-    ]
-
-
-def test_what_is_done_in_which_flight_state() -> None:
-    columns: tuple[type[Action], ...] = (Takeoff, Hover, Land, Velocity, ResetEmergency)
-    words = {"done": StatePolicy.APPLY, "refused": StatePolicy.REFUSE, "hover": StatePolicy.HOVER}
-    seen = set()
-    for states, *cells in rows(section("docs/proxy.md", "## Which commands are executed")):
-        for state in states.split(", "):
-            seen.add(FlightState(state.replace(" ", "_")))
-            for action, cell in zip(columns, cells, strict=True):
-                plan = STATE_POLICIES[action][FlightState(state.replace(" ", "_"))]
-                assert plan is words.get(cell, StatePolicy.HOLD), (state, action.__name__)
-    assert seen == set(FlightState)
 
 
 ADDRESSES = [

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from skyloop.messages import Refusal
-from skyloop.messages.command import ENDINGS
-from tests.promises.security.deeds import COLUMNS, DEEDS, works
+from tests.promises.security.deeds import DEEDS
 from tests.support.pages import rows, section
 
 HERE = Path(__file__).parent
@@ -52,12 +51,6 @@ REPLAYS = {
 }
 
 
-def test_the_table_of_attempts_is_that_of_the_tests() -> None:
-    table = rows(section(PAGE, "### What was tried"))[: len(DEEDS)]
-    assert table == [[deed.what, *("**works**" if works(deed, who) else "–" for who in COLUMNS)] for deed in DEEDS]
-    assert f"| tries to | {' | '.join(COLUMNS.values())} |" in section(PAGE, "### What was tried")
-
-
 def test_each_row_about_the_door_is_a_test() -> None:
     assert [row[0] for row in rows(section(PAGE, "### What was tried"))[len(DEEDS) :]] == list(DOORS)
     for name in DOORS.values():
@@ -69,7 +62,3 @@ def test_each_row_about_replays_is_a_test() -> None:
     assert table == [[words, f"`{reason}`"] for words, (_, reason) in REPLAYS.items()]
     for name, _ in REPLAYS.values():
         assert f"\ndef test_{name}(" in (HERE / "test_replays.py").read_text(), name
-
-
-def test_the_list_of_what_ends_an_order_is_the_one_of_the_code() -> None:
-    assert f"\n{'; '.join(ENDINGS.values())}.\n" in section(PAGE, "## Replayed commands")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 
 from skyloop.drivers.uri import parse_uri
-from skyloop.vehicles.ardrone import options
 from skyloop.vehicles.ardrone.emulator.video import BOTTOM_2_SENT, FRONT_2
 from skyloop.vehicles.ardrone.parameters import PREFIX, Commands, entries_of
 from skyloop.vehicles.ardrone.setpoints import SetpointController
@@ -19,11 +18,6 @@ DRIVER = section("docs/ardrone.md", "## The driver")
 
 def names(cell: str) -> list[str]:
     return re.findall(r"`([^`]+)`", cell)
-
-
-def test_options() -> None:
-    table = rows(section("docs/ardrone.md", "### `ardrone://`"))
-    assert sorted(name for row in table for name in names(row[0])) == sorted(options.KNOWN)
 
 
 def test_common_parameters() -> None:

@@ -6,7 +6,6 @@ import math
 import re
 
 from skyloop.messages import Attitude, Velocity
-from skyloop.vehicles.tello import options
 from skyloop.vehicles.tello.parameters import SETTINGS, flip_parameter, scale_parameters
 from skyloop.vehicles.tello.protocol import ALIVE_NS, DEGRADED_NS, ENTER_NS, LOST_NS
 from skyloop.vehicles.tello.setpoints import Scale, sticks_of
@@ -15,11 +14,6 @@ from tests.support.pages import rows, section
 
 def names(cell: str) -> list[str]:
     return re.findall(r"`([^`]+)`", cell)
-
-
-def test_options() -> None:
-    table = rows(section("docs/tello.md", "### `tello://`"))
-    assert sorted(name for row in table for name in names(row[0])) == sorted(options.KNOWN)
 
 
 def test_parameters() -> None:
