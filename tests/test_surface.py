@@ -1,6 +1,6 @@
 """What users may rely on: the names of the documented modules, and what a drone and a swarm show. No more is public.
 
-``python -m tests.test_surface`` writes the list, ``tests/data/public.txt``, anew. What is added is promised from then on.
+``python -m tests.test_surface`` writes ``tests/data/public.txt`` anew: what is added there is promised from then on.
 """
 
 from __future__ import annotations
