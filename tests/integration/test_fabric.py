@@ -11,7 +11,9 @@ from skyloop.client.connection import Scheduler
 from skyloop.errors import UsageError
 from skyloop.messages import Applied, FlightState, Velocity
 from skyloop.transport.memory import MemoryServer
-from tests.support.nodes import WAIT_S, Node, near_node, take
+from tests.support.nodes import WAIT_S, Node, far, near_node, node, take
+
+__all__ = ["far", "node"]  # fixtures
 
 pytest.importorskip("cv2", reason="encoded video needs the extra 'network'")
 
