@@ -14,10 +14,10 @@ import typer
 import typer.main
 from typer.core import TyperCommand, TyperGroup
 
-from skyloop.cli import INTERRUPTED, wording
+from skyloop.cli import INTERRUPTED
 from skyloop.cli.commands import COMMANDS, Entry, Task, entry_of
 from skyloop.cli.naming import with_place
-from skyloop.cli.text import coloured, make_printable
+from skyloop.cli.text import WordError, coloured, error_text, make_printable, usage_text
 from skyloop.errors import MissingExtraError, ParameterError, SkyloopError, install_command
 
 _log = logging.getLogger(__name__)
@@ -101,8 +101,8 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
     except typer.Abort:
         print(f"{name}: nothing was done", file=sys.stderr)
         sys.exit(FAILED)
-    except wording.WordError as error:
-        print(coloured(wording.of_word(error, name), sys.stderr), file=sys.stderr)
+    except WordError as error:
+        print(coloured(usage_text(error, name), sys.stderr), file=sys.stderr)
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _fail(error, arguments, name)
@@ -119,7 +119,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
 
 def _fail(error: SkyloopError, arguments: list[str], name: str) -> NoReturn:
     _log.debug("the command failed", exc_info=error)
-    told, entry = wording.of(error), entry_of(arguments)
+    told, entry = error_text(error), entry_of(arguments)
     if entry is not None and install_command("") in told:  # its own, or of a proxy that it started
         from skyloop.cli.install import with_all_missing
 

@@ -124,7 +124,7 @@ COMMANDS: Final = {
     ),
     "router": Entry(
         Task.SHARE,
-        "router",
+        "network",
         "router",
         "Join proxies and programs of several networks",
         "router --network other-site.example:7447",
@@ -132,7 +132,7 @@ COMMANDS: Final = {
     ),
     "keys": Entry(
         Task.SHARE,
-        "keys",
+        "network",
         "keys",
         "Who may join the network: make, issue, revoke keys",
         "keys issue jane --role pilot",
