@@ -149,9 +149,6 @@ class Spread(msgspec.Struct, frozen=True):
 def spread(times_ns: Sequence[float]) -> Spread:
     """Return the median and the 99th percentile of some times.
 
-    Args:
-        times_ns: The times [ns].
-
     Raises:
         ValueError: There are none: something did not flow.
     """
@@ -230,11 +227,7 @@ class BenchVehicle(Driver):
 
 
 def proxy_name(folder: str) -> str:
-    """Return the name of the proxy that is measured.
-
-    Args:
-        folder: Of this run alone.
-    """
+    """Return the name of the proxy that is measured."""
     return Path(folder).name.lower()
 
 
@@ -273,11 +266,7 @@ class Vehicle:
 
 
 class Listening:
-    """Reports each feedback and frame once, on the connection's receiving thread.
-
-    Args:
-        received: Called with each.
-    """
+    """Reports each feedback and frame once, on the connection's receiving thread."""
 
     def __init__(self, received: Received) -> None:
         self._received = received
@@ -750,12 +739,7 @@ def _drawing_row(cameras: str, model: CameraModel, pictures: int, times: list[in
 
 
 class Flight:
-    """Drones that circle in the furnished room, and their cameras, which expose in turn.
-
-    Args:
-        drones: How many.
-        cameras: The drone and the model of each.
-    """
+    """Drones that circle in the furnished room, and their cameras, which expose in turn."""
 
     def __init__(self, drones: int, cameras: list[tuple[int, CameraModel]]) -> None:
         from skyloop.sim import STEP_S
@@ -772,9 +756,6 @@ class Flight:
 
     def draw(self, at: int) -> int:
         """Fly on, then draw what a camera sees with the flaws of its sensor.
-
-        Args:
-            at: The camera's index.
 
         Returns:
             The time of the drawing [ns].

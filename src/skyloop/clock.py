@@ -88,9 +88,6 @@ class LiveClock:
 
     A stream whose clock runs a little slower is followed through two windows, one of which is always complete. Times
     run neither backwards nor ahead.
-
-    Args:
-        window_s: Length of a window [s].
     """
 
     def __init__(self, window_s: float = 5.0) -> None:

@@ -384,12 +384,7 @@ class FlightProgress:
 
 
 def flight_line(drone: Drone, flown_s: float) -> str:
-    """Return how a flight goes in one line.
-
-    Args:
-        drone: Who flies.
-        flown_s: For how long [s].
-    """
+    """Return how a flight goes in one line."""
     feedback, video = drone.feedback(), [value for name, value in drone.stats.items() if name.startswith("video")]
     rate, dropped = sum(channel.rate_hz for channel in video), sum(channel.dropped for channel in video)
     parts = [

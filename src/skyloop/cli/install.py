@@ -67,9 +67,6 @@ def install(
 def requirements(parts: Iterable[str]) -> list[str]:
     """Return what optional parts consist of, as pip takes it.
 
-    Args:
-        parts: Names of extras.
-
     Raises:
         UnknownNameError: There is no such part.
         SkyloopError: Skyloop's own metadata is missing: it runs from a folder and was never installed.

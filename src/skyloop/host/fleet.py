@@ -137,12 +137,7 @@ def read_fleet(path: Path) -> Fleet:
 
 
 def parse_fleet(text: str, source: str) -> Fleet:
-    """Parse the text of a file of vehicles; see :func:`read_fleet`.
-
-    Args:
-        text: The file's text.
-        source: The file's name, for errors.
-    """
+    """Parse the text of a file of vehicles; see :func:`read_fleet`."""
     found = read_tables(parse_toml(text, source), source, _File)
     top = Place(source)
     _checked(top, "name", lambda: check_name(found.name))

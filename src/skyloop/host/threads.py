@@ -277,11 +277,7 @@ class Watchdog:
             self._thread.join()
 
     def look(self, now_s: float) -> None:
-        """Look once.
-
-        Args:
-            now_s: The time, on a monotonic clock [s].
-        """
+        """Look once."""
         punctual = now_s - self._looked_s < 2 * LOOK_S
         self._looked_s = now_s
         seen: dict[SharedLoop, tuple[int, int]] = {}

@@ -66,11 +66,7 @@ class VehicleStatus(msgspec.Struct, frozen=True):
 
 
 class HostedVehicle(ABC):
-    """A vehicle of a host. Methods may be called from any thread.
-
-    Args:
-        settings: Its settings.
-    """
+    """A vehicle of a host. Methods may be called from any thread."""
 
     def __init__(self, settings: VehicleSettings) -> None:
         self.settings = settings
@@ -270,10 +266,6 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 
 def within(call: Callable[[], object], seconds: float) -> bool:
     """Call something that may hang, on a thread of its own, and raise what it raises.
-
-    Args:
-        call: The function.
-        seconds: How long to wait for it [s].
 
     Returns:
         Whether it returned in time; if not, it is left to its daemon thread.

@@ -95,12 +95,7 @@ class ServerConnection:
         return identity is None or identity.may_fly(drone)
 
     def lags(self, topic: str, number: int) -> bool:
-        """Return whether a topic's packet has no room any more: more than :data:`DEPTH` before it are not acknowledged.
-
-        Args:
-            topic: The topic.
-            number: The packet's.
-        """
+        """Return whether a topic's packet has no room: more than :data:`DEPTH` before it are not acknowledged."""
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
@@ -148,9 +143,6 @@ class ServerConnection:
 
     def due(self, now_s: float) -> tuple[list[tuple[int, bytes]], bool]:
         """Return what is to be sent now.
-
-        Args:
-            now_s: The monotonic clock [s].
 
         Returns:
             The packets with their numbers (0: the transport's own), and whether more may become due as time passes.

@@ -86,9 +86,6 @@ class Outgoing:
     def due(self, now_s: float) -> list[tuple[int, bytes, str]]:
         """Return what is to be sent now: packets for which there is room on the way, and those that seem lost.
 
-        Args:
-            now_s: The monotonic clock [s].
-
         Returns:
             Number, packet and way of each.
         """
@@ -115,10 +112,6 @@ class Outgoing:
         """Drop the packets up to this number, as the other end has acknowledged them.
 
         A number of a packet that was not sent yet is ignored.
-
-        Args:
-            number: The last packet that was acknowledged.
-            now_s: The monotonic clock [s].
         """
         if not self._under_way or number >= self._kept[0].number + self._under_way:
             return
@@ -183,13 +176,7 @@ class AckPolicy:
         self._next_s = -math.inf if every_s < math.inf else math.inf
 
     def count(self, number: int, size: int, now_s: float = 0.0) -> bool:
-        """Count a packet; return whether to acknowledge now.
-
-        Args:
-            number: The packet's.
-            size: Its size [bytes].
-            now_s: The monotonic clock [s].
-        """
+        """Count a packet; return whether to acknowledge now."""
         self._bytes += size
         few = number - self._acknowledged < ACKNOWLEDGE_AFTER and self._bytes < MAX_BYTES // 8
         if few and now_s < self._next_s:
@@ -216,11 +203,7 @@ class Pace:
         self._since_s = math.inf  # when the oldest was sent that is not acknowledged, or later
 
     def may_send(self, now_s: float) -> bool:
-        """Return whether another packet may be sent now.
-
-        Args:
-            now_s: The monotonic clock [s].
-        """
+        """Return whether another packet may be sent now."""
         stands = self._prompt and now_s - self._since_s > STANDS_S
         return not stands or now_s - self._sent_s >= SLOW_S
 
@@ -249,11 +232,7 @@ class Pace:
 
 
 class RecentPackets:
-    """The last packets that came: where there is a direct path and one through a router, each comes twice.
-
-    Args:
-        depth: How many are remembered.
-    """
+    """The last packets that came: where there is a direct path and one through a router, each comes twice."""
 
     def __init__(self, depth: int = RECENT_PACKETS) -> None:
         self._packets: deque[tuple[int, bytes]] = deque(maxlen=depth)
@@ -310,13 +289,7 @@ class Receiver:
     def receive(
         self, packet: bytes, *, control: Callable[[packets.Message], bool], deliver: Callable[[bytes], object]
     ) -> None:
-        """Receive a packet that may be lost.
-
-        Args:
-            packet: The packet.
-            control: Handles the transport's own packets.
-            deliver: Handles all others.
-        """
+        """Receive a packet that may be lost."""
         message = packets.parse_own(packet)
         if message is not None and control(message):
             return

@@ -69,10 +69,6 @@ def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
 def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
     """Return the proxies with this name, the oldest first; there are several only where a network was cut in two.
 
-    Args:
-        settings: How to join the network.
-        name: The proxy's name.
-
     Raises:
         LinkError: The network can't be joined.
     """
@@ -161,13 +157,7 @@ class UnreachablePeers:
         self._tried: dict[str, float] = {}
 
     def any_new(self, answered: set[str], known: set[str], now_s: float) -> bool:
-        """Return whether a peer answered that is not known and for which no new session was opened yet.
-
-        Args:
-            answered: Who answered a search.
-            known: Who is linked.
-            now_s: The monotonic clock [s].
-        """
+        """Return whether a peer answered that is not known and for which no new session was opened yet."""
         self._tried = {who: at for who, at in self._tried.items() if now_s - at < FORGET_S}
         new = answered - known - self._tried.keys()
         self._tried |= dict.fromkeys(new, now_s)

@@ -154,10 +154,6 @@ class FramePublisher:
     def subscribe(self, key: Hashable, topic: str) -> bool:
         """Send a connection frames, from the next one on.
 
-        Args:
-            key: The connection.
-            topic: A camera's, in any form.
-
         Returns:
             False if it can't have them; see :meth:`problem`.
         """

@@ -93,9 +93,6 @@ class HandlerQueue(Generic[Item]):
     def get(self, timeout_s: float) -> Item | None:
         """Return the next item.
 
-        Args:
-            timeout_s: How long to wait for one [s].
-
         Returns:
             The item; None if none came in time, or if the queue is closed and empty.
         """

@@ -205,10 +205,6 @@ def _topic(text: bytes, least: int = 0) -> str:
 def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
     """Return what Zenoh received as bytes; empty for None.
 
-    Args:
-        data: The payload or attachment.
-        at_most: The largest size that is copied [bytes].
-
     Raises:
         DecodeError: It is larger.
     """
@@ -221,10 +217,6 @@ def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
 
 def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, bytes]:
     """Return the packet and the attachment of a sample.
-
-    Args:
-        sample: What Zenoh received.
-        at_most: The largest size of the packet [bytes].
 
     Raises:
         DecodeError: It is empty or too large.

@@ -57,11 +57,6 @@ class Opener(Protocol):
     def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
         """Open what came. Any thread.
 
-        Args:
-            where: The key by which it came.
-            attachment: As it came.
-            payload: As it came.
-
         Returns:
             The packet and its attachment; None if it came before, or can't be opened yet.
 
@@ -156,10 +151,6 @@ class Open:
 
 def contents(opener: Opener, sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
     """Open a sample as :meth:`Opener.open` does, without copying what is too large.
-
-    Args:
-        opener: Opens it.
-        sample: What Zenoh received.
 
     Returns:
         The packet and the attachment; None if it came before, or can't be opened yet.

@@ -38,10 +38,6 @@ _ATTEMPTS: Final = 5  # to get a free port before somebody else has it
 class Session:
     """One shared Zenoh session; :func:`release` gives it back.
 
-    Args:
-        settings: How to join the network.
-        part: What the session is.
-
     Raises:
         LinkError: The network can't be joined.
         MissingExtraError: The extra ``network`` is not installed.

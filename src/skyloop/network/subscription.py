@@ -61,11 +61,6 @@ class Subscription:
     def declare(self, session: Session, name: str, connection: str) -> list[Any]:
         """Subscribe on a Zenoh session.
 
-        Args:
-            session: The session.
-            name: The proxy's name.
-            connection: This connection's id.
-
         Returns:
             What was declared; the caller undeclares it.
         """

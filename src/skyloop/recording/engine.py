@@ -90,11 +90,7 @@ class Engine:
         self._ended_ns = time.monotonic_ns()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write what was received, and close the file. Idempotent.
-
-        Args:
-            timeout_s: How long to wait for the disk.
-        """
+        """Write what was received, and close the file. Idempotent."""
         if self._ended_ns is not None:
             return
         self._ended_ns = time.monotonic_ns()

@@ -73,9 +73,6 @@ class Options(msgspec.Struct, frozen=True):
     def check_cameras(self, known: Iterable[str]) -> None:
         """Check the cameras that were chosen.
 
-        Args:
-            known: The cameras of all drones.
-
         Raises:
             UnknownNameError: No drone has a camera of that name.
         """

@@ -37,10 +37,6 @@ Opener = Callable[[Path, bool], Target]
 def open_target(path: Path, overwrite: bool) -> Target:
     """Open a file without a buffer.
 
-    Args:
-        path: The file.
-        overwrite: Whether an existing file is replaced.
-
     Raises:
         OSError: It exists, or can't be written.
     """

@@ -103,11 +103,6 @@ def compressed(message: bytes, record: FrameRecord) -> bytes:
 def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:
     """Decode JPEG or PNG.
 
-    Args:
-        data: The image file.
-        what: The frame, for error messages.
-        grey: Whether to return grey and not BGR.
-
     Returns:
         BGR, shape (h, w, 3), or grey (h, w), uint8.
 
@@ -187,10 +182,6 @@ class Group:
     def pixels(self, index: int, what: str) -> NDArray[np.uint8]:
         """Decode one frame.
 
-        Args:
-            index: Of the frame in the group.
-            what: The frame, for error messages.
-
         Returns:
             BGR, shape (height, width, 3), uint8.
 
@@ -217,11 +208,6 @@ class Groups:
 
     def add(self, number: int, unit: bytes, *, key: bool) -> tuple[Group, int] | None:
         """Add a frame.
-
-        Args:
-            number: Of the frame.
-            unit: Its access unit.
-            key: Whether it is a key frame.
 
         Returns:
             The group and the index in it; None for a frame that can't be decoded, because one before it is missing.

@@ -250,9 +250,6 @@ class Line(msgspec.Struct, frozen=True, omit_defaults=True):
 def run_child(order: Order) -> int:
     """Record until standard input ends or SIGTERM arrives.
 
-    Args:
-        order: What to record.
-
     Returns:
         The exit code: 0, or 2 if the recording could not start.
     """

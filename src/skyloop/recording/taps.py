@@ -342,9 +342,6 @@ class Video:
 def encoder(options: Options) -> Encode:
     """Return a function that encodes images, shape (height, width, 3) BGR or (height, width), uint8.
 
-    Args:
-        options: Format and quality.
-
     Raises:
         MissingExtraError: OpenCV is not installed.
     """

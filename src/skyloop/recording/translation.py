@@ -104,11 +104,7 @@ class Translator:
         return self._makers[type(item.sample)](item.sample, self._clock.unix(item.received_ns))
 
     def prelude(self, now_ns: int) -> Iterator[Message]:
-        """Create the messages that make each file complete in itself: parameters, mountings and calibrations.
-
-        Args:
-            now_ns: On the recorder's clock.
-        """
+        """Create the messages that make each file complete in itself: parameters, mountings and calibrations."""
         at_ns = self._clock.unix(now_ns)
         for parameter in list(self._parameters.values()):
             yield from self._parameter(parameter, at_ns)

@@ -89,12 +89,7 @@ def certificate_pem(certificate: x509.Certificate) -> bytes:
 
 
 def make_authority(days: int, now: datetime) -> Authority:
-    """Make a new lab's authority. Its name ends in random digits, so that labs can be distinguished.
-
-    Args:
-        days: How long it is valid.
-        now: The time in UTC.
-    """
+    """Make a new lab's authority. Its name ends in random digits, so that labs can be distinguished."""
     key = new_key()
     name = _name(f"Skyloop lab {secrets.token_hex(4)}")
     certificate = (
@@ -207,10 +202,6 @@ def may_certify(authority: Authority, name: str) -> bool:
 def read_certificate(content: bytes, path: Path) -> x509.Certificate:
     """Decode a certificate from a file.
 
-    Args:
-        content: PEM.
-        path: The file, for errors.
-
     Raises:
         FileFormatError: It is not a certificate.
     """
@@ -257,10 +248,6 @@ def signed_by(certificate: x509.Certificate, content: bytes, signature: bytes) -
 def read_key(content: bytes, path: Path) -> PrivateKey:
     """Decode a private key from a file.
 
-    Args:
-        content: PEM, not encrypted.
-        path: The file, for errors.
-
     Raises:
         FileFormatError: It is not such a key, or not one on a curve.
     """
@@ -299,10 +286,6 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
 def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
     """Return the identity that a certificate names.
 
-    Args:
-        certificate: The holder's.
-        path: Its file, for errors.
-
     Raises:
         FileFormatError: It names no role and drones.
     """
@@ -331,11 +314,6 @@ def matches(key: PrivateKey, certificate: x509.Certificate) -> bool:
 def check_issued(certificate: x509.Certificate, authority: Authority, path: Path) -> None:
     """Check that an authority issued a certificate.
 
-    Args:
-        certificate: To check.
-        authority: The lab's.
-        path: The certificate's file, for errors.
-
     Raises:
         UsageError: Another authority issued it.
     """
@@ -349,11 +327,6 @@ def check_issued(certificate: x509.Certificate, authority: Authority, path: Path
 
 def check_time(certificate: x509.Certificate, what: str, now: datetime) -> None:
     """Check that a certificate is valid now.
-
-    Args:
-        certificate: To check.
-        what: What it belongs to, for errors.
-        now: The time in UTC.
 
     Raises:
         UsageError: It is not valid yet, or has expired.

@@ -59,10 +59,6 @@ def write(path: Path, content: bytes, *, private: bool = False) -> None:
 def read(path: Path, what: str) -> bytes:
     """Read a file of at most :data:`MAX_BYTES`.
 
-    Args:
-        path: The file.
-        what: What it holds, for errors.
-
     Raises:
         UsageError: It can't be read, or is too large.
     """
@@ -71,10 +67,6 @@ def read(path: Path, what: str) -> bytes:
 
 def read_private(path: Path, what: str) -> bytes:
     """Read a file that must not be open to others, as somebody else may have the key then.
-
-    Args:
-        path: The file.
-        what: What it holds, for errors.
 
     Raises:
         UsageError: It can't be read, is too large, or is open to others.

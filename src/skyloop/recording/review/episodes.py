@@ -369,11 +369,7 @@ class Film:
 
 
 def numbers_stats(values: NDArray[Any]) -> dict[str, Any]:
-    """Return what a dataset says of a column's numbers, each as a list: one, or one for each of a row's.
-
-    Args:
-        values: Shape (rows,) or (rows, n).
-    """
+    """Return what a dataset says of a column's numbers, each as a list: one, or one for each of a row's."""
     columns = values.reshape(len(values), -1).astype(np.float64)
     found = {"min": columns.min(0), "max": columns.max(0), "mean": columns.mean(0), "std": columns.std(0)}
     found |= {name: np.quantile(columns, share, axis=0) for name, share in _QUANTILES.items()}
