@@ -8,8 +8,9 @@ them apart. Wall-clock time is never used for ages.
 from __future__ import annotations
 
 import functools
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -41,6 +42,16 @@ def slept_ns() -> int:
     if _BOOTTIME is None:
         return 0
     return time.clock_gettime_ns(_BOOTTIME) - time.monotonic_ns()
+
+
+def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
+    """Yield once a period, by absolute deadlines, until ``ended`` is set; beats that come late are not made up for."""
+    due_s = time.monotonic()
+    while True:
+        due_s = max(due_s + period_s, time.monotonic())
+        if ended.wait(max(0.0, due_s - time.monotonic())):
+            return
+        yield
 
 
 @functools.cache

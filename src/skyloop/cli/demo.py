@@ -264,11 +264,7 @@ class Spread:
 
 
 def true_range(native: dict[str, Value] | None) -> float | None:
-    """Return the true distance from the vehicle's centre to the carried board's [m].
-
-    Returns:
-        None where it is not known.
-    """
+    """Return the true distance from the vehicle's centre to the carried board's [m]; None where it is not known."""
     if native is None:
         return None
     places = [[native.get(name) for name in names] for names in (OWN_PLACE, BOARD_PLACE)]

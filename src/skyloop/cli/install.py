@@ -119,11 +119,6 @@ def _is_there(module: str) -> bool:
 
 
 def with_all_missing(told: str, parts: Iterable[str]) -> str:
-    """Return an error that names all parts that a command lacks, not only the one that it met first.
-
-    Args:
-        told: The error, which ends with how to install a part.
-        parts: Those that the command needs.
-    """
+    """Return an error that ends with how to install a part, with all that are missing of those that are needed."""
     before, command, first = told.rpartition(install_command(""))
     return before + command + " ".join((first, *(part for part in missing(parts) if part != first)))

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from skyloop.cli.naming import recordings
-from skyloop.cli.text import console
+from skyloop.cli.text import console, tell
 from skyloop.errors import FileFormatError, UsageError
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def report(
     target = output or file.with_suffix(".html")
     with _progress("drawing") as progress:
         write_report(recording, recording.drone(drone).name, target, pictures=pictures, progress=progress)
-    _print(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
+    tell(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
 
 
 @log.command(short_help="Samples and frames for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
@@ -182,7 +182,7 @@ def export(
         with _progress(f"exporting {chosen}") as progress:
             found = export_mp4(recording, name, chosen, target, burn_time=burn_time, encode=encode, progress=progress)
         for line in log_tables.exported(found, chosen):
-            _print(line)
+            tell(line)
         return
     _refuse({"--camera": bool(camera), "--burn-time": burn_time, "--encode": encode}, to)
     with _progress("reading") as progress:
@@ -193,7 +193,7 @@ def export(
         write = ways.export_csv if to is Form.CSV else ways.export_parquet
         written = write(tables, output or file.with_name(f"{file.stem}-{to.value}"))
     rows = ", ".join(f"{len(table)} × {title}" for title, table in tables.items())
-    _print(f"{written[0] if len(written) == 1 else written[0].parent}: {rows}")
+    tell(f"{written[0] if len(written) == 1 else written[0].parent}: {rows}")
 
 
 @log.command(
@@ -230,7 +230,7 @@ def compare(
         from skyloop.recording.review.compare import write_comparison
 
         write_comparison(found, str(old), str(new), output)
-        _print(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
+        tell(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
 
 
 @log.command(short_help="Repair a recording that was cut off", epilog=f"{_EXAMPLE}recover flight.mcap")
@@ -249,7 +249,7 @@ def recover(
     with _progress("looking") as progress:
         wrong = mending.problems(recording, progress)
     if not wrong and output is None:
-        _print(f"{file} is whole: there is nothing to repair")
+        tell(f"{file} is whole: there is nothing to repair")
         if json:
             typer.echo(log_tables.recovered_json(file, None))
         return
@@ -260,11 +260,11 @@ def recover(
         typer.echo(log_tables.recovered_json(file, saved))
         return
     for problem in saved.why:
-        _print(f"{file}: {problem}")
+        tell(f"{file}: {problem}")
     for topic, count in sorted(saved.messages.items()):
         typer.echo(f"{count:8} {topic}")
     lost = f"; at most {saved.lost} bytes are lost" if saved.lost else ""
-    _print(f"{target}: {sum(saved.messages.values())} messages, {saved.seconds:.1f} s saved{lost}")
+    tell(f"{target}: {sum(saved.messages.values())} messages, {saved.seconds:.1f} s saved{lost}")
 
 
 def _export_lerobot(
@@ -290,7 +290,7 @@ def _export_lerobot(
             doing=lambda _, share: progress(share),
         )
     repeated = f"; {found.repeated} pictures were damaged, those before them stand there" if found.repeated else ""
-    _print(
+    tell(
         f"{target}: {found.episodes} episodes, {found.rows} rows: {', '.join(found.form.state)}; "
         f"{', '.join(found.form.cameras) or 'no camera'}; action: {', '.join(found.form.action)}{repeated}"
     )
@@ -302,7 +302,7 @@ def _export_rrd(recording: Recording, target: Path, drone: str | None) -> None:
     with _progress("exporting") as progress:
         found = export_rrd(recording, target, drone=drone, progress=progress)
     lost = f"; {found.left_out} pictures that can't be decoded are left out" if found.left_out else ""
-    _print(f"{target}: {', '.join(found.drones)}: {found.samples} samples, {found.pictures} pictures{lost}")
+    tell(f"{target}: {', '.join(found.drones)}: {found.samples} samples, {found.pictures} pictures{lost}")
 
 
 # Inside --------------------------------------------------------------------------------------------------------
@@ -349,7 +349,3 @@ def _progress(what: str) -> Iterator[Callable[[float], None]]:
     with Progress(transient=True, console=Console(stderr=True)) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda share: bar.update(task, completed=share)
-
-
-def _print(text: str) -> None:
-    typer.echo(text, err=True)

@@ -106,22 +106,14 @@ def places(
 
 
 def server_ends(settings: FabricSettings | None, group: str | None = None) -> MakeEnd:
-    """Return what makes a proxy's transport server: on this host, and with settings on the network too.
-
-    Args:
-        settings: How to join the network, None for this host only.
-        group: The group of users that may connect on this host.
-    """
+    """Return what makes a proxy's transport server: on this host, for a group too, and with settings on the network."""
     from skyloop.transport.local import LocalServer
 
     if settings is None:
         return lambda name, _: LocalServer(name, group=group)
-    from skyloop.network import FabricServer
-    from skyloop.transport.composite import CompositeServer
+    from skyloop.network.server import beside
 
-    return lambda name, vehicle: CompositeServer(
-        [LocalServer(name, group=group), FabricServer(name, settings, vehicle=vehicle)]
-    )
+    return lambda name, vehicle: beside(LocalServer(name, group=group), name, settings, vehicle)
 
 
 def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | None:

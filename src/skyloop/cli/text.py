@@ -51,6 +51,11 @@ def _unaccented(character: str) -> str:
     return unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
 
 
+def tell(text: str) -> None:
+    """Print a line for people on standard error."""
+    typer.echo(text, err=True)
+
+
 def coloured(line: str, stream: TextIO | None) -> str:
     """Return a line with a coloured beginning, if it has one that matters and the stream shows colours.
 

@@ -158,13 +158,7 @@ def parse_fleet(text: str, source: str) -> Fleet:
 
 
 def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Defaults) -> VehicleSettings:
-    """Return a vehicle's settings with the defaults filled in.
-
-    Args:
-        vehicle: The vehicle.
-        defaults: Of the host.
-        place: Where errors are.
-        own: What stands at that place.
+    """Return a vehicle's settings with the defaults filled in; ``own`` stands at the place that errors name.
 
     Raises:
         FileFormatError: A value is not valid.

@@ -179,10 +179,9 @@ class SharedVehicle(HostedVehicle):
     def _end(self, address: str) -> TransportServer:
         if self._network is None:
             return self.server
-        from skyloop.network import FabricServer
-        from skyloop.transport.composite import CompositeServer
+        from skyloop.network.server import beside
 
-        return CompositeServer([self.server, FabricServer(self.settings.name, self._network, vehicle=address)])
+        return beside(self.server, self.settings.name, self._network, address)
 
     def status(self) -> VehicleStatus:
         proxy, row = self.proxy, self.row()

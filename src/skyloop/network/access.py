@@ -34,11 +34,7 @@ Rules = Mapping[tuple[str, ...], list[str]]
 
 
 def access_control(identities: Iterable[Identity]) -> dict[str, Any]:
-    """Return Zenoh's ``access_control`` section for any node of a lab.
-
-    Args:
-        identities: All identities that may join; without any, nothing passes.
-    """
+    """Return Zenoh's ``access_control`` section for any node of a lab: only these identities may join."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []

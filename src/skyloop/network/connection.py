@@ -38,15 +38,7 @@ _RESULTS: Final = results("")
 
 
 class ServerConnection:
-    """An application at the transport server. Its lock guards what is sent to it, and its topics.
-
-    Args:
-        peer: As the handler knows it.
-        who: Its identity.
-        connection: Its id in keys.
-        joined_s: When it asked to be let in, on the monotonic clock [s].
-        admission: The terms of the connection.
-    """
+    """An application at the transport server. Its lock guards what is sent to it, and its topics."""
 
     __slots__ = (
         "_own",
@@ -221,14 +213,7 @@ class Sender:
 
 
 class Publisher:
-    """Keeps the subscriptions of all connections, and publishes to them. Thread-safe.
-
-    Args:
-        name: The proxy's name.
-        run: This run of the proxy.
-        sealer: Seals what is published.
-        clock: The monotonic clock [s].
-    """
+    """Keeps the subscriptions of all connections, and publishes to them. Thread-safe."""
 
     def __init__(self, name: str, run: str, sealer: Sealer, clock: Callable[[], float] = time.monotonic) -> None:
         self._name = name
@@ -315,11 +300,7 @@ class Publisher:
         return len(self._subscribed.get(topic, ()))
 
     def subscribe(self, connection: ServerConnection, request: packets.Subscribe) -> bool:
-        """Subscribe a connection to a topic, or unsubscribe it.
-
-        Returns:
-            False if it can't be subscribed; see :meth:`problem`.
-        """
+        """Subscribe a connection to a topic, or unsubscribe it; return False if that can't be, see :meth:`problem`."""
         topic = request.topic
         with self._lock, connection.lock:
             if connection.ended or connection.left or request.on == (topic in connection.topics):

@@ -41,12 +41,7 @@ class _Packet:
 
 
 class Outgoing:
-    """The packets for one end that it has not acknowledged yet. Not thread-safe.
-
-    Args:
-        depth: How many are kept at most.
-        most_bytes: How many bytes of them; a single packet may be larger.
-    """
+    """The packets for one end that it has not acknowledged yet. Not thread-safe."""
 
     def __init__(self, depth: int = DEPTH, most_bytes: int = MAX_BYTES) -> None:
         self._depth = depth
@@ -84,11 +79,7 @@ class Outgoing:
         return True
 
     def due(self, now_s: float) -> list[tuple[int, bytes, str]]:
-        """Return what is to be sent now: packets for which there is room on the way, and those that seem lost.
-
-        Returns:
-            Number, packet and way of each.
-        """
+        """Return number, packet and way of what is to be sent: where there is room on the way, and what seems lost."""
         found: list[tuple[int, bytes, str]] = []
         if self._under_way and now_s - self._kept[0].sent_s >= self._again_s:
             self._again_s = min(2 * self._again_s, AGAIN_AT_MOST_S)
@@ -141,15 +132,7 @@ class Incoming:
         self._early: dict[int, bytes] = {}
 
     def take(self, number: int, packet: bytes) -> list[bytes]:
-        """Return the packets that can be delivered now that this one came, in order.
-
-        Args:
-            number: The packet's, from 1.
-            packet: The packet.
-
-        Returns:
-            Nothing if it came before, or if one before it is missing.
-        """
+        """Return the packets that can be delivered now that this one came, in order; none if it came before."""
         if number != self.taken + 1:
             if self.taken < number <= self.taken + ON_THE_WAY:
                 self._early.setdefault(number, packet)
@@ -208,12 +191,7 @@ class Pace:
         return not stands or now_s - self._sent_s >= SLOW_S
 
     def sent(self, number: int, now_s: float) -> None:
-        """Note a packet.
-
-        Args:
-            number: Its number, higher than those before.
-            now_s: The monotonic clock [s].
-        """
+        """Note a packet."""
         self._newest, self._sent_s = number, now_s
         self._since_s = min(self._since_s, now_s)
 

@@ -97,13 +97,7 @@ def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
 
 
 def listed(session: Session, name: str = "*", *, within_s: float = SYNC_S) -> tuple[set[tuple[str, str]], bool]:
-    """Return what :func:`runs` does, and whether the linked nodes have sent all that they know.
-
-    Args:
-        session: The Zenoh session.
-        name: The proxies' name.
-        within_s: How long to wait for the linked nodes [s].
-    """
+    """Return what :func:`runs` does, and whether the linked nodes have sent all that they know."""
     found = set()
     deadline = time.monotonic() + within_s
     for reply in session.zenoh.liveliness().get(layout.alive(name, "*"), timeout=within_s):
@@ -179,11 +173,7 @@ def proxy_reached() -> None:
 
 
 def renew(session: Session) -> bool:
-    """Search for nodes that a session does not know.
-
-    Returns:
-        True if there is one: the session is then retired, and another one has to be acquired.
-    """
+    """Search for nodes that a session does not know; return whether there are some, for which it is retired then."""
     if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
         return False
     answered = _search(session)

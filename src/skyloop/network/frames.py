@@ -152,11 +152,7 @@ class FramePublisher:
             return sum(len(variant.readers) for variant in self._variants.get(camera, {}).values())
 
     def subscribe(self, key: Hashable, topic: str) -> bool:
-        """Send a connection frames, from the next one on.
-
-        Returns:
-            False if it can't have them; see :meth:`problem`.
-        """
+        """Send a connection frames, from the next one on; return False if that can't be, see :meth:`problem`."""
         with self._changed:
             if self._problem(key, topic):
                 return False

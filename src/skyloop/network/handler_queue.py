@@ -91,11 +91,7 @@ class HandlerQueue(Generic[Item]):
             self._changed.notify()
 
     def get(self, timeout_s: float) -> Item | None:
-        """Return the next item.
-
-        Returns:
-            The item; None if none came in time, or if the queue is closed and empty.
-        """
+        """Return the next item; None if none came in time, or if the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._urgent or self._others or self._closed, timeout_s)
             if self._urgent and not (self._others and self._in_a_row >= IN_A_ROW):

@@ -302,11 +302,7 @@ class ConnectionRegistry:
     # --- sending to one, and the ends of connections: any thread ---
 
     def send(self, connection: ServerConnection, packet: bytes) -> bool:
-        """Send a packet that has to arrive. Any thread.
-
-        Returns:
-            False if the connection has ended, or ends now because too much waits for it already.
-        """
+        """Send a packet that has to arrive; return False if the connection has ended, or ends for it. Any thread."""
         if connection.ended:
             return False
         problem = connection.queue(packet)

@@ -24,6 +24,7 @@ from skyloop.network.registry import ConnectionRegistry, Item
 from skyloop.network.sealing import PLAIN, TopicSeal, contents
 from skyloop.network.session import Session, acquire, host_name, load, release, undeclare
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_frame, check_name, check_packet
+from skyloop.transport.composite import CompositeServer
 from skyloop.transport.priority import SUPERSEDED, is_command
 
 if TYPE_CHECKING:
@@ -331,3 +332,8 @@ class FabricServer(TransportServer):
             handler.malformed(connection.peer, self._publisher.problem(connection, message.topic))
         else:
             handler.packet(connection.peer, packet)
+
+
+def beside(local: TransportServer, name: str, settings: FabricSettings, vehicle: str) -> TransportServer:
+    """Return a proxy's end on this host and on the network; the other arguments are a :class:`FabricServer`'s."""
+    return CompositeServer([local, FabricServer(name, settings, vehicle=vehicle)])

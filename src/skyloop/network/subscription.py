@@ -59,11 +59,7 @@ class Subscription:
         self._ended = False
 
     def declare(self, session: Session, name: str, connection: str) -> list[Any]:
-        """Subscribe on a Zenoh session.
-
-        Returns:
-            What was declared; the caller undeclares it.
-        """
+        """Subscribe on a Zenoh session, and return what was declared, for the caller to undeclare."""
         z, call, topic = session.zenoh, session.callback, self._topic
         if not topic.startswith(_VIDEO):
             return [z.declare_subscriber(layout.topic(name, topic), call(self._on_packet))]

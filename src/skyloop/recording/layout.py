@@ -104,13 +104,9 @@ class ClockPair(msgspec.Struct, frozen=True):
         return cls((before + time.monotonic_ns()) // 2, unix, os.getpid(), _boot_id())
 
     def unix(self, monotonic_ns: int, offset_ns: int = 0) -> int:
-        """Convert a monotonic time to Unix time [ns].
+        """Convert a monotonic time to Unix time [ns]; ``offset_ns`` is its clock minus the recorder's.
 
         The result is limited to what a file can hold, so that a sample with an absurd time breaks no file.
-
-        Args:
-            monotonic_ns: The time.
-            offset_ns: Its clock minus the recorder's.
         """
         return min(max(0, monotonic_ns - offset_ns - self.monotonic_ns + self.unix_ns), _LAST_UNIX_NS)
 

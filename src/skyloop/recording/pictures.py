@@ -101,10 +101,7 @@ def compressed(message: bytes, record: FrameRecord) -> bytes:
 
 
 def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:
-    """Decode JPEG or PNG.
-
-    Returns:
-        BGR, shape (h, w, 3), or grey (h, w), uint8.
+    """Decode JPEG or PNG to BGR, shape (height, width, 3), or grey (height, width), uint8.
 
     Raises:
         FileFormatError: It can't be decoded.
@@ -180,10 +177,7 @@ class Group:
         self._units.append(unit)
 
     def pixels(self, index: int, what: str) -> NDArray[np.uint8]:
-        """Decode one frame.
-
-        Returns:
-            BGR, shape (height, width, 3), uint8.
+        """Decode one frame to BGR, shape (height, width, 3), uint8.
 
         Raises:
             FileFormatError: The frame is damaged, or no H.264.

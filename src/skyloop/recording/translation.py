@@ -67,14 +67,7 @@ class Translator:
     def __init__(
         self, drone: str, capabilities: Capabilities, clock: ClockPair, offset_ns: Callable[[], int] = lambda: 0
     ) -> None:
-        """Initialise the translator.
-
-        Args:
-            drone: The drone's name.
-            capabilities: Of the drone.
-            clock: Relates the recorder's clock and Unix time.
-            offset_ns: Returns the proxy's clock minus the recorder's.
-        """
+        """Initialise the translator; ``offset_ns`` returns the proxy's clock minus the recorder's."""
         self._drone = drone
         self._cameras = capabilities.cameras
         self._camera_names = frozenset(camera.name for camera in capabilities.cameras)
