@@ -49,9 +49,9 @@ ID: Final = re.compile(r"[0-9a-f]{16}")
 ASK: Final = "ask"  #: reliable; what an observer may send
 ORDER: Final = "order"  #: reliable; what only a pilot may send
 COMMAND: Final = "command"  #: best effort; the command channel
+WAYS: Final = (ASK, ORDER, COMMAND)
 #: What an observer may ask. A request that is not named here needs the right to order, so a new one is safe.
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
-_RANK: Final = {ASK: 0, ORDER: 1, COMMAND: 2}
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
 _REPORT: Final = encode(StreamReport("", 0))[:6]  # all of the head, as garbage keeps its order
@@ -225,65 +225,7 @@ def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None
 
 def allows(way: str, packet: bytes) -> bool:
     """Return whether a packet may travel by the key by which it came."""
-    return _RANK[way] >= _RANK[way_of(packet)]
-
-
-# What each role may do, as key expressions (see Zenoh's "access control": a rule's ``key_exprs``) -----------------
-
-
-def observer_puts(who: str, name: str = "*") -> list[str]:
-    """Return where an observer may put packets."""
-    return [upward(ASK, name, who, "*")]
-
-
-def pilot_puts(who: str, name: str) -> list[str]:
-    """Return where a pilot may put packets, beside an observer's keys."""
-    return [upward(ORDER, name, who, "*"), upward(COMMAND, name, who, "*")]
-
-
-def app_tokens(who: str, name: str = "*") -> list[str]:
-    """Return the liveliness tokens that an application may declare."""
-    return [app(name, who, "*")]
-
-
-def app_queries(who: str, name: str = "*") -> list[str]:
-    """Return what an application may query."""
-    return [join(name, who, "*"), info(name)]
-
-
-def app_watches(name: str = "*") -> list[str]:
-    """Return the liveliness tokens that an application may query and watch."""
-    return [alive(name, "*")]
-
-
-def app_subscriptions(name: str = "*") -> list[str]:
-    """Return what an application may subscribe to."""
-    return [to(name, "*"), f"{ROOT}/{name}/topic/*", f"{ROOT}/{name}/video/**"]
-
-
-def proxy_puts(name: str) -> list[str]:
-    """Return where a proxy may put packets."""
-    return app_subscriptions(name)
-
-
-def proxy_tokens(name: str) -> list[str]:
-    """Return the liveliness tokens that a proxy may declare."""
-    return [alive(name, "*")]
-
-
-def proxy_watches(name: str) -> list[str]:
-    """Return the liveliness tokens that a proxy may query and watch."""
-    return [alive(name, "*"), app(name, "*", "*")]
-
-
-def proxy_answers(name: str) -> list[str]:
-    """Return the queries that a proxy may answer (its queryables)."""
-    return [join(name, "*", "*"), info(name)]
-
-
-def proxy_subscriptions(name: str) -> list[str]:
-    """Return what a proxy may subscribe to."""
-    return [upward(way, name, "*", "*") for way in (ASK, ORDER, COMMAND)]
+    return WAYS.index(way) >= WAYS.index(way_of(packet))
 
 
 def _chunk(text: str) -> str:
