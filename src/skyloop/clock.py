@@ -55,15 +55,21 @@ def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
 
 
 @functools.cache
+def boot_id() -> str:
+    """Return which boot of this host's kernel runs; empty where that is not known, as on systems other than Linux."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
+
+
+@functools.cache
 def clock_identity() -> str:
     """Return which monotonic clock this process reads; processes with the same identity read the same clock.
 
-    It names the boot of the host's kernel and the time namespace. Empty where the boot is not known, as on systems
-    other than Linux.
+    It names the boot of the host's kernel and the time namespace. Empty where the boot is not known.
     """
-    try:
-        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    except OSError:
+    if not (boot := boot_id()):
         return ""
     try:
         namespace = Path("/proc/self/ns/time").stat().st_ino
