@@ -376,11 +376,7 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return the ports of an AR.Drone; each further drone's are 10 higher.
-
-    Args:
-        base: From where the first drone's ports count, usually 5550; 0 for any free ones.
-        drone: The drone's index.
+    """Return the ports of an AR.Drone: the first one's count from ``base`` (0: any free ones), others' are 10 higher.
 
     Raises:
         UsageError: There are no such ports.

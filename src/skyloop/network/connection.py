@@ -230,12 +230,7 @@ class Publisher:
         self.video = FramePublisher(self._send_frame, name)
 
     def open(self, session: Session, topic_problem: Callable[[str], str]) -> None:
-        """Begin to publish.
-
-        Args:
-            session: The Zenoh session.
-            topic_problem: Returns why a topic can't be subscribed to, empty if it can.
-        """
+        """Begin to publish; ``topic_problem`` returns why a topic can't be subscribed to, empty if it can."""
         with self._lock:
             self._session = session
             self._topic_problem = self.video.topic_problem = topic_problem

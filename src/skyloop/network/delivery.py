@@ -196,12 +196,7 @@ class Pace:
         self._since_s = min(self._since_s, now_s)
 
     def taken(self, number: int, now_s: float) -> None:
-        """Note that the subscriber acknowledged the packets up to this number.
-
-        Args:
-            number: The packet's; those that were not sent yet are ignored, as in :meth:`Outgoing.taken`.
-            now_s: The monotonic clock [s].
-        """
+        """Note that the subscriber acknowledged the packets up to this number; one that was not sent yet is ignored."""
         if not self._acknowledged < number <= self._newest:
             return
         self._prompt = self._prompt or (self._acknowledged > 0 and number - self._acknowledged < ACKNOWLEDGE_AFTER)

@@ -233,11 +233,7 @@ class ProxyWatch:
         )
 
     def find(self, within_s: float, list_s: float) -> list[tuple[str, packets.ProxyInfo | None]]:
-        """Wait for a proxy with this name.
-
-        Args:
-            within_s: How long [s].
-            list_s: How long the linked nodes may take after that to list the proxies that they know [s].
+        """Wait for a proxy with this name, then at most ``list_s`` [s] for linked nodes to list those that they know.
 
         Returns:
             The run of each candidate with what it reports of itself, the best first. That is the oldest; with keys the
@@ -293,16 +289,7 @@ class ProxyWatch:
 
 
 def join(session: Session, name: str, run: str, connection: str) -> Admission:
-    """Ask a proxy to let a connection in.
-
-    Args:
-        session: The Zenoh session.
-        name: The proxy's name.
-        run: The run of the proxy that is meant.
-        connection: The connection's id.
-
-    Returns:
-        The terms of the connection.
+    """Ask that run of a proxy to let a connection in, and return its terms.
 
     Raises:
         LinkError: The proxy refuses, does not answer (:class:`NoAnswerError`), or somebody else answers in its place.

@@ -59,14 +59,7 @@ class HandlerQueue(Generic[Item]):
         self._closed = False
 
     def put(self, of: Hashable, item: Item, *, urgent: bool = False, at_most: int | None = None) -> bool:
-        """Queue an item. Any thread.
-
-        Args:
-            of: The connection whose item it is.
-            item: The item.
-            urgent: Whether it goes before all items that are not urgent.
-            at_most: How many items of this connection and urgency may wait before further ones are refused; None: no
-                bound.
+        """Queue an item of a connection, of which at most so many may wait; urgent ones go first. Any thread.
 
         Returns:
             False if it was refused.

@@ -92,14 +92,7 @@ def join(name: str, who: str, connection: str) -> str:
 
 
 def upward(way: str, name: str, who: str, connection: str) -> str:
-    """Return the key by which an application sends packets.
-
-    Args:
-        way: :data:`ASK`, :data:`ORDER` or :data:`COMMAND`.
-        name: The proxy's name.
-        who: The application's identity.
-        connection: The connection's id.
-    """
+    """Return the key by which an application sends packets in one of the :data:`WAYS`."""
     return f"{ROOT}/{name}/{way}/{who}/{connection}"
 
 
@@ -119,13 +112,7 @@ def newest_wins(topic_name: str) -> bool:
 
 
 def video(name: str, camera: str, variant: str = "") -> str:
-    """Return the key at which frames are published.
-
-    Args:
-        name: The proxy's name.
-        camera: The camera's.
-        variant: What follows the ``?`` of the frames' topic.
-    """
+    """Return the key at which frames of a variant, what follows the ``?`` of their topic, are published."""
     return f"{ROOT}/{name}/video/{_chunk(camera)}/{_chunk(variant) or PLAIN}"
 
 
@@ -204,11 +191,6 @@ def is_report(packet: bytes) -> bool:
 
 def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
     """Return the reply to a request that an application's keys give no right to, which is not sent to the proxy.
-
-    Args:
-        packet: Needs the right to fly.
-        identity: The application's.
-        drone: The proxy's name.
 
     Returns:
         The packet of the reply; None for a packet that is no request.

@@ -245,12 +245,7 @@ def parse_number(attachment: bytes) -> int:
 
 
 def published(run: bytes, count: int) -> bytes:
-    """Encode the attachment of a published packet.
-
-    Args:
-        run: RUN of its proxy, 8 bytes.
-        count: The packet's number on this topic, from 1.
-    """
+    """Encode the attachment of a published packet: RUN of its proxy, 8 bytes, and its number on the topic, from 1."""
     return _PUBLISHED.pack(run, count)
 
 
@@ -268,13 +263,7 @@ def parse_published(attachment: bytes) -> tuple[bytes, int]:
 
 
 def frame(run: bytes, count: int, header: bytes) -> bytes:
-    """Encode the attachment of a frame.
-
-    Args:
-        run: RUN of its proxy, 8 bytes.
-        count: The frame's number.
-        header: The whole packet of its :class:`FrameHeader`.
-    """
+    """Encode the attachment of a frame: RUN of its proxy, 8 bytes, its number, and the packet of its header."""
     return _PUBLISHED.pack(run, count) + header
 
 

@@ -156,11 +156,7 @@ class ReplayWindow:
 
 
 class TopicSeal:
-    """Seals what all applications of a proxy may read, with a key that changes when one of them is shut out.
-
-    Args:
-        clock: The monotonic clock [s].
-    """
+    """Seals what all applications of a proxy may read, with a key that changes when one of them is shut out."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

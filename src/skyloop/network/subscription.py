@@ -74,11 +74,6 @@ class Subscription:
     def deliver(self, handler: ClientHandler, packet: bytes, number: int) -> bytes:
         """Deliver the next item to the handler.
 
-        Args:
-            handler: The application's.
-            packet: As it was given to ``enqueue``.
-            number: As it was given to ``enqueue``.
-
         Returns:
             The packet by which to acknowledge it to the proxy; empty for none.
         """

@@ -104,15 +104,7 @@ def make_authority(days: int, now: datetime) -> Authority:
 def issue(
     authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Make a certificate for an identity.
-
-    Args:
-        authority: Signs it; needs its key.
-        identity: The holder.
-        key: The holder's key.
-        until: When it expires, in UTC; no later than the authority's certificate does.
-        now: The time in UTC.
-    """
+    """Make a certificate for an identity, signed by an authority that has its key, until its end at most."""
     assert authority.key is not None
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role in (KeyRole.PROXY, KeyRole.ROUTER):
@@ -132,15 +124,10 @@ def issue(
 
 
 def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
-    """Make an authority for cockpits' pages, which browsers are to trust: not the lab's, and for nothing else.
+    """Make an authority for pages, not the lab's, that may certify these names and all below them too, and no others.
 
     What it issues counts for private addresses, names of local networks, and the given ones: a browser that trusts it
     trusts it with no other site (name constraints, RFC 5280, 4.2.1.10).
-
-    Args:
-        names: More names that it may certify, with all below them.
-        days: How long it is valid.
-        now: The time in UTC.
     """
     key = new_key()
     name = _name(f"Skyloop pages {secrets.token_hex(4)}")
@@ -261,12 +248,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Check that a certificate is an authority's.
-
-    Args:
-        certificate: The authority's.
-        key: Its key, None where nothing is issued.
-        path: The certificate's file, for errors.
+    """Check that a certificate is an authority's, whose key is None where nothing is issued.
 
     Raises:
         FileFormatError: It is not an authority's certificate.

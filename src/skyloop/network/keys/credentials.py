@@ -184,9 +184,6 @@ class Credentials:
     def ends(self, now: datetime | None = None) -> dict[str, str]:
         """Return what expires within a week or has expired: this key, and the lab's authority.
 
-        Args:
-            now: The time in UTC; by default of this machine.
-
         Returns:
             A sentence for people for each, by what it is about.
         """
@@ -206,10 +203,6 @@ class Credentials:
 
 def load(directory: Path | str, now: datetime | None = None) -> Credentials:
     """Read an identity's folder and check all that can be checked.
-
-    Args:
-        directory: The folder.
-        now: The time in UTC; by default of this machine.
 
     Raises:
         UsageError: Something is wrong with the folder; :class:`skyloop.errors.FileFormatError` for a file that is

@@ -33,12 +33,7 @@ def make_directory(path: Path) -> None:
 
 
 def write(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Replace a file in one step.
-
-    Args:
-        path: The file.
-        content: All of it.
-        private: Whether only its owner may read it, from its first byte on.
+    """Replace a file in one step; a private one can be read by its owner only, from its first byte on.
 
     Raises:
         UsageError: It can't be written.
