@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
-from rich.console import Console
 
 from skyloop.cli.naming import recordings
-from skyloop.cli.text import console, tell
+from skyloop.cli.text import console, progress_bar, tell
 from skyloop.errors import FileFormatError, UsageError
 
 if TYPE_CHECKING:
@@ -66,7 +62,7 @@ def info(
     from skyloop.recording.review.summary import summarise
 
     recording = _open(file)
-    with _progress("reading") as progress:
+    with progress_bar("reading") as progress:
         summary = summarise(recording, progress)
     if json:
         typer.echo(log_tables.as_json(recording, summary))
@@ -115,7 +111,7 @@ def report(
 
     recording = _open(file)
     target = output or file.with_suffix(".html")
-    with _progress("drawing") as progress:
+    with progress_bar("drawing") as progress:
         write_report(recording, recording.drone(drone).name, target, pictures=pictures, progress=progress)
     tell(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
 
@@ -179,13 +175,13 @@ def export(
             raise UsageError(f"{len(camera)} cameras were given: mp4 is made of one at a time")
         chosen = camera[0] if camera else _first_camera(recording, name)
         target = output or file.with_name(f"{file.stem}-{chosen}.mp4")
-        with _progress(f"exporting {chosen}") as progress:
+        with progress_bar(f"exporting {chosen}") as progress:
             found = export_mp4(recording, name, chosen, target, burn_time=burn_time, encode=encode, progress=progress)
         for line in log_tables.exported(found, chosen):
             tell(line)
         return
     _refuse({"--camera": bool(camera), "--burn-time": burn_time, "--encode": encode}, to)
-    with _progress("reading") as progress:
+    with progress_bar("reading") as progress:
         tables = ways.read(recording, name, _channels(channel), progress)
     if to is Form.NPZ:
         written = ways.export_npz(tables, output or file.with_suffix(".npz"))
@@ -246,7 +242,7 @@ def recover(
     from skyloop.recording.review import summary as mending
 
     recording = _open(file)
-    with _progress("looking") as progress:
+    with progress_bar("looking") as progress:
         wrong = mending.problems(recording, progress)
     if not wrong and output is None:
         tell(f"{file} is whole: there is nothing to repair")
@@ -254,7 +250,7 @@ def recover(
             typer.echo(log_tables.recovered_json(file, None))
         return
     target = output or file.with_name(f"{file.stem}-recovered.mcap")
-    with _progress("mending") as progress:
+    with progress_bar("mending") as progress:
         saved = mending.recover(recording, target, progress)
     if json:
         typer.echo(log_tables.recovered_json(file, saved))
@@ -279,7 +275,7 @@ def _export_lerobot(
 
     recordings = [_open(file) for file in files]
     target = output or files[0].with_name(f"{files[0].stem}-lerobot")
-    with _progress("exporting") as progress:
+    with progress_bar("exporting") as progress:
         found = export_lerobot(
             recordings,
             target,
@@ -299,7 +295,7 @@ def _export_lerobot(
 def _export_rrd(recording: Recording, target: Path, drone: str | None) -> None:
     from skyloop.recording.rerun_viewer import export_rrd
 
-    with _progress("exporting") as progress:
+    with progress_bar("exporting") as progress:
         found = export_rrd(recording, target, drone=drone, progress=progress)
     lost = f"; {found.left_out} pictures that can't be decoded are left out" if found.left_out else ""
     tell(f"{target}: {', '.join(found.drones)}: {found.samples} samples, {found.pictures} pictures{lost}")
@@ -336,16 +332,3 @@ def _refuse(given: dict[str, bool], to: Form) -> None:
     for option, is_given in given.items():
         if is_given:
             raise UsageError(f"{option} has no effect on {to.value}: leave it out, or choose another --to")
-
-
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[float], None]]:
-    """A bar on a terminal that goes away at the end; nothing into a pipe."""
-    if not sys.stderr.isatty():
-        yield lambda _: None
-        return
-    from rich.progress import Progress
-
-    with Progress(transient=True, console=Console(stderr=True)) as bar:
-        task = bar.add_task(what, total=1.0)
-        yield lambda share: bar.update(task, completed=share)

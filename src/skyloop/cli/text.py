@@ -8,7 +8,8 @@ import os
 import re
 import sys
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
 import typer
@@ -97,6 +98,24 @@ def console() -> Console:
 
     wide = sys.stdout.isatty() or "COLUMNS" in os.environ
     return Console(highlight=False, width=None if wide else _PIPE_COLUMNS)
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[..., object]]:
+    """Show a bar on standard error that goes away at the end, if that is a terminal.
+
+    Yields:
+        What moves it: called with the share that is done, from 0 to 1, and with what is being done, if that changes.
+    """
+    if not sys.stderr.isatty():
+        yield lambda *_: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(transient=True, console=Console(stderr=True)) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share, doing=what: bar.update(task, completed=share, description=doing)
 
 
 # Errors ---------------------------------------------------------------------------------------------------------
