@@ -101,7 +101,7 @@ def console() -> Console:
 
 
 @contextmanager
-def progress_bar(what: str) -> Iterator[Callable[..., object]]:
+def progress_bar(what: str) -> Iterator[Callable[..., None]]:
     """Show a bar on standard error that goes away at the end, if that is a terminal.
 
     Yields:
