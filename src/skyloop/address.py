@@ -1,4 +1,4 @@
-"""What may be shown of an address: never a user, a password or a key in it. Pure.
+"""What may be shown of an address: never a user, a password or a key in it; and whether it is this machine's. Pure.
 
 People also write passwords unquoted, with the characters that separate an address's parts; where it can't be told
 where such a password ends, the rest is hidden with it.
@@ -6,6 +6,7 @@ where such a password ends, the rest is hidden with it.
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from collections.abc import Iterable
 from typing import Final
@@ -21,6 +22,14 @@ _HOST: Final = re.compile(r"(?:\[[^\]]*\]|[^:\[\]]*)(?::\d*)?\Z")
 #: How places begin that are devices, which have no user, whatever stands before an ``@`` in their path.
 _DEVICES: Final = {"mavlink": ("serial:/", "serial:~")}
 _KEEP: Final = "/:@*,;=()[]~!$'+"  # as people write them in an address
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches an address."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def without_secrets(text: str, option: str = "", *, broken: bool = False, place_of: str = "") -> str:

@@ -13,7 +13,6 @@ import platform
 import re
 import socket
 import struct
-import subprocess
 import sys
 import tempfile
 import threading
@@ -30,6 +29,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.child_process import ChildProcess
 from skyloop.client import Drone, Frame, connect
 from skyloop.client.video import VideoOptions
 from skyloop.drivers.base import Driver, Sink
@@ -149,9 +149,6 @@ class Spread(msgspec.Struct, frozen=True):
 def spread(times_ns: Sequence[float]) -> Spread:
     """Return the median and the 99th percentile of some times.
 
-    Args:
-        times_ns: The times [ns].
-
     Raises:
         ValueError: There are none: something did not flow.
     """
@@ -230,21 +227,12 @@ class BenchVehicle(Driver):
 
 
 def proxy_name(folder: str) -> str:
-    """Return the name of the proxy that is measured.
-
-    Args:
-        folder: Of this run alone.
-    """
+    """Return the name of the proxy that is measured."""
     return Path(folder).name.lower()
 
 
 class Vehicle:
-    """The end with the proxy.
-
-    Args:
-        folder: Of this run alone; the proxy is named after it.
-        received: Called with each command.
-    """
+    """The end with the proxy, which is named after the folder of this run."""
 
     camera = USUAL_CAMERA
 
@@ -273,11 +261,7 @@ class Vehicle:
 
 
 class Listening:
-    """Reports each feedback and frame once, on the connection's receiving thread.
-
-    Args:
-        received: Called with each.
-    """
+    """Reports each feedback and frame once, on the connection's receiving thread."""
 
     def __init__(self, received: Received) -> None:
         self._received = received
@@ -514,13 +498,13 @@ class _Pair:
     def __init__(self, kind: str, folder: str) -> None:
         self._kind = kind
         self._pipes: list[Connection] = []
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: list[ChildProcess] = []
         for side in ("vehicle", "application"):
             ours, theirs = multiprocessing.Pipe()
             with theirs:
                 number = theirs.fileno()
                 command = [sys.executable, "-c", _BOOT, str(number), kind, side, folder]
-                self._processes.append(subprocess.Popen(command, pass_fds=[number]))
+                self._processes.append(ChildProcess(command, keep_errors=False, inherited=[number]))
             self._pipes.append(ours)
 
     def measure(self, turn: _Turn) -> dict[str, list[int]]:
@@ -553,11 +537,7 @@ class _Pair:
         for pipe in self._pipes:
             pipe.close()  # which ends the process
         for process in self._processes:
-            try:
-                process.wait(5.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            process.close()
 
 
 def _run_end(number: int, kind: str, side: str, folder: str) -> None:
@@ -750,12 +730,7 @@ def _drawing_row(cameras: str, model: CameraModel, pictures: int, times: list[in
 
 
 class Flight:
-    """Drones that circle in the furnished room, and their cameras, which expose in turn.
-
-    Args:
-        drones: How many.
-        cameras: The drone and the model of each.
-    """
+    """Drones that circle in the furnished room, and their cameras, which expose in turn."""
 
     def __init__(self, drones: int, cameras: list[tuple[int, CameraModel]]) -> None:
         from skyloop.sim import STEP_S
@@ -771,14 +746,7 @@ class Flight:
             self.draw(at)  # the first picture of a lens makes its tables
 
     def draw(self, at: int) -> int:
-        """Fly on, then draw what a camera sees with the flaws of its sensor.
-
-        Args:
-            at: The camera's index.
-
-        Returns:
-            The time of the drawing [ns].
-        """
+        """Fly on, then draw what a camera sees with the flaws of its sensor; return the time of the drawing [ns]."""
         from skyloop.sim.render import SceneState
 
         simulation, (drone, model, effects) = self._simulation, self._cameras[at]

@@ -162,12 +162,7 @@ class ChildProcess:
         return None
 
     def end(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
-        """Ask it to end and wait; then terminate it, at last kill it. Idempotent.
-
-        Args:
-            grace_s: Time to end by itself [s].
-            harder_s: Time to end when it was terminated [s].
-        """
+        """Ask it to end and wait so long [s]; then terminate it and wait, at last kill it. Idempotent."""
         if not self._ours:
             return
         self.part()

@@ -8,8 +8,9 @@ them apart. Wall-clock time is never used for ages.
 from __future__ import annotations
 
 import functools
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -43,16 +44,32 @@ def slept_ns() -> int:
     return time.clock_gettime_ns(_BOOTTIME) - time.monotonic_ns()
 
 
+def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
+    """Yield once a period, by absolute deadlines, until ``ended`` is set; beats that come late are not made up for."""
+    due_s = time.monotonic()
+    while True:
+        due_s = max(due_s + period_s, time.monotonic())
+        if ended.wait(max(0.0, due_s - time.monotonic())):
+            return
+        yield
+
+
+@functools.cache
+def boot_id() -> str:
+    """Return which boot of this host's kernel runs; empty where that is not known, as on systems other than Linux."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
+
+
 @functools.cache
 def clock_identity() -> str:
     """Return which monotonic clock this process reads; processes with the same identity read the same clock.
 
-    It names the boot of the host's kernel and the time namespace. Empty where the boot is not known, as on systems
-    other than Linux.
+    It names the boot of the host's kernel and the time namespace. Empty where the boot is not known.
     """
-    try:
-        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    except OSError:
+    if not (boot := boot_id()):
         return ""
     try:
         namespace = Path("/proc/self/ns/time").stat().st_ino
@@ -88,9 +105,6 @@ class LiveClock:
 
     A stream whose clock runs a little slower is followed through two windows, one of which is always complete. Times
     run neither backwards nor ahead.
-
-    Args:
-        window_s: Length of a window [s].
     """
 
     def __init__(self, window_s: float = 5.0) -> None:

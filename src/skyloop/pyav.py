@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 def require_pyav(purpose: str) -> None:
     """Check that PyAV is installed.
 
-    Args:
-        purpose: What it is needed for, as the error says it.
-
     Raises:
         MissingExtraError: It is not.
     """

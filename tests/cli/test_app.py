@@ -124,6 +124,16 @@ def test_ctrl_c_while_the_commands_are_imported_is_no_traceback(run: Run, monkey
     assert run("list") == (130, "", "")
 
 
+def test_help_makes_no_command() -> None:
+    code = (
+        "import sys; from skyloop.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: print(*[m for m in sys.modules if m.startswith('skyloop.') and m.count('.') == 1])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.splitlines()[-1].split()) <= {"skyloop.cli", "skyloop.errors"}
+
+
 def test_a_command_imports_nothing_that_it_does_not_need() -> None:
     """What a private proxy, or a list, would only pay for at its start."""
     code = (

@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import pytest
 
 from skyloop.cli import install
-from skyloop.cli.app import build
 from skyloop.cli.app import run as run_app
+from skyloop.cli.commands import COMMANDS, entry_of
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UnknownNameError, UnsupportedError
 from tests.support.commands import Run
 from tests.support.pages import ROOT
@@ -111,12 +111,48 @@ def test_all_missing_parts_are_named_at_once(
     lacking = "the simulator needs an optional part that is not installed (No module named 'cv2')"
     assert told[0] == f"skyloop: {lacking}: skyloop install sim vision cockpit\n"
     assert told[1].endswith(f"\n{lacking}: skyloop install sim vision cockpit\n")
-    assert install.with_all_missing(str(error), ["record", "alpha"]) == str(error)
+    assert install.with_all_missing(str(error), ()) == str(error)
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-def test_the_commands_that_need_several_parts_exist() -> None:
-    names = {info.name for info in build().registered_commands} | {info.name for info in build().registered_groups}
-    assert {words.split()[0] for words in install.NEEDS} <= names
+def test_a_library_that_no_module_looked_for_is_brought_by_a_part_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``skyloop keys show`` ended with a traceback where there is no cryptography."""
+
+    def keys(*_: object, **__: object) -> None:
+        raise ModuleNotFoundError("No module named 'cryptography'")
+
+    monkeypatch.setattr(install, "_is_there", lambda module: module != "cryptography")
+    with pytest.raises(SystemExit) as ended:
+        run_app(keys, ["keys", "show"])  # type: ignore[arg-type]
+    assert ended.value.code == 1
+    assert capsys.readouterr().err == (
+        "skyloop: skyloop keys needs an optional part that is not installed (No module named 'cryptography'): "
+        "skyloop install network\n"
+    )
+    monkeypatch.setattr(install, "_is_there", lambda module: True)  # then it is a mistake of ours, shown in full
+    with pytest.raises(ModuleNotFoundError):
+        run_app(keys, ["keys", "show"])  # type: ignore[arg-type]
+
+
+def test_the_parts_that_commands_need_exist() -> None:
     known = {extra for extra, _, _ in install.EXTRAS}
-    assert all(set(parts) <= known for parts in install.NEEDS.values())
+    for entry in COMMANDS.values():
+        for each in (entry, *entry.behaviours.values()):
+            assert set(each.extras) <= known
+
+
+@pytest.mark.parametrize(
+    ("words", "extras"),
+    [
+        (["fly", "follow", "--class", "car"], ("vision", "detect")),
+        (["fly", "mine.py"], ("sim", "vision")),
+        (["--verbose", "keys", "show"], ("network",)),
+        (["nothing"], None),
+        (["--help"], None),
+    ],
+)
+def test_a_command_line_is_of_one_command(words: list[str], extras: tuple[str, ...] | None) -> None:
+    entry = entry_of(words)
+    assert (None if entry is None else entry.extras) == extras

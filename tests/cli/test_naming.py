@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 import typer
 
-from skyloop.cli import naming, wording
+from skyloop.cli import naming
 from skyloop.cli.app import build
 from skyloop.cli.commands import COMMANDS
 from skyloop.cli.ending import AllOption
+from skyloop.cli.text import error_text
 from skyloop.errors import Hint, LinkError, SkyloopError, UnknownNameError, UsageError
 from tests.support.commands import Run
 
@@ -120,11 +121,11 @@ def test_every_hint_has_its_words_in_python_and_in_the_terminal() -> None:
         error = LinkError("gone").with_hint(hint)
         assert str(error).startswith("gone; ")
         assert error.reason == "gone"
-        said = wording.of(error)
+        said = error_text(error)
         assert said.startswith("gone; ")
         for word in ("=True", "access=", "wait_s"):
             assert word not in said
-    assert str(UnknownNameError("proxy", "x", [])) == wording.of(UnknownNameError("proxy", "x", []))
+    assert str(UnknownNameError("proxy", "x", [])) == error_text(UnknownNameError("proxy", "x", []))
 
 
 def test_the_words_of_options_are_the_same_everywhere() -> None:
@@ -165,5 +166,5 @@ def test_the_network_reaches_what_a_command_starts(monkeypatch: pytest.MonkeyPat
     with pytest.raises(UsageError) as refused:
         naming.join_network(None, tmp_path)
     assert (
-        wording.of(refused.value) == "keys are for the network; give --network multicast or --network HOST:PORT as well"
+        error_text(refused.value) == "keys are for the network; give --network multicast or --network HOST:PORT as well"
     )

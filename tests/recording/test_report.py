@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 from skyloop.messages import Feedback
 from skyloop.recording.reader import Recording
 from skyloop.recording.review import charts
-from skyloop.recording.review import flight as facts
+from skyloop.recording.review import report as facts
+from skyloop.recording.review.charts import spans
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.tables import Table
 from tests.support.commands import Ended
@@ -235,24 +236,24 @@ def test_the_way_without_a_position() -> None:
     t_s = np.arange(0.0, 2.0, 0.1)
     columns = {"t_s": t_s, "velocity_forward_m_s": np.full(20, 0.5), "velocity_left_m_s": np.zeros(20)}
     columns["yaw_rad"] = np.full(20, math.pi / 2)
-    way = facts.way(Table("feedback", columns))
+    way = facts.way_of(Table("feedback", columns))
     assert way is not None
     assert "drifts" in way.source
     assert way.length_m == pytest.approx(0.95)
     assert way.y[-1] == pytest.approx(0.95)
     assert abs(way.x[-1]) < 1e-9
     truth = {"native.truth.x": t_s, "native.truth.y": np.zeros(20)}
-    known = facts.way(Table("feedback", columns | truth))
+    known = facts.way_of(Table("feedback", columns | truth))
     assert known is not None
     assert "simulator" in known.source
-    assert facts.way(Table("feedback", {"t_s": t_s})) is None
+    assert facts.way_of(Table("feedback", {"t_s": t_s})) is None
 
 
 def test_stretches_of_one_name() -> None:
     names = np.array(["a", "a", "", "b_c", "b_c"])
-    found = facts.spans(np.arange(5.0), names, {"a": "", "*": "flying"}, 6.0)
+    found = spans(np.arange(5.0), names, {"a": "", "*": "flying"}, 6.0)
     assert [(span.begin_s, span.end_s, span.text) for span in found] == [(3.0, 6.0, "b c")]
-    assert facts.spans(np.zeros(0), np.array([], dtype=np.str_), {}, 1.0) == []
+    assert spans(np.zeros(0), np.array([], dtype=np.str_), {}, 1.0) == []
 
 
 def test_without_a_picture_decoder_thumbnails_are_as_recorded(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-from typing import Final
+import threading
+from collections.abc import Sequence
+from typing import Final, NoReturn
 
 INTERRUPTED: Final = 130  #: 128 + SIGINT, as shells count
 
@@ -16,3 +19,17 @@ def main(arguments: list[str] | None = None) -> None:
         app.main(arguments)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def interrupt_by_signals(numbers: Sequence[signal.Signals] = (signal.SIGINT, signal.SIGTERM)) -> None:
+    """Raise KeyboardInterrupt on SIGINT, which shells ignore for what they run in the background, and on SIGTERM.
+
+    Does nothing on another thread than the main one.
+    """
+
+    def interrupt(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            signal.signal(number, interrupt)

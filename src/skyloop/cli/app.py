@@ -8,23 +8,22 @@ import shutil
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import import_module
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final, NoReturn
 
 import typer
 import typer.main
 from typer.core import TyperCommand, TyperGroup
 
-from skyloop.cli import INTERRUPTED, wording
-from skyloop.cli.commands import COMMANDS, Entry
+from skyloop.cli import INTERRUPTED
+from skyloop.cli.commands import COMMANDS, Entry, Task, entry_of
 from skyloop.cli.naming import with_place
-from skyloop.cli.text import coloured, make_printable
-from skyloop.errors import ParameterError, SkyloopError, install_command
+from skyloop.cli.text import WordError, coloured, error_text, make_printable, usage_text
+from skyloop.errors import MissingExtraError, ParameterError, SkyloopError, install_command
 
 _log = logging.getLogger(__name__)
 VERBOSE: Final = "--verbose"  #: works before and behind any command
 FAILED: Final = 1
 USAGE_ERROR: Final = 2
-_OTHERS: Final = "Commands"
 _WIDEST: Final = 80
 _NARROWEST: Final = 34
 _COLUMN: Final = 30  #: of the options; a longer one has its text on the next line
@@ -43,7 +42,7 @@ _RANGES: Final = (
 
 
 def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Return the command line with these commands; only their modules are imported."""
+    """Return the command line with these commands made: only their modules are imported, the others' when asked for."""
     app = typer.Typer(
         name="skyloop",
         cls=ByTask,
@@ -59,7 +58,6 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
         shown: dict[str, Any] = {
             "short_help": entry.summary,
             "epilog": f"Example: skyloop {entry.example}",
-            "rich_help_panel": entry.task.value,
         }
         if isinstance(function, typer.Typer):  # a command with commands of its own
             for info in function.registered_commands:
@@ -90,7 +88,7 @@ def main(arguments: list[str] | None = None) -> None:
     if VERBOSE in given:
         given.remove(VERBOSE)
         log_to_stderr()
-    run(build([given[0]] if given and given[0] in COMMANDS else COMMANDS), given or ["--help"])
+    run(build(()), given or ["--help"])
 
 
 def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
@@ -103,19 +101,31 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
     except typer.Abort:
         print(f"{name}: nothing was done", file=sys.stderr)
         sys.exit(FAILED)
-    except wording.WordError as error:
-        print(coloured(wording.of_word(error, name), sys.stderr), file=sys.stderr)
+    except WordError as error:
+        print(coloured(usage_text(error, name), sys.stderr), file=sys.stderr)
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
-        _log.debug("the command failed", exc_info=error)
-        told = wording.of(error)
-        if install_command("") in told:  # its own, or of a proxy that it started
-            from skyloop.cli.install import with_all_missing
+        _fail(error, arguments, name)
+    except ImportError as error:  # of a part that none of Skyloop's modules looked for
+        from skyloop.cli.install import missing
 
-            told = with_all_missing(told, arguments)
-        print(coloured(f"{name}: {told}", sys.stderr), file=sys.stderr)
-        sys.exit(USAGE_ERROR if isinstance(error, ValueError | ParameterError) else FAILED)
+        entry = entry_of(arguments)
+        lacking = next(missing(entry.extras), None) if entry is not None else None
+        if lacking is None:
+            raise
+        _fail(MissingExtraError(f"{name} {arguments[0]}", lacking, cause=str(error)), arguments, name)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(error: SkyloopError, arguments: list[str], name: str) -> NoReturn:
+    _log.debug("the command failed", exc_info=error)
+    told, entry = error_text(error), entry_of(arguments)
+    if entry is not None and install_command("") in told:  # its own, or of a proxy that it started
+        from skyloop.cli.install import with_all_missing
+
+        told = with_all_missing(told, entry.extras)
+    print(coloured(f"{name}: {told}", sys.stderr), file=sys.stderr)
+    sys.exit(USAGE_ERROR if isinstance(error, ValueError | ParameterError) else FAILED)
 
 
 def log_to_stderr() -> None:
@@ -186,7 +196,7 @@ class WithBehaviours(Command):
 
 
 class Group(TyperGroup):
-    """Commands listed under what one wants to do, each with its whole summary, wrapped where it does not fit."""
+    """A command with commands of its own, listed each with its whole summary, wrapped where it does not fit."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line."""
@@ -199,26 +209,41 @@ class Group(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""
-        sections: dict[str, list[tuple[str, str]]] = {}
-        for name in self.list_commands(ctx):
-            command = self.get_command(ctx, name)
-            if command is None or command.hidden:
-                continue
-            panel = getattr(command, "rich_help_panel", None)
-            summary = command.short_help or command.get_short_help_str(limit=200)
-            sections.setdefault(panel if isinstance(panel, str) else _OTHERS, []).append((name, summary))
-        longest = max((len(name) for rows in sections.values() for name, _ in rows), default=0)
-        for title, rows in sections.items():
-            with formatter.section(title):
-                formatter.write_dl([(name.ljust(longest), summary) for name, summary in rows])
+        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        summaries = [(name, each.short_help or each.get_short_help_str(200)) for name, each in commands.items() if each]
+        write_sections(formatter, {"Commands": summaries})
 
 
 class ByTask(Group):
-    """All commands in the order of the table, those with commands of their own among them."""
+    """All commands of the table in its order; each is made when it is asked for."""
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as Typer calls it
         """Return the names of the commands in the order of the help."""
-        return [name for name in COMMANDS if name in self.commands]
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command, which is made now if it was not before; None for an unknown one."""
+        if cmd_name not in COMMANDS:
+            for name in COMMANDS:  # among which Typer looks for the one that was meant
+                self.get_command(ctx, name)
+        elif cmd_name not in self.commands:
+            made: Any = typer.main.get_command(build([cmd_name]))
+            self.commands[cmd_name] = made.commands[cmd_name]
+        return self.commands.get(cmd_name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
+        """Write the list of commands, of which none is made for that."""
+        write_sections(
+            formatter, {task: [(n, e.summary) for n, e in COMMANDS.items() if e.task is task] for task in Task}
+        )
+
+
+def write_sections(formatter: Any, sections: Mapping[str, list[tuple[str, str]]]) -> None:
+    """Write commands and their summaries under titles, all in the same columns."""
+    longest = max((len(name) for rows in sections.values() for name, _ in rows), default=0)
+    for title, rows in sections.items():
+        with formatter.section(title):
+            formatter.write_dl([(name.ljust(longest), summary) for name, summary in rows])
 
 
 def argument_words(command: Any, ctx: Any) -> list[str]:

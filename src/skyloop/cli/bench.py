@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 import typer
-from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
-from skyloop.cli.text import console, named
+from skyloop.cli.text import console, named, progress_bar
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
     from skyloop.bench import DelayResults, SimResults, Spread
-    from skyloop.bench import Progress as Report
 
 
 class What(StrEnum):
@@ -51,7 +46,7 @@ def bench(
     wanted = parse_sizes(sizes)
     from skyloop import bench as measuring
 
-    with _progress(f"measuring {what.value}") as progress:
+    with progress_bar(f"measuring {what.value}") as progress:
         if what is What.DELAYS:
             delays = measuring.measure_delays(seconds, wanted, progress)
             results: DelayResults | SimResults = delays
@@ -80,14 +75,6 @@ def parse_sizes(text: str | None, largest: tuple[int, int] = (1920, 1080)) -> li
             raise UsageError(f"{word!r} is no size of frames: give such as 320x240, at most {largest[0]}x{largest[1]}")
         sizes.append(size)
     return list(dict.fromkeys(sizes))
-
-
-@contextmanager
-def _progress(what: str) -> Iterator[Report]:
-    """Show the progress on a terminal."""
-    with Progress(transient=True, disable=not sys.stderr.isatty(), console=Console(stderr=True)) as bar:
-        task = bar.add_task(what, total=1.0)
-        yield lambda share, doing: bar.update(task, completed=share, description=doing)
 
 
 def delay_table(results: DelayResults) -> Table:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from enum import StrEnum
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 import typer
 
 from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, join_network, one_drone
+from skyloop.cli.text import tell
 from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
 from skyloop.files import read_bytes
 from skyloop.messages.frame import image_size, why_not_decoded
@@ -120,14 +120,14 @@ def calibrate(
         search.run(_from_files(named))
     else:
         with _Vehicle(named[0], camera, seconds) as vehicle:
-            _print(
+            tell(
                 f"looking for a board of {columns} × {rows} squares for {seconds:g} s at most; Ctrl-C ends that earlier"
             )
             search.run(vehicle.pictures(), vehicle.draw)
     collector = search.collector
     if collector is None:
         raise UsageError("no frame came")
-    _print(f"{search.looked} images searched, {len(collector.views)} views of the board taken")
+    tell(f"{search.looked} images searched, {len(collector.views)} views of the board taken")
     found, rejected = fit(collector.views, *collector.size, model=model.value, camera=camera or "")
     found.save(output)
     _report(found, rejected, output)
@@ -174,17 +174,17 @@ class _Search:
                 if not self.every and len(self.collector.views) >= self._most:
                     break
         except KeyboardInterrupt:
-            _print("ended by Ctrl-C")
+            tell("ended by Ctrl-C")
 
     def _take(self, collector: Collector, view: BoardView | None, name: str) -> None:
         if view is None:
             if self.every:
-                _print(f"{name}: the board is not seen, or too little of it")
+                tell(f"{name}: the board is not seen, or too little of it")
         elif self.every:
             collector.views.append(view)
         elif collector.offer(view):
             seen = f"{len(view.pixels)} corners, {collector.coverage:.0%} of the image covered"
-            _print(f"view {len(collector.views)}: {seen}")
+            tell(f"view {len(collector.views)}: {seen}")
 
 
 def _board(columns: int, rows: int, square_mm: float, kind: Kind, dictionary: str) -> Board:
@@ -195,7 +195,7 @@ def _board(columns: int, rows: int, square_mm: float, kind: Kind, dictionary: st
 
 def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None:
     for view in rejected:
-        _print(f"left out, as it does not fit the others: {view.name}")
+        tell(f"left out, as it does not fit the others: {view.name}")
     sure = "" if found.fx_deviation is None else f" ± {found.fx_deviation:.1f}"
     assert found.rms_px is not None
     assert found.coverage is not None
@@ -205,9 +205,9 @@ def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None
     )
     typer.echo(f"reprojection error {found.rms_px:.3f} px RMS over {found.views} views, coverage {found.coverage:.0%}")
     if found.rms_px > _GOOD_RMS_PX:
-        _print("that error is large: is the board flat, and its size in squares as given?")
+        tell("that error is large: is the board flat, and its size in squares as given?")
     if found.coverage < _GOOD_COVERAGE:
-        _print("little of the image was covered: the distortion is known there only; show the board in the corners too")
+        tell("little of the image was covered: the distortion is known there only; show the board in the corners too")
     typer.echo(f"wrote {output}")
 
 
@@ -297,10 +297,10 @@ class _Vehicle:
             for frame in self._drone.frames(self._camera, timeout_s=_PATIENCE_S):
                 yield f"frame {frame.seq}", frame
                 if time.monotonic() > end:
-                    _print(f"{self._seconds:g} s are over")
+                    tell(f"{self._seconds:g} s are over")
                     return
         except NoAnswerError as error:
-            _print(str(error))
+            tell(str(error))
 
     def draw(self, frame: Any, view: BoardView) -> None:
         """Show in the cockpit what was found."""
@@ -308,7 +308,3 @@ class _Vehicle:
 
         corners = tuple((float(x), float(y)) for x, y in view.pixels)
         self._drone.annotate(frame, [Points(corners, (64, 220, 100))], source="calibration")
-
-
-def _print(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

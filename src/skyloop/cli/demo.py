@@ -264,14 +264,7 @@ class Spread:
 
 
 def true_range(native: dict[str, Value] | None) -> float | None:
-    """Return the true distance from the vehicle's centre to the carried board's [m].
-
-    Args:
-        native: A simulated vehicle's telemetry.
-
-    Returns:
-        None where it is not known.
-    """
+    """Return the true distance from the vehicle's centre to the carried board's [m]; None where it is not known."""
     if native is None:
         return None
     places = [[native.get(name) for name in names] for names in (OWN_PLACE, BOARD_PLACE)]
@@ -283,10 +276,6 @@ class TruthMeter:
     """Compares the true distance with the wanted one while the marker is followed.
 
     It does so for as long as its ``with`` block lasts.
-
-    Args:
-        drone: Simulated; its telemetry has the truth.
-        follower: Flies it.
     """
 
     def __init__(self, drone: Drone, follower: FollowMarker) -> None:

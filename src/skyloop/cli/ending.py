@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
-from skyloop.cli import wording
 from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
+from skyloop.cli.text import error_text
 from skyloop.errors import AuthorityError, LinkError, NoAnswerError, SkyloopError, UsageError
 from skyloop.extend import Known, let_go
 
@@ -163,7 +163,7 @@ def _each(
         try:
             return Ending(name, True, end(name))
         except SkyloopError as error:
-            return Ending(name, False, f"{failed}: {wording.of(error)}")
+            return Ending(name, False, f"{failed}: {error_text(error)}")
         except Exception as error:  # noqa: BLE001  what happens to one keeps nobody from hearing of the others
             return Ending(name, False, f"{failed}: {error!r}")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import signal
 import sys
 import sysconfig
 import threading
@@ -12,11 +11,12 @@ import time
 import traceback
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, Self
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 import typer
 
+from skyloop.cli import interrupt_by_signals
 from skyloop.cli.naming import (
     DroneOption,
     KeysOption,
@@ -177,29 +177,13 @@ def land(drone: Drone) -> None:
         raise problem
 
 
-def interrupt_by_signals() -> None:
-    """Raise KeyboardInterrupt on SIGINT, which a shell ignores for what it runs in the background, and on SIGTERM."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _interrupt)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001  as signal handlers are called
-    raise KeyboardInterrupt
-
-
 def say(text: str) -> None:
     """Print a line on standard error."""
     typer.echo("\n".join(coloured(line, sys.stderr) for line in text.splitlines()), err=True)
 
 
 class Flight:
-    """Runs a controller to its end, and what takes its place when its file is saved. Use once.
-
-    Args:
-        drone: Connected, and in the air if the controller expects that.
-        controller: Of that drone.
-        report: Shows a line to the user.
-    """
+    """Runs a connected drone's controller to its end, and what takes its place when its file is saved. Use once."""
 
     def __init__(self, drone: Drone, controller: Controller, report: Callable[[str], None]) -> None:
         self._drone = drone
@@ -207,14 +191,7 @@ class Flight:
         self._report = report
 
     def run(self, seconds: float | None) -> bool:
-        """Run the controller; what it raises is shown, and leaves the vehicle hovering.
-
-        Args:
-            seconds: For how long; None until it ends by itself.
-
-        Returns:
-            Whether it ended without an error.
-        """
+        """Run the controller for so long, or to its end; return whether no error, which is shown, left it hovering."""
         try:
             summary = self._controller.run(seconds=seconds)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
@@ -231,16 +208,7 @@ class Flight:
             self._report(f"note: {note}")
 
     def run_reloading(self, seconds: float | None, reloader: Reloader, make: Make) -> bool:
-        """Run the controller; a saved file takes over in flight, and one that failed hovers until it is saved again.
-
-        Args:
-            seconds: For how long; None until it ends by itself.
-            reloader: Watches the file.
-            make: Makes a controller of the loaded class.
-
-        Returns:
-            Whether it ended without an error.
-        """
+        """Run the controller; a saved file takes over in flight, and one that failed hovers until it is saved again."""
         deadline = math.inf if seconds is None else time.monotonic() + seconds
         while True:
             try:
@@ -384,12 +352,7 @@ class FlightProgress:
 
 
 def flight_line(drone: Drone, flown_s: float) -> str:
-    """Return how a flight goes in one line.
-
-    Args:
-        drone: Who flies.
-        flown_s: For how long [s].
-    """
+    """Return how a flight goes in one line."""
     feedback, video = drone.feedback(), [value for name, value in drone.stats.items() if name.startswith("video")]
     rate, dropped = sum(channel.rate_hz for channel in video), sum(channel.dropped for channel in video)
     parts = [

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from skyloop.cli.fly import ADVICE, Flight, FlightProgress, interrupt_by_signals, land, run, say
+from skyloop.cli import interrupt_by_signals
+from skyloop.cli.fly import ADVICE, Flight, FlightProgress, land, run, say
 from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, drone_names, join_network, one_drone
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
 

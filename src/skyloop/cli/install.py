@@ -11,7 +11,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from importlib.metadata import requires
 from typing import Annotated, Final
 
@@ -43,13 +43,6 @@ EXTRAS: Final = (
     ("ray", "processors on a Ray cluster", ("ray",)),
 )
 
-#: Commands that need several parts: who lacks one of them is told of all that are missing.
-NEEDS: Final = {
-    "demo": ("sim", "vision", "cockpit"),
-    "fly": ("sim", "vision"),
-    "fly follow": ("vision", "detect"),
-    "detect": ("detect", "vision"),
-}
 _EXTRA: Final = re.compile(r"\s*(?:\band\s+)?\bextra\s*==\s*[\"']([\w-]+)[\"']")
 
 
@@ -73,9 +66,6 @@ def install(
 
 def requirements(parts: Iterable[str]) -> list[str]:
     """Return what optional parts consist of, as pip takes it.
-
-    Args:
-        parts: Names of extras.
 
     Raises:
         UnknownNameError: There is no such part.
@@ -128,14 +118,7 @@ def _is_there(module: str) -> bool:
         return False
 
 
-def with_all_missing(told: str, words: Sequence[str]) -> str:
-    """Return an error that names all parts that a command lacks, not only the one that it met first.
-
-    Args:
-        told: The error, which ends with how to install a part.
-        words: The command line.
-    """
-    plain = [word for word in words if not word.startswith("-")]
-    needed: Collection[str] = NEEDS.get(" ".join(plain[:2])) or NEEDS.get(" ".join(plain[:1]), ())
+def with_all_missing(told: str, parts: Iterable[str]) -> str:
+    """Return an error that ends with how to install a part, with all that are missing of those that are needed."""
     before, command, first = told.rpartition(install_command(""))
-    return before + command + " ".join((first, *(part for part in missing(needed) if part != first)))
+    return before + command + " ".join((first, *(part for part in missing(parts) if part != first)))

@@ -122,13 +122,7 @@ class Hands:
         self.no_effect = ""  #: why a key of the last step did nothing, for people; empty where each did something
 
     def step(self, keys: Sequence[str], now_s: float, state: FlightState) -> list[Order | Deflection]:
-        """Return what is to be done, in this order; last where the sticks are, if one is moved.
-
-        Args:
-            keys: Pressed since the last step.
-            now_s: The time now.
-            state: Of the vehicle.
-        """
+        """Return what is to be done, in this order; last where the sticks are, if one is moved."""
         wanted: list[Order | Deflection] = []
         self.no_effect = ""
         stalled = now_s - self._stepped_s > REPEAT_S  # keys may have waited, and tell no time
@@ -334,9 +328,6 @@ class Keyboard:
 
     def keys(self, within_s: float) -> list[str]:
         """Return the keys that were pressed, as soon as there are any.
-
-        Args:
-            within_s: How long to wait for one [s].
 
         Raises:
             EOFError: The terminal is gone.

@@ -73,11 +73,7 @@ def list_proxies(
 
 
 def none_runs(settings: FabricSettings | None) -> str:
-    """Return, in words, that no proxy can be reached, and whose there are.
-
-    Args:
-        settings: Of the network, if it was searched.
-    """
+    """Return, in words, that no proxy can be reached, here or on the network that was searched, and whose there are."""
     also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
     others = of_others()
     ours = f"No proxy of yours is running on this host{also}" if others else f"No proxy is running on this host{also}"
@@ -180,12 +176,7 @@ def described(row: Row, settings: FabricSettings | None) -> Row:
 
 
 def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop list") -> Drone:
-    """Connect to a proxy as an observer.
-
-    Args:
-        row: Which one, and how it can be reached.
-        settings: Of the network.
-        name: Under which name to connect.
+    """Connect to a proxy as an observer of this name, in the way that its row says.
 
     Raises:
         SkyloopError: It does not answer.

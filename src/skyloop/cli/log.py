@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
-from rich.console import Console
 
 from skyloop.cli.naming import recordings
-from skyloop.cli.text import console
+from skyloop.cli.text import console, progress_bar, tell
 from skyloop.errors import FileFormatError, UsageError
 
 if TYPE_CHECKING:
@@ -66,7 +62,7 @@ def info(
     from skyloop.recording.review.summary import summarise
 
     recording = _open(file)
-    with _progress("reading") as progress:
+    with progress_bar("reading") as progress:
         summary = summarise(recording, progress)
     if json:
         typer.echo(log_tables.as_json(recording, summary))
@@ -115,9 +111,9 @@ def report(
 
     recording = _open(file)
     target = output or file.with_suffix(".html")
-    with _progress("drawing") as progress:
+    with progress_bar("drawing") as progress:
         write_report(recording, recording.drone(drone).name, target, pictures=pictures, progress=progress)
-    _print(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
+    tell(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
 
 
 @log.command(short_help="Samples and frames for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
@@ -179,13 +175,13 @@ def export(
             raise UsageError(f"{len(camera)} cameras were given: mp4 is made of one at a time")
         chosen = camera[0] if camera else _first_camera(recording, name)
         target = output or file.with_name(f"{file.stem}-{chosen}.mp4")
-        with _progress(f"exporting {chosen}") as progress:
+        with progress_bar(f"exporting {chosen}") as progress:
             found = export_mp4(recording, name, chosen, target, burn_time=burn_time, encode=encode, progress=progress)
         for line in log_tables.exported(found, chosen):
-            _print(line)
+            tell(line)
         return
     _refuse({"--camera": bool(camera), "--burn-time": burn_time, "--encode": encode}, to)
-    with _progress("reading") as progress:
+    with progress_bar("reading") as progress:
         tables = ways.read(recording, name, _channels(channel), progress)
     if to is Form.NPZ:
         written = ways.export_npz(tables, output or file.with_suffix(".npz"))
@@ -193,7 +189,7 @@ def export(
         write = ways.export_csv if to is Form.CSV else ways.export_parquet
         written = write(tables, output or file.with_name(f"{file.stem}-{to.value}"))
     rows = ", ".join(f"{len(table)} × {title}" for title, table in tables.items())
-    _print(f"{written[0] if len(written) == 1 else written[0].parent}: {rows}")
+    tell(f"{written[0] if len(written) == 1 else written[0].parent}: {rows}")
 
 
 @log.command(
@@ -230,7 +226,7 @@ def compare(
         from skyloop.recording.review.compare import write_comparison
 
         write_comparison(found, str(old), str(new), output)
-        _print(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
+        tell(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
 
 
 @log.command(short_help="Repair a recording that was cut off", epilog=f"{_EXAMPLE}recover flight.mcap")
@@ -246,25 +242,25 @@ def recover(
     from skyloop.recording.review import summary as mending
 
     recording = _open(file)
-    with _progress("looking") as progress:
+    with progress_bar("looking") as progress:
         wrong = mending.problems(recording, progress)
     if not wrong and output is None:
-        _print(f"{file} is whole: there is nothing to repair")
+        tell(f"{file} is whole: there is nothing to repair")
         if json:
             typer.echo(log_tables.recovered_json(file, None))
         return
     target = output or file.with_name(f"{file.stem}-recovered.mcap")
-    with _progress("mending") as progress:
+    with progress_bar("mending") as progress:
         saved = mending.recover(recording, target, progress)
     if json:
         typer.echo(log_tables.recovered_json(file, saved))
         return
     for problem in saved.why:
-        _print(f"{file}: {problem}")
+        tell(f"{file}: {problem}")
     for topic, count in sorted(saved.messages.items()):
         typer.echo(f"{count:8} {topic}")
     lost = f"; at most {saved.lost} bytes are lost" if saved.lost else ""
-    _print(f"{target}: {sum(saved.messages.values())} messages, {saved.seconds:.1f} s saved{lost}")
+    tell(f"{target}: {sum(saved.messages.values())} messages, {saved.seconds:.1f} s saved{lost}")
 
 
 def _export_lerobot(
@@ -279,7 +275,7 @@ def _export_lerobot(
 
     recordings = [_open(file) for file in files]
     target = output or files[0].with_name(f"{files[0].stem}-lerobot")
-    with _progress("exporting") as progress:
+    with progress_bar("exporting") as progress:
         found = export_lerobot(
             recordings,
             target,
@@ -290,7 +286,7 @@ def _export_lerobot(
             doing=lambda _, share: progress(share),
         )
     repeated = f"; {found.repeated} pictures were damaged, those before them stand there" if found.repeated else ""
-    _print(
+    tell(
         f"{target}: {found.episodes} episodes, {found.rows} rows: {', '.join(found.form.state)}; "
         f"{', '.join(found.form.cameras) or 'no camera'}; action: {', '.join(found.form.action)}{repeated}"
     )
@@ -299,10 +295,10 @@ def _export_lerobot(
 def _export_rrd(recording: Recording, target: Path, drone: str | None) -> None:
     from skyloop.recording.rerun_viewer import export_rrd
 
-    with _progress("exporting") as progress:
+    with progress_bar("exporting") as progress:
         found = export_rrd(recording, target, drone=drone, progress=progress)
     lost = f"; {found.left_out} pictures that can't be decoded are left out" if found.left_out else ""
-    _print(f"{target}: {', '.join(found.drones)}: {found.samples} samples, {found.pictures} pictures{lost}")
+    tell(f"{target}: {', '.join(found.drones)}: {found.samples} samples, {found.pictures} pictures{lost}")
 
 
 # Inside --------------------------------------------------------------------------------------------------------
@@ -336,20 +332,3 @@ def _refuse(given: dict[str, bool], to: Form) -> None:
     for option, is_given in given.items():
         if is_given:
             raise UsageError(f"{option} has no effect on {to.value}: leave it out, or choose another --to")
-
-
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[float], None]]:
-    """A bar on a terminal that goes away at the end; nothing into a pipe."""
-    if not sys.stderr.isatty():
-        yield lambda _: None
-        return
-    from rich.progress import Progress
-
-    with Progress(transient=True, console=Console(stderr=True)) as bar:
-        task = bar.add_task(what, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
-
-
-def _print(text: str) -> None:
-    typer.echo(text, err=True)

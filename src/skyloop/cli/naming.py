@@ -136,12 +136,7 @@ def one_drone(name: str | None, drone: str | None, default: str | None = None) -
 
 
 def drones(names: Sequence[str] | None, others: Sequence[str] | None, *, needed: bool = True) -> list[str]:
-    """Return the drones that a command is about, each once.
-
-    Args:
-        names: As NAME.
-        others: As ``--drone``.
-        needed: Whether at least one must be named.
+    """Return the drones that a command is about, each once: those that it has as NAME, then those as ``--drone``.
 
     Raises:
         UsageError: None is named and one is needed.

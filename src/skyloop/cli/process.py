@@ -5,18 +5,17 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Collection
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
 import typer
 
+from skyloop.cli import interrupt_by_signals
 from skyloop.cli.naming import (
     AnyNameArgument,
     DroneOption,
@@ -26,6 +25,8 @@ from skyloop.cli.naming import (
     join_network,
     one_drone,
 )
+from skyloop.cli.text import tell
+from skyloop.clock import beats
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.relayed import Polyline, Shape, Text
 from skyloop.processing.worker import Output
@@ -83,8 +84,7 @@ def process(
     drone = one_drone(drone_name, drone)
     code = load_processor(target)
     settings = Settings(name if name is not None else code.name, code.mark, camera, share, max_age, max_fps, stuck)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, interrupt)
+    interrupt_by_signals()
     show = show_json if json else show_text
     try:
         if workers == 1:
@@ -112,7 +112,7 @@ def work(
     processor = make()
     app = f"{settings.name[:32]}@{socket.gethostname()[:20]}:{os.getpid()}"
     with connect(target, access="observe", name=app) as drone:
-        worker = Worker(drone, processor, settings, _print)
+        worker = Worker(drone, processor, settings, tell)
         if child:
             end_with_parent(worker.stop)
         ended = threading.Event()
@@ -126,10 +126,8 @@ def work(
 
 
 def _lines(line: Callable[[], str], ended: threading.Event) -> None:
-    """Print a line each second, by absolute deadlines."""
-    due = time.monotonic() + LINE_EVERY_S
-    while not ended.wait(max(0.0, due - time.monotonic())):
-        due = max(due + LINE_EVERY_S, time.monotonic())
+    """Print a line each second."""
+    for _ in beats(LINE_EVERY_S, ended):
         typer.echo(line())
 
 
@@ -147,7 +145,7 @@ def _lead(
     if "://" in drone:
         raise UsageError(f"several workers need one proxy: skyloop proxy {drone} --name alpha, then --drone alpha")
     due = time.monotonic() + LINE_EVERY_S
-    with Group(child_command(_arguments(settings, target, drone, seconds)), workers, _print) as group:
+    with Group(child_command(_arguments(settings, target, drone, seconds)), workers, tell) as group:
         while (ended := group.code) is None:
             time.sleep(_LOOK_S)
             status = group.status
@@ -181,15 +179,6 @@ def show_text(status: Status) -> str:
 def show_json(status: Status) -> str:
     """Return a line for programs."""
     return msgspec.json.encode(status).decode()
-
-
-def interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001  as signal handlers are called
-    """End the command, as a signal handler."""
-    raise KeyboardInterrupt
-
-
-def _print(text: str) -> None:
-    typer.echo(text, err=True)
 
 
 def detect(
@@ -251,8 +240,7 @@ def detect(
 
     digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, interrupt)
+    interrupt_by_signals()
     with contextlib.suppress(KeyboardInterrupt):  # how it is meant to end
         work(make, settings, drone, seconds, show_json if json else show_text, child=False)
 
@@ -264,12 +252,7 @@ class DetectionProcessor:
     """
 
     def __init__(self, detector: ObjectDetector, classes: Collection[str] = ()) -> None:
-        """Keep the detector.
-
-        Args:
-            detector: Called on the worker's thread.
-            classes: Names of the classes that are published; none: all.
-        """
+        """Keep the detector, called on the worker's thread, and the names of the classes to publish; none: all."""
         self._detector = detector
         self._classes = frozenset(classes)
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import signal
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, NoReturn, cast
+from typing import TYPE_CHECKING, Annotated, Final, cast
 
 import typer
 
+from skyloop.cli import interrupt_by_signals
 from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
 from skyloop.errors import SkyloopError, UsageError
 
@@ -76,15 +76,10 @@ def record(
         overwrite=overwrite,
         in_process=True,
     )
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, _interrupt)
+    interrupt_by_signals((signal.SIGTERM,))
     with recorder, suppress(KeyboardInterrupt):  # how it is meant to end
         _show(recorder, math.inf if seconds is None else seconds)
     _conclude(recorder)
-
-
-def _interrupt(*_: object) -> NoReturn:
-    raise KeyboardInterrupt
 
 
 def _show(recorder: Recorder, seconds: float) -> None:
@@ -173,8 +168,7 @@ def view(
     _refuse(foxglove, rerun, write, connect, save, port)
     join_network(network, keys)
     chosen = drones(names, drone)
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, _interrupt)
+    interrupt_by_signals((signal.SIGTERM,))
     with ExitStack() as stack, suppress(KeyboardInterrupt):  # how it is meant to end
         from skyloop.client import connect as connect_to
         from skyloop.recording.view import View, give_way
@@ -190,7 +184,8 @@ def view(
 
 
 def _foxglove(known: Sequence[Drone], host: str, port: int | None, priority: int | None) -> Screen:
-    from skyloop.recording.foxglove_server import PORT, FoxgloveServer, is_loopback
+    from skyloop.address import is_loopback
+    from skyloop.recording.foxglove_server import PORT, FoxgloveServer
 
     server = FoxgloveServer(known, host=host, port=PORT if port is None else port, priority=priority)
     typer.echo(f"In Foxglove: Open connection, Foxglove WebSocket, {server.url}")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shlex
-import signal
 from typing import Annotated
 
 import typer
 
+from skyloop.cli import interrupt_by_signals
 from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
-from skyloop.cli.process import interrupt
 
 
 def ros(
@@ -63,8 +62,7 @@ def ros(
         subnet=subnet,
         arguments=tuple(shlex.split(ros_args)),
     )
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, interrupt)
+    interrupt_by_signals()
     try:
         with Bridge(settings) as bridge:
             for name, namespace in bridge.namespaces.items():

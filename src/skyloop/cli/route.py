@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
+from skyloop.cli.text import tell
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ def fly(
     land: Annotated[bool, typer.Option(help="Land at the end, or hover until this program has ended")] = True,
 ) -> None:
     """Check a route, take off, fly it, land. Ctrl-C lands. In a terminal P pauses, R resumes, S skips."""
-    from skyloop.cli.fly import ADVICE, interrupt_by_signals
+    from skyloop.cli import interrupt_by_signals
+    from skyloop.cli.fly import ADVICE
     from skyloop.cli.fly import land as put_down
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
@@ -72,21 +74,21 @@ def fly(
     with connect_pilot(drone, ADVICE, name=file.name[:64], authority=authority) as flown:
         flight = FlyRoute(flown, plan, folder=photos, on_progress=lambda step: _show(plan, step))
         found = flight.check()
-        _print(_summary(plan, found))
+        tell(_summary(plan, found))
         if not found.ok:
             raise UsageError(f"{file} can't be flown like this: see above")
         try:
             if not flown.feedback().state.airborne:
-                _print(f"taking off with {flown.name}")
+                tell(f"taking off with {flown.name}")
                 flown.takeoff()
             _run(flight)
         except KeyboardInterrupt:
-            _print("stopped by Ctrl-C")
+            tell("stopped by Ctrl-C")
             land = True
         if land:
             put_down(flown)
     for path in flight.photos:
-        _print(f"photo {path}")
+        tell(f"photo {path}")
     if flight.law.state != "done":
         raise typer.Exit(1)
 
@@ -100,7 +102,7 @@ def _run(flight: FlyRoute) -> None:
 
             keyboard = stack.enter_context(Keyboard())
             pressed = keyboard.keys
-            _print(KEYS)
+            tell(KEYS)
         acts = {"p": flight.pause, "r": flight.resume, "s": flight.skip}
 
         def look() -> bool:
@@ -111,11 +113,11 @@ def _run(flight: FlyRoute) -> None:
 
         flight.run(until=look)
     if flight.law.state == "paused":
-        _print(f"paused: {flight.law.problem or 'as asked'}")
+        tell(f"paused: {flight.law.problem or 'as asked'}")
 
 
 def _show(plan: Route, step: Progress) -> None:
-    _print(f"{step.waypoint}/{len(plan.waypoints)} {step.kind.removeprefix('route.').replace('_', ' ')}: {step.text}")
+    tell(f"{step.waypoint}/{len(plan.waypoints)} {step.kind.removeprefix('route.').replace('_', ' ')}: {step.text}")
 
 
 def _summary(plan: Route, found: RouteCheck) -> str:
@@ -128,7 +130,3 @@ def _summary(plan: Route, found: RouteCheck) -> str:
         where = "route" if one.waypoint is None else f"waypoint {one.waypoint}"
         lines.append(f"{one.severity}: {where}: {one.reason}")
     return "\n".join(lines)
-
-
-def _print(text: str) -> None:
-    typer.echo(text, err=True)

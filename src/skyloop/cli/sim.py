@@ -6,8 +6,6 @@ Each has a proxy of its own, or with ``--firmware`` is the firmware of a real dr
 from __future__ import annotations
 
 import ipaddress
-import signal
-import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass
@@ -378,11 +376,7 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return the ports of an AR.Drone; each further drone's are 10 higher.
-
-    Args:
-        base: From where the first drone's ports count, usually 5550; 0 for any free ones.
-        drone: The drone's index.
+    """Return the ports of an AR.Drone: the first one's count from ``base`` (0: any free ones), others' are 10 higher.
 
     Raises:
         UsageError: There are no such ports.
@@ -399,19 +393,16 @@ def ports_from(base: int, drone: int) -> Ports:
 
 
 def _run(firmwares: Sequence[Emulated]) -> None:
-    asked = threading.Event()
-    before = {number: signal.signal(number, lambda *_: asked.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with ExitStack() as started:
-            for firmware in firmwares:
-                started.enter_context(firmware)
-            for firmware in firmwares:
-                print(f"ready {describe(firmware)}", flush=True)
-            while not asked.wait(LOOK_UP_S):  # a signal that another thread gets does not wake this one
-                pass
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    from skyloop.proxy.serve import Shutdown, on_signals
+
+    shutdown = Shutdown()
+    with on_signals(shutdown, ignore_interrupt=False), ExitStack() as started:
+        for firmware in firmwares:
+            started.enter_context(firmware)
+        for firmware in firmwares:
+            print(f"ready {describe(firmware)}", flush=True)
+        while not shutdown.requested.wait(LOOK_UP_S):  # a signal that another thread gets does not wake this one
+            pass
 
 
 def describe(firmware: Emulated) -> str:

@@ -137,12 +137,7 @@ def read_fleet(path: Path) -> Fleet:
 
 
 def parse_fleet(text: str, source: str) -> Fleet:
-    """Parse the text of a file of vehicles; see :func:`read_fleet`.
-
-    Args:
-        text: The file's text.
-        source: The file's name, for errors.
-    """
+    """Parse the text of a file of vehicles; see :func:`read_fleet`."""
     found = read_tables(parse_toml(text, source), source, _File)
     top = Place(source)
     _checked(top, "name", lambda: check_name(found.name))
@@ -163,13 +158,7 @@ def parse_fleet(text: str, source: str) -> Fleet:
 
 
 def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Defaults) -> VehicleSettings:
-    """Return a vehicle's settings with the defaults filled in.
-
-    Args:
-        vehicle: The vehicle.
-        defaults: Of the host.
-        place: Where errors are.
-        own: What stands at that place.
+    """Return a vehicle's settings with the defaults filled in; ``own`` stands at the place that errors name.
 
     Raises:
         FileFormatError: A value is not valid.

@@ -53,12 +53,7 @@ class LinkThread:
         self._thread.start()
 
     def add(self, link: ServedLink, vehicle: Any) -> None:
-        """Serve a link from now on, until it ends. Any thread.
-
-        Args:
-            link: The link.
-            vehicle: What :attr:`inside` shows while it is served.
-        """
+        """Serve a link from now on, until it ends. Any thread."""
         with self._lock:
             self._members[link] = vehicle
             self._plan(link, 0)

@@ -186,45 +186,25 @@ def serve(settings: VehicleSettings) -> None:
     driver = make_driver(settings.address)
     end: TransportServer = LocalServer(settings.name, group=settings.group)
     if network is not None:
-        from skyloop.network import FabricServer
-        from skyloop.transport.composite import CompositeServer
+        from skyloop.network.server import beside
 
-        end = CompositeServer([end, FabricServer(settings.name, network, vehicle=str(driver.uri))])
+        end = beside(end, settings.name, network, str(driver.uri))
     proxy = Proxy(driver, end, name=settings.name)
     proxy.parameters.preset(settings.presets)
-    reporter = _Reporter(settings, proxy)
     keys = None if network is None or network.ring is None else network.ring.poll
+    row = VehicleStatus(settings.name, str(settings.address), Condition.RUNNING, process="own", pid=os.getpid())
+    began_s, reported_s = time.monotonic(), 0.0
 
     def look() -> Sequence[str]:
-        reporter.report()
+        """Report the proxy's status several times a second, and return what is new about the keys."""
+        nonlocal reported_s
+        now_s = time.monotonic()
+        if now_s - reported_s >= STATUS_EVERY_S:
+            reported_s = now_s
+            _write(msgspec.structs.replace(row, uptime_s=now_s - began_s, **of_proxy(proxy)))
         return () if keys is None else keys()
 
     run([proxy], parent_fd=0, look=look, records=True)
-
-
-class _Reporter:
-    """Writes the status of a proxy to standard output, several times a second."""
-
-    def __init__(self, settings: VehicleSettings, proxy: Proxy) -> None:
-        self._settings = settings
-        self._proxy = proxy
-        self._began_s = time.monotonic()
-        self._said_s = 0.0
-
-    def report(self) -> None:
-        now_s = time.monotonic()
-        if now_s - self._said_s < STATUS_EVERY_S:
-            return
-        self._said_s = now_s
-        row = VehicleStatus(
-            self._settings.name,
-            str(self._settings.address),
-            Condition.RUNNING,
-            uptime_s=now_s - self._began_s,
-            process="own",
-            pid=os.getpid(),
-        )
-        _write(msgspec.structs.replace(row, **of_proxy(self._proxy)))
 
 
 def _write(status: VehicleStatus) -> None:

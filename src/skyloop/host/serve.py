@@ -107,12 +107,7 @@ def serve(
 
 
 class Answering:
-    """Carries out the requests at a host's control socket.
-
-    Args:
-        host: The host.
-        defaults: Of its file, for vehicles that come by their address alone.
-    """
+    """Carries out the requests at a host's control socket; the defaults are for vehicles that come by address alone."""
 
     def __init__(self, host: Host, defaults: Defaults) -> None:
         self._host = host
@@ -234,13 +229,7 @@ _ERRORS: Final[dict[str, type[SkyloopError]]] = {
 
 
 class ControlServer:
-    """Takes requests, from :meth:`start` to :meth:`stop`.
-
-    Args:
-        name: The host's name.
-        answering: Carries requests out.
-        group: Of users who may connect as well.
-    """
+    """Takes requests of this user, and of a group's, from :meth:`start` to :meth:`stop`."""
 
     def __init__(self, name: str, answering: Responder, *, group: str | None = None) -> None:
         self._name = name
@@ -363,11 +352,6 @@ def chosen_host(name: str | None = None, group: str | None = None) -> str:
 
 def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     """Ask a host.
-
-    Args:
-        name: The host's name.
-        request: What to do.
-        group: The group that shares the directory of sockets.
 
     Raises:
         UsageError, RefusedError: Nothing was done; says why.

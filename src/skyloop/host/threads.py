@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any, Final, Protocol
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import beats
 from skyloop.proxy import Proxy
 from skyloop.proxy.core.autopilot import PERIOD_S
 
@@ -81,10 +81,7 @@ class Ticker:
             self._thread.join()
 
     def _run(self) -> None:
-        period_ns = nanoseconds(PERIOD_S)
-        due_ns = time.monotonic_ns() + period_ns
-        rounds = 0
-        while not self._closing.wait(max(0, due_ns - time.monotonic_ns()) / 1e9):
+        for rounds, _ in enumerate(beats(PERIOD_S, self._closing)):
             with self._lock:
                 proxies = list(self._failures)
             for place, proxy in enumerate(proxies, rounds):  # each round a fifth of them, so that all are alike long
@@ -92,8 +89,6 @@ class Ticker:
                 if failures is not None:  # it is not another ticker's meanwhile
                     self._tick(proxy, whole=failures > 0 or place % WHOLE_ROUNDS == 0)
             self.inside = None
-            rounds += 1
-            due_ns = max(due_ns + period_ns, time.monotonic_ns())  # late ones are not made up for
 
     def _tick(self, proxy: Proxy, *, whole: bool) -> None:
         self.inside = proxy
@@ -277,11 +272,7 @@ class Watchdog:
             self._thread.join()
 
     def look(self, now_s: float) -> None:
-        """Look once.
-
-        Args:
-            now_s: The time, on a monotonic clock [s].
-        """
+        """Look once."""
         punctual = now_s - self._looked_s < 2 * LOOK_S
         self._looked_s = now_s
         seen: dict[SharedLoop, tuple[int, int]] = {}

@@ -66,11 +66,7 @@ class VehicleStatus(msgspec.Struct, frozen=True):
 
 
 class HostedVehicle(ABC):
-    """A vehicle of a host. Methods may be called from any thread.
-
-    Args:
-        settings: Its settings.
-    """
+    """A vehicle of a host. Methods may be called from any thread."""
 
     def __init__(self, settings: VehicleSettings) -> None:
         self.settings = settings
@@ -183,10 +179,9 @@ class SharedVehicle(HostedVehicle):
     def _end(self, address: str) -> TransportServer:
         if self._network is None:
             return self.server
-        from skyloop.network import FabricServer
-        from skyloop.transport.composite import CompositeServer
+        from skyloop.network.server import beside
 
-        return CompositeServer([self.server, FabricServer(self.settings.name, self._network, vehicle=address)])
+        return beside(self.server, self.settings.name, self._network, address)
 
     def status(self) -> VehicleStatus:
         proxy, row = self.proxy, self.row()
@@ -270,10 +265,6 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 
 def within(call: Callable[[], object], seconds: float) -> bool:
     """Call something that may hang, on a thread of its own, and raise what it raises.
-
-    Args:
-        call: The function.
-        seconds: How long to wait for it [s].
 
     Returns:
         Whether it returned in time; if not, it is left to its daemon thread.

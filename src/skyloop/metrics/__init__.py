@@ -143,12 +143,7 @@ def proxy_readings(proxy: Proxy) -> Iterator[Reading]:
 
 
 def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
-    """Yield what a client knows of its connection to one proxy. Asks the proxy for nothing.
-
-    Args:
-        name: Of the proxy.
-        drone: Connected to it.
-    """
+    """Yield what a client knows of its connection to one proxy. Asks the proxy for nothing."""
     yield from _states("skyloop_client_link_state", (name,), drone.link.application, LinkState)
     for channel, stats in Known(drone).stats.items():
         if channel != "feedback" and (not channel.startswith("video/") or "?" in channel):
@@ -166,11 +161,7 @@ def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
 
 
 def router_readings(session: Callable[[], Session]) -> Source:
-    """Return the source of a router's readings.
-
-    Args:
-        session: Returns the router's present session of Zenoh.
-    """
+    """Return the source of a router's readings."""
 
     def read() -> Iterator[Reading]:
         current = session()

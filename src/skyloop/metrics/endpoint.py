@@ -5,7 +5,6 @@ The endpoint has threads of its own: who reads it, or stops reading, delays noth
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import socket
 import threading
@@ -19,6 +18,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 from urllib.parse import urlsplit
 
+from skyloop.address import is_loopback
 from skyloop.errors import MissingExtraError, UsageError
 
 if TYPE_CHECKING:
@@ -295,7 +295,7 @@ class _Server(ThreadingHTTPServer):
                 f"metrics can't be served at {host}, port {port}: {error.strerror or error}; choose another port, or 0"
             ) from None
         self.registry = registry
-        self.own = ipaddress.ip_address(str(self.server_address[0])).is_loopback
+        self.own = is_loopback(str(self.server_address[0]))
         self._deadline_s = deadline_s
         self._lock = threading.Lock()
         self._open: dict[Any, float] = {}  # connections, and until when each makes way for nobody; the oldest first
@@ -377,13 +377,7 @@ class _Handler(BaseHTTPRequestHandler):
 def _names_loopback(host: str) -> bool:
     """Return whether a Host header names this machine's loopback, with any port."""
     try:
-        name = urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return False
-    if name == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(name).is_loopback
+        return is_loopback(urlsplit(f"//{host}").hostname or "")
     except ValueError:
         return False
 

@@ -12,7 +12,7 @@ count as messages in the direction in which they travel: the declaration of a su
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 from skyloop.network import layout
@@ -34,11 +34,7 @@ Rules = Mapping[tuple[str, ...], list[str]]
 
 
 def access_control(identities: Iterable[Identity]) -> dict[str, Any]:
-    """Return Zenoh's ``access_control`` section for any node of a lab.
-
-    Args:
-        identities: All identities that may join; without any, nothing passes.
-    """
+    """Return Zenoh's ``access_control`` section for any node of a lab: only these identities may join."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -63,19 +59,22 @@ def may_publish(identity: Identity) -> Rules:
     names = _chunks(identity.drones)
     if identity.role is KeyRole.PROXY:
         return {
-            _PUT: _each(names, layout.proxy_puts),
-            _TOKEN: _each(names, layout.proxy_tokens),
-            _ANSWERS: _each(names, layout.proxy_answers),
-            _SUBSCRIBE: _each(names, layout.proxy_subscriptions),
-            _LIFE: [*layout.app_watches(_ANY), *_each(names, layout.proxy_watches)],
+            _PUT: _to_applications(names),
+            _TOKEN: [layout.alive(name, _ANY) for name in names],
+            _ANSWERS: [key for name in names for key in (layout.join(name, _ANY, _ANY), layout.info(name))],
+            _SUBSCRIBE: [layout.upward(way, name, _ANY, _ANY) for name in names for way in layout.WAYS],
+            _LIFE: [
+                layout.alive(_ANY, _ANY),
+                *(key for name in names for key in (layout.alive(name, _ANY), layout.app(name, _ANY, _ANY))),
+            ],
             _QUERY: [layout.info(_ANY)],
         }
     who, seen = identity.name, _seen(identity)
     return {
-        _PUT: _app_puts(identity, who),
-        _TOKEN: [key for name in seen for key in layout.app_tokens(who, name)],
-        _SUBSCRIBE: _each(seen, layout.app_subscriptions),
-        _LIFE: layout.app_watches(_ANY),
+        _PUT: _to_proxies(identity, who),
+        _TOKEN: [layout.app(name, who, _ANY) for name in seen],
+        _SUBSCRIBE: _to_applications(seen),
+        _LIFE: [layout.alive(_ANY, _ANY)],
         _QUERY: [layout.info(_ANY), *(layout.join(name, who, _ANY) for name in seen)],
     }
 
@@ -87,34 +86,42 @@ def may_subscribe(identity: Identity) -> Rules:
     """
     if identity.role is KeyRole.ROUTER:
         return may_publish(identity)
-    names = _chunks(identity.drones)
-    everywhere = {_TOKEN: layout.proxy_tokens(_ANY), _ANSWERS: [layout.info(_ANY)], _LIFE: layout.app_watches(_ANY)}
+    names, alive, info = _chunks(identity.drones), layout.alive(_ANY, _ANY), layout.info(_ANY)
     if identity.role is KeyRole.PROXY:
         return {
-            **everywhere,
-            _TOKEN: [*everywhere[_TOKEN], *(key for name in names for key in layout.app_tokens(_ANY, name))],
-            _PUT: [
-                key for name in names for key in (*layout.observer_puts(_ANY, name), *layout.pilot_puts(_ANY, name))
-            ],
-            _SUBSCRIBE: _each(names, layout.app_subscriptions),
-            _QUERY: [layout.info(_ANY), *(layout.join(name, _ANY, _ANY) for name in names)],
+            _TOKEN: [alive, *(layout.app(name, _ANY, _ANY) for name in names)],
+            _ANSWERS: [info],
+            _LIFE: [alive],
+            _PUT: [layout.upward(way, name, _ANY, _ANY) for name in names for way in layout.WAYS],
+            _SUBSCRIBE: _to_applications(names),
+            _QUERY: [info, *(layout.join(name, _ANY, _ANY) for name in names)],
         }
     seen = _seen(identity)
     return {
-        **everywhere,
-        _PUT: _each(seen, layout.proxy_puts),
-        _ANSWERS: [*everywhere[_ANSWERS], *(layout.join(name, _ANY, _ANY) for name in seen)],
-        _SUBSCRIBE: _app_puts(identity, _ANY),
-        _LIFE: [*everywhere[_LIFE], *(layout.app(name, _ANY, _ANY) for name in seen)],
-        _QUERY: [layout.info(_ANY)],
+        _TOKEN: [alive],
+        _ANSWERS: [info, *(layout.join(name, _ANY, _ANY) for name in seen)],
+        _LIFE: [alive, *(layout.app(name, _ANY, _ANY) for name in seen)],
+        _PUT: _to_applications(seen),
+        _SUBSCRIBE: _to_proxies(identity, _ANY),
+        _QUERY: [info],
     }
 
 
-def _app_puts(identity: Identity, who: str) -> list[str]:
+def _to_applications(names: list[str]) -> list[str]:
+    """Return where proxies put packets and frames, and applications subscribe to them."""
+    return [
+        key
+        for name in names
+        for key in (layout.to(name, _ANY), f"{layout.ROOT}/{name}/topic/*", f"{layout.ROOT}/{name}/video/**")
+    ]
+
+
+def _to_proxies(identity: Identity, who: str) -> list[str]:
     """Return where an application may put packets, or receive the subscription of ``who`` to them."""
-    keys = [key for name in _seen(identity) for key in layout.observer_puts(who, name)]
+    keys = [layout.upward(layout.ASK, name, who, _ANY) for name in _seen(identity)]
     if identity.role is KeyRole.PILOT:
-        keys += [key for name in _chunks(identity.drones) for key in layout.pilot_puts(who, name)]
+        ways = (layout.ORDER, layout.COMMAND)
+        keys += [layout.upward(way, name, who, _ANY) for name in _chunks(identity.drones) for way in ways]
     return keys
 
 
@@ -126,7 +133,3 @@ def _seen(identity: Identity) -> list[str]:
 def _chunks(patterns: tuple[str, ...]) -> list[str]:
     """Convert patterns to one chunk of a key expression each, where ``*`` is any name and ``$*`` any characters."""
     return [pattern if pattern == _ANY else pattern.replace("*", "$*") for pattern in patterns]
-
-
-def _each(names: list[str], keys: Callable[[str], list[str]]) -> list[str]:
-    return [key for name in names for key in keys(name)]

@@ -44,18 +44,7 @@ class Admission(NamedTuple):
 def admit(
     ring: KeyRing | None, name: str, run: str, sender: layout.Sender, request: packets.Join, topics: Seal | None
 ) -> Admission:
-    """Check a request to join, and make the proxy's answer.
-
-    Args:
-        ring: The proxy's keys, None without.
-        name: The proxy's name.
-        run: This run of the proxy.
-        sender: Who asks, by the key of the request.
-        request: The request.
-        topics: The seal of what is published, None without keys.
-
-    Returns:
-        The terms of the connection, with the answer.
+    """Check a request to join, and return its terms with the proxy's answer; without keys everybody is let in.
 
     Raises:
         LinkError: The application has no key of this lab, another's, or one without a right to see this drone.
@@ -80,14 +69,7 @@ def admit(
 
 
 class JoinRequest:
-    """The application's request to be let in, which accepts only the answer of the proxy.
-
-    Args:
-        ring: The application's keys, None without.
-        name: The proxy's name.
-        run: The run of the proxy that is asked.
-        sender: This application and connection.
-    """
+    """The application's request to be let in, which accepts only the answer of the proxy; without keys any."""
 
     def __init__(self, ring: KeyRing | None, name: str, run: str, sender: layout.Sender) -> None:
         self._name = name
@@ -100,10 +82,7 @@ class JoinRequest:
             self.proof = self._agreement.offer()
 
     def accept(self, welcome: packets.Welcome) -> Admission:
-        """Check the proxy's answer.
-
-        Returns:
-            The terms of the connection.
+        """Check the proxy's answer, and return the terms of the connection.
 
         Raises:
             LinkError: Whoever answered has no key to serve this drone, or the answer is damaged.
@@ -156,11 +135,7 @@ def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]
 
 
 class Tokens:
-    """The liveliness tokens of connections, bounded for each identity. Not thread-safe.
-
-    Args:
-        by_key: Whether identities are proved by keys; else all connections share one name and a larger bound.
-    """
+    """The liveliness tokens of connections, bounded for each identity, or without keys in all. Not thread-safe."""
 
     def __init__(self, *, by_key: bool) -> None:
         self._most = TOKENS_PER_KEY if by_key else TOKENS
@@ -187,9 +162,5 @@ class Tokens:
         return connection in self._seen.get(who, ())
 
     def any_of(self, connections: Mapping[str, str]) -> bool:
-        """Return whether the token of any of these connections is there.
-
-        Args:
-            connections: The identity of each connection, by its id.
-        """
+        """Return whether the token of any of these connections, given with their identities, is there."""
         return any(self.has(who, connection) for connection, who in connections.items())

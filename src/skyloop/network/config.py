@@ -213,13 +213,7 @@ def settings(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Make settings for the network.
-
-    Args:
-        listen: Addresses to listen at.
-        connect: Addresses to connect to.
-        multicast: Whether to search, and be found, by multicast.
-        keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
+    """Make settings for the network; ``keys`` is the folder of an identity, by default ``SKYLOOP_KEYS``.
 
     Raises:
         UsageError: An address or the folder is not valid.
@@ -279,12 +273,7 @@ _REGIONS: Final = {Part.PROXY: "proxies", Part.APP: "apps"}
 
 
 def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> dict[str, Any]:
-    """Return Zenoh's configuration, as its sections by name.
-
-    Args:
-        settings: How this process joins the network.
-        part: What the session is.
-        listen: Endpoints to listen at, in place of those of the settings.
+    """Return Zenoh's configuration, as its sections by name; ``listen`` are endpoints in place of the settings'.
 
     Raises:
         UsageError: An address is not valid.
@@ -337,11 +326,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
 
 
 def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str]:
-    """Convert addresses to Zenoh's endpoints.
-
-    Args:
-        addresses: ``HOST:PORT``, ``HOST`` or whole endpoints.
-        settings: With keys each address stands for QUIC, without for TCP and UDP.
+    """Convert addresses (``HOST:PORT``, ``HOST`` or whole endpoints) to Zenoh's: QUIC with keys, else TCP and UDP.
 
     Raises:
         UsageError: An address is not valid, or with keys not encrypted.

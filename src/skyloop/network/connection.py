@@ -38,15 +38,7 @@ _RESULTS: Final = results("")
 
 
 class ServerConnection:
-    """An application at the transport server. Its lock guards what is sent to it, and its topics.
-
-    Args:
-        peer: As the handler knows it.
-        who: Its identity.
-        connection: Its id in keys.
-        joined_s: When it asked to be let in, on the monotonic clock [s].
-        admission: The terms of the connection.
-    """
+    """An application at the transport server. Its lock guards what is sent to it, and its topics."""
 
     __slots__ = (
         "_own",
@@ -95,12 +87,7 @@ class ServerConnection:
         return identity is None or identity.may_fly(drone)
 
     def lags(self, topic: str, number: int) -> bool:
-        """Return whether a topic's packet has no room any more: more than :data:`DEPTH` before it are not acknowledged.
-
-        Args:
-            topic: The topic.
-            number: The packet's.
-        """
+        """Return whether a topic's packet has no room: more than :data:`DEPTH` before it are not acknowledged."""
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
@@ -148,9 +135,6 @@ class ServerConnection:
 
     def due(self, now_s: float) -> tuple[list[tuple[int, bytes]], bool]:
         """Return what is to be sent now.
-
-        Args:
-            now_s: The monotonic clock [s].
 
         Returns:
             The packets with their numbers (0: the transport's own), and whether more may become due as time passes.
@@ -229,14 +213,7 @@ class Sender:
 
 
 class Publisher:
-    """Keeps the subscriptions of all connections, and publishes to them. Thread-safe.
-
-    Args:
-        name: The proxy's name.
-        run: This run of the proxy.
-        sealer: Seals what is published.
-        clock: The monotonic clock [s].
-    """
+    """Keeps the subscriptions of all connections, and publishes to them. Thread-safe."""
 
     def __init__(self, name: str, run: str, sealer: Sealer, clock: Callable[[], float] = time.monotonic) -> None:
         self._name = name
@@ -253,12 +230,7 @@ class Publisher:
         self.video = FramePublisher(self._send_frame, name)
 
     def open(self, session: Session, topic_problem: Callable[[str], str]) -> None:
-        """Begin to publish.
-
-        Args:
-            session: The Zenoh session.
-            topic_problem: Returns why a topic can't be subscribed to, empty if it can.
-        """
+        """Begin to publish; ``topic_problem`` returns why a topic can't be subscribed to, empty if it can."""
         with self._lock:
             self._session = session
             self._topic_problem = self.video.topic_problem = topic_problem
@@ -323,11 +295,7 @@ class Publisher:
         return len(self._subscribed.get(topic, ()))
 
     def subscribe(self, connection: ServerConnection, request: packets.Subscribe) -> bool:
-        """Subscribe a connection to a topic, or unsubscribe it.
-
-        Returns:
-            False if it can't be subscribed; see :meth:`problem`.
-        """
+        """Subscribe a connection to a topic, or unsubscribe it; return False if that can't be, see :meth:`problem`."""
         topic = request.topic
         with self._lock, connection.lock:
             if connection.ended or connection.left or request.on == (topic in connection.topics):

@@ -41,12 +41,7 @@ class _Packet:
 
 
 class Outgoing:
-    """The packets for one end that it has not acknowledged yet. Not thread-safe.
-
-    Args:
-        depth: How many are kept at most.
-        most_bytes: How many bytes of them; a single packet may be larger.
-    """
+    """The packets for one end that it has not acknowledged yet. Not thread-safe."""
 
     def __init__(self, depth: int = DEPTH, most_bytes: int = MAX_BYTES) -> None:
         self._depth = depth
@@ -84,14 +79,7 @@ class Outgoing:
         return True
 
     def due(self, now_s: float) -> list[tuple[int, bytes, str]]:
-        """Return what is to be sent now: packets for which there is room on the way, and those that seem lost.
-
-        Args:
-            now_s: The monotonic clock [s].
-
-        Returns:
-            Number, packet and way of each.
-        """
+        """Return number, packet and way of what is to be sent: where there is room on the way, and what seems lost."""
         found: list[tuple[int, bytes, str]] = []
         if self._under_way and now_s - self._kept[0].sent_s >= self._again_s:
             self._again_s = min(2 * self._again_s, AGAIN_AT_MOST_S)
@@ -115,10 +103,6 @@ class Outgoing:
         """Drop the packets up to this number, as the other end has acknowledged them.
 
         A number of a packet that was not sent yet is ignored.
-
-        Args:
-            number: The last packet that was acknowledged.
-            now_s: The monotonic clock [s].
         """
         if not self._under_way or number >= self._kept[0].number + self._under_way:
             return
@@ -148,15 +132,7 @@ class Incoming:
         self._early: dict[int, bytes] = {}
 
     def take(self, number: int, packet: bytes) -> list[bytes]:
-        """Return the packets that can be delivered now that this one came, in order.
-
-        Args:
-            number: The packet's, from 1.
-            packet: The packet.
-
-        Returns:
-            Nothing if it came before, or if one before it is missing.
-        """
+        """Return the packets that can be delivered now that this one came, in order; none if it came before."""
         if number != self.taken + 1:
             if self.taken < number <= self.taken + ON_THE_WAY:
                 self._early.setdefault(number, packet)
@@ -183,13 +159,7 @@ class AckPolicy:
         self._next_s = -math.inf if every_s < math.inf else math.inf
 
     def count(self, number: int, size: int, now_s: float = 0.0) -> bool:
-        """Count a packet; return whether to acknowledge now.
-
-        Args:
-            number: The packet's.
-            size: Its size [bytes].
-            now_s: The monotonic clock [s].
-        """
+        """Count a packet; return whether to acknowledge now."""
         self._bytes += size
         few = number - self._acknowledged < ACKNOWLEDGE_AFTER and self._bytes < MAX_BYTES // 8
         if few and now_s < self._next_s:
@@ -216,31 +186,17 @@ class Pace:
         self._since_s = math.inf  # when the oldest was sent that is not acknowledged, or later
 
     def may_send(self, now_s: float) -> bool:
-        """Return whether another packet may be sent now.
-
-        Args:
-            now_s: The monotonic clock [s].
-        """
+        """Return whether another packet may be sent now."""
         stands = self._prompt and now_s - self._since_s > STANDS_S
         return not stands or now_s - self._sent_s >= SLOW_S
 
     def sent(self, number: int, now_s: float) -> None:
-        """Note a packet.
-
-        Args:
-            number: Its number, higher than those before.
-            now_s: The monotonic clock [s].
-        """
+        """Note a packet."""
         self._newest, self._sent_s = number, now_s
         self._since_s = min(self._since_s, now_s)
 
     def taken(self, number: int, now_s: float) -> None:
-        """Note that the subscriber acknowledged the packets up to this number.
-
-        Args:
-            number: The packet's; those that were not sent yet are ignored, as in :meth:`Outgoing.taken`.
-            now_s: The monotonic clock [s].
-        """
+        """Note that the subscriber acknowledged the packets up to this number; one that was not sent yet is ignored."""
         if not self._acknowledged < number <= self._newest:
             return
         self._prompt = self._prompt or (self._acknowledged > 0 and number - self._acknowledged < ACKNOWLEDGE_AFTER)
@@ -249,11 +205,7 @@ class Pace:
 
 
 class RecentPackets:
-    """The last packets that came: where there is a direct path and one through a router, each comes twice.
-
-    Args:
-        depth: How many are remembered.
-    """
+    """The last packets that came: where there is a direct path and one through a router, each comes twice."""
 
     def __init__(self, depth: int = RECENT_PACKETS) -> None:
         self._packets: deque[tuple[int, bytes]] = deque(maxlen=depth)
@@ -310,13 +262,7 @@ class Receiver:
     def receive(
         self, packet: bytes, *, control: Callable[[packets.Message], bool], deliver: Callable[[bytes], object]
     ) -> None:
-        """Receive a packet that may be lost.
-
-        Args:
-            packet: The packet.
-            control: Handles the transport's own packets.
-            deliver: Handles all others.
-        """
+        """Receive a packet that may be lost."""
         message = packets.parse_own(packet)
         if message is not None and control(message):
             return

@@ -69,10 +69,6 @@ def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
 def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
     """Return the proxies with this name, the oldest first; there are several only where a network was cut in two.
 
-    Args:
-        settings: How to join the network.
-        name: The proxy's name.
-
     Raises:
         LinkError: The network can't be joined.
     """
@@ -101,13 +97,7 @@ def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
 
 
 def listed(session: Session, name: str = "*", *, within_s: float = SYNC_S) -> tuple[set[tuple[str, str]], bool]:
-    """Return what :func:`runs` does, and whether the linked nodes have sent all that they know.
-
-    Args:
-        session: The Zenoh session.
-        name: The proxies' name.
-        within_s: How long to wait for the linked nodes [s].
-    """
+    """Return what :func:`runs` does, and whether the linked nodes have sent all that they know."""
     found = set()
     deadline = time.monotonic() + within_s
     for reply in session.zenoh.liveliness().get(layout.alive(name, "*"), timeout=within_s):
@@ -161,13 +151,7 @@ class UnreachablePeers:
         self._tried: dict[str, float] = {}
 
     def any_new(self, answered: set[str], known: set[str], now_s: float) -> bool:
-        """Return whether a peer answered that is not known and for which no new session was opened yet.
-
-        Args:
-            answered: Who answered a search.
-            known: Who is linked.
-            now_s: The monotonic clock [s].
-        """
+        """Return whether a peer answered that is not known and for which no new session was opened yet."""
         self._tried = {who: at for who, at in self._tried.items() if now_s - at < FORGET_S}
         new = answered - known - self._tried.keys()
         self._tried |= dict.fromkeys(new, now_s)
@@ -189,11 +173,7 @@ def proxy_reached() -> None:
 
 
 def renew(session: Session) -> bool:
-    """Search for nodes that a session does not know.
-
-    Returns:
-        True if there is one: the session is then retired, and another one has to be acquired.
-    """
+    """Search for nodes that a session does not know; return whether there are some, for which it is retired then."""
     if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
         return False
     answered = _search(session)
@@ -253,11 +233,7 @@ class ProxyWatch:
         )
 
     def find(self, within_s: float, list_s: float) -> list[tuple[str, packets.ProxyInfo | None]]:
-        """Wait for a proxy with this name.
-
-        Args:
-            within_s: How long [s].
-            list_s: How long the linked nodes may take after that to list the proxies that they know [s].
+        """Wait for a proxy with this name, then at most ``list_s`` [s] for linked nodes to list those that they know.
 
         Returns:
             The run of each candidate with what it reports of itself, the best first. That is the oldest; with keys the
@@ -313,16 +289,7 @@ class ProxyWatch:
 
 
 def join(session: Session, name: str, run: str, connection: str) -> Admission:
-    """Ask a proxy to let a connection in.
-
-    Args:
-        session: The Zenoh session.
-        name: The proxy's name.
-        run: The run of the proxy that is meant.
-        connection: The connection's id.
-
-    Returns:
-        The terms of the connection.
+    """Ask that run of a proxy to let a connection in, and return its terms.
 
     Raises:
         LinkError: The proxy refuses, does not answer (:class:`NoAnswerError`), or somebody else answers in its place.

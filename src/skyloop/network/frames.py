@@ -89,13 +89,7 @@ class Variant:
 
 
 class FramePublisher:
-    """All cameras of a transport server. Thread-safe; nothing is copied, encoded or sent under its lock.
-
-    Args:
-        send: Sends one encoded frame; called on the camera's thread.
-        name: The proxy's name.
-        clock: The monotonic clock [ns].
-    """
+    """All cameras of a transport server. Thread-safe; nothing is copied, encoded or sent under its lock."""
 
     def __init__(self, send: Send, name: str, clock: Clock = time.monotonic_ns) -> None:
         #: Why a topic can't be subscribed to; empty if it can.
@@ -111,11 +105,7 @@ class FramePublisher:
         self._unable: set[str] = set()  # topics that can't be encoded, and of which that was logged
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Take a frame and have it encoded and sent by the camera's thread.
-
-        Args:
-            header: The frame's header.
-            pixels: ``header.size`` bytes, dtype uint8; copied if anybody reads the camera.
+        """Take a frame, whose pixels are copied if anybody reads the camera; its thread encodes and sends it.
 
         Returns:
             How many readers it passes by, as they have :data:`WINDOW` frames on the way.
@@ -152,15 +142,7 @@ class FramePublisher:
             return sum(len(variant.readers) for variant in self._variants.get(camera, {}).values())
 
     def subscribe(self, key: Hashable, topic: str) -> bool:
-        """Send a connection frames, from the next one on.
-
-        Args:
-            key: The connection.
-            topic: A camera's, in any form.
-
-        Returns:
-            False if it can't have them; see :meth:`problem`.
-        """
+        """Send a connection frames, from the next one on; return False if that can't be, see :meth:`problem`."""
         with self._changed:
             if self._problem(key, topic):
                 return False

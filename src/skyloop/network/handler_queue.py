@@ -59,14 +59,7 @@ class HandlerQueue(Generic[Item]):
         self._closed = False
 
     def put(self, of: Hashable, item: Item, *, urgent: bool = False, at_most: int | None = None) -> bool:
-        """Queue an item. Any thread.
-
-        Args:
-            of: The connection whose item it is.
-            item: The item.
-            urgent: Whether it goes before all items that are not urgent.
-            at_most: How many items of this connection and urgency may wait before further ones are refused; None: no
-                bound.
+        """Queue an item of a connection, of which at most so many may wait; urgent ones go first. Any thread.
 
         Returns:
             False if it was refused.
@@ -91,14 +84,7 @@ class HandlerQueue(Generic[Item]):
             self._changed.notify()
 
     def get(self, timeout_s: float) -> Item | None:
-        """Return the next item.
-
-        Args:
-            timeout_s: How long to wait for one [s].
-
-        Returns:
-            The item; None if none came in time, or if the queue is closed and empty.
-        """
+        """Return the next item; None if none came in time, or if the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._urgent or self._others or self._closed, timeout_s)
             if self._urgent and not (self._others and self._in_a_row >= IN_A_ROW):

@@ -49,9 +49,9 @@ ID: Final = re.compile(r"[0-9a-f]{16}")
 ASK: Final = "ask"  #: reliable; what an observer may send
 ORDER: Final = "order"  #: reliable; what only a pilot may send
 COMMAND: Final = "command"  #: best effort; the command channel
+WAYS: Final = (ASK, ORDER, COMMAND)
 #: What an observer may ask. A request that is not named here needs the right to order, so a new one is safe.
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
-_RANK: Final = {ASK: 0, ORDER: 1, COMMAND: 2}
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
 _REPORT: Final = encode(StreamReport("", 0))[:6]  # all of the head, as garbage keeps its order
@@ -92,14 +92,7 @@ def join(name: str, who: str, connection: str) -> str:
 
 
 def upward(way: str, name: str, who: str, connection: str) -> str:
-    """Return the key by which an application sends packets.
-
-    Args:
-        way: :data:`ASK`, :data:`ORDER` or :data:`COMMAND`.
-        name: The proxy's name.
-        who: The application's identity.
-        connection: The connection's id.
-    """
+    """Return the key by which an application sends packets in one of the :data:`WAYS`."""
     return f"{ROOT}/{name}/{way}/{who}/{connection}"
 
 
@@ -119,13 +112,7 @@ def newest_wins(topic_name: str) -> bool:
 
 
 def video(name: str, camera: str, variant: str = "") -> str:
-    """Return the key at which frames are published.
-
-    Args:
-        name: The proxy's name.
-        camera: The camera's.
-        variant: What follows the ``?`` of the frames' topic.
-    """
+    """Return the key at which frames of a variant, what follows the ``?`` of their topic, are published."""
     return f"{ROOT}/{name}/video/{_chunk(camera)}/{_chunk(variant) or PLAIN}"
 
 
@@ -205,11 +192,6 @@ def is_report(packet: bytes) -> bool:
 def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
     """Return the reply to a request that an application's keys give no right to, which is not sent to the proxy.
 
-    Args:
-        packet: Needs the right to fly.
-        identity: The application's.
-        drone: The proxy's name.
-
     Returns:
         The packet of the reply; None for a packet that is no request.
     """
@@ -225,65 +207,7 @@ def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None
 
 def allows(way: str, packet: bytes) -> bool:
     """Return whether a packet may travel by the key by which it came."""
-    return _RANK[way] >= _RANK[way_of(packet)]
-
-
-# What each role may do, as key expressions (see Zenoh's "access control": a rule's ``key_exprs``) -----------------
-
-
-def observer_puts(who: str, name: str = "*") -> list[str]:
-    """Return where an observer may put packets."""
-    return [upward(ASK, name, who, "*")]
-
-
-def pilot_puts(who: str, name: str) -> list[str]:
-    """Return where a pilot may put packets, beside an observer's keys."""
-    return [upward(ORDER, name, who, "*"), upward(COMMAND, name, who, "*")]
-
-
-def app_tokens(who: str, name: str = "*") -> list[str]:
-    """Return the liveliness tokens that an application may declare."""
-    return [app(name, who, "*")]
-
-
-def app_queries(who: str, name: str = "*") -> list[str]:
-    """Return what an application may query."""
-    return [join(name, who, "*"), info(name)]
-
-
-def app_watches(name: str = "*") -> list[str]:
-    """Return the liveliness tokens that an application may query and watch."""
-    return [alive(name, "*")]
-
-
-def app_subscriptions(name: str = "*") -> list[str]:
-    """Return what an application may subscribe to."""
-    return [to(name, "*"), f"{ROOT}/{name}/topic/*", f"{ROOT}/{name}/video/**"]
-
-
-def proxy_puts(name: str) -> list[str]:
-    """Return where a proxy may put packets."""
-    return app_subscriptions(name)
-
-
-def proxy_tokens(name: str) -> list[str]:
-    """Return the liveliness tokens that a proxy may declare."""
-    return [alive(name, "*")]
-
-
-def proxy_watches(name: str) -> list[str]:
-    """Return the liveliness tokens that a proxy may query and watch."""
-    return [alive(name, "*"), app(name, "*", "*")]
-
-
-def proxy_answers(name: str) -> list[str]:
-    """Return the queries that a proxy may answer (its queryables)."""
-    return [join(name, "*", "*"), info(name)]
-
-
-def proxy_subscriptions(name: str) -> list[str]:
-    """Return what a proxy may subscribe to."""
-    return [upward(way, name, "*", "*") for way in (ASK, ORDER, COMMAND)]
+    return WAYS.index(way) >= WAYS.index(way_of(packet))
 
 
 def _chunk(text: str) -> str:

@@ -205,10 +205,6 @@ def _topic(text: bytes, least: int = 0) -> str:
 def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
     """Return what Zenoh received as bytes; empty for None.
 
-    Args:
-        data: The payload or attachment.
-        at_most: The largest size that is copied [bytes].
-
     Raises:
         DecodeError: It is larger.
     """
@@ -221,10 +217,6 @@ def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
 
 def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, bytes]:
     """Return the packet and the attachment of a sample.
-
-    Args:
-        sample: What Zenoh received.
-        at_most: The largest size of the packet [bytes].
 
     Raises:
         DecodeError: It is empty or too large.
@@ -253,12 +245,7 @@ def parse_number(attachment: bytes) -> int:
 
 
 def published(run: bytes, count: int) -> bytes:
-    """Encode the attachment of a published packet.
-
-    Args:
-        run: RUN of its proxy, 8 bytes.
-        count: The packet's number on this topic, from 1.
-    """
+    """Encode the attachment of a published packet: RUN of its proxy, 8 bytes, and its number on the topic, from 1."""
     return _PUBLISHED.pack(run, count)
 
 
@@ -276,13 +263,7 @@ def parse_published(attachment: bytes) -> tuple[bytes, int]:
 
 
 def frame(run: bytes, count: int, header: bytes) -> bytes:
-    """Encode the attachment of a frame.
-
-    Args:
-        run: RUN of its proxy, 8 bytes.
-        count: The frame's number.
-        header: The whole packet of its :class:`FrameHeader`.
-    """
+    """Encode the attachment of a frame: RUN of its proxy, 8 bytes, its number, and the packet of its header."""
     return _PUBLISHED.pack(run, count) + header
 
 

@@ -92,12 +92,7 @@ class ConnectionRegistry:
             self._open = True
 
     def farewell(self, reason: str, within_s: float) -> None:
-        """Let nobody in any more, disconnect all applications, and wait until they have gone.
-
-        Args:
-            reason: Why, for the applications.
-            within_s: How long to wait at most [s].
-        """
+        """Let nobody in any more, disconnect all applications, and wait until they have gone."""
         with self._lock:
             self._open = False
         for connection in self.connections:
@@ -249,9 +244,6 @@ class ConnectionRegistry:
         Those are connections whose application was let in and never showed its token, takes nothing of what is sent to
         it, or has no right to be here any more. The handler is notified of commands from unknown applications, and of
         connections that were turned away.
-
-        Args:
-            handler: Its ``refused`` is called; what it raises is passed on.
         """
         self._check_keys()
         commands, self._stray_commands = self._stray_commands, 0
@@ -302,11 +294,7 @@ class ConnectionRegistry:
     # --- sending to one, and the ends of connections: any thread ---
 
     def send(self, connection: ServerConnection, packet: bytes) -> bool:
-        """Send a packet that has to arrive. Any thread.
-
-        Returns:
-            False if the connection has ended, or ends now because too much waits for it already.
-        """
+        """Send a packet that has to arrive; return False if the connection has ended, or ends for it. Any thread."""
         if connection.ended:
             return False
         problem = connection.queue(packet)

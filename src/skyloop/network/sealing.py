@@ -12,7 +12,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from skyloop.errors import DecodeError
 from skyloop.network import packets
@@ -20,6 +20,7 @@ from skyloop.transport.base import MAX_PACKET
 
 if TYPE_CHECKING:
     import zenoh
+    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 TAG: Final = 16  #: bytes by which a sealed payload is longer
 _TRAILER = struct.Struct("<IQ")  # generation and number: at the end of the attachment, and the nonce
@@ -32,57 +33,8 @@ GENERATIONS: Final = 3  #: keys of topics that an application keeps: in force, o
 SWITCH_S: Final = 0.5
 
 
-class Sealer(Protocol):
-    """Seals packets."""
-
-    def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
-        """Seal a packet. Any thread.
-
-        Args:
-            where: The key that it will be sent by.
-            attachment: Sent beside it, authenticated but readable.
-            data: The packet.
-
-        Returns:
-            The payload and the attachment to send.
-        """
-
-
-class Opener(Protocol):
-    """Opens sealed packets."""
-
-    tag: int  #: bytes by which a payload is longer than the data
-    trailer: int  #: bytes by which an attachment is longer than it was
-
-    def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
-        """Open what came. Any thread.
-
-        Args:
-            where: The key by which it came.
-            attachment: As it came.
-            payload: As it came.
-
-        Returns:
-            The packet and its attachment; None if it came before, or can't be opened yet.
-
-        Raises:
-            DecodeError: The other end did not send this.
-        """
-
-    def use(self, key: bytes, generation: int = 0) -> Opener:
-        """Open what is sealed with this key, too, and forget the oldest of more than :data:`GENERATIONS` keys.
-
-        Args:
-            key: :data:`KEY_BYTES` bytes.
-            generation: The key's number, which grows.
-
-        Returns:
-            This object.
-        """
-
-
 class Plain:
-    """The sealer and opener without keys, which change nothing."""
+    """What seals and opens without keys: it changes nothing."""
 
     tag = trailer = 0
 
@@ -100,12 +52,7 @@ PLAIN: Final = Plain()
 
 
 class Seal:
-    """Seals with one key, and uses no number twice.
-
-    Args:
-        key: :data:`KEY_BYTES` bytes.
-        generation: The key's number.
-    """
+    """Seals with one key of :data:`KEY_BYTES` bytes, which has a number, and uses no number of a packet twice."""
 
     def __init__(self, key: bytes, generation: int = 0) -> None:
         self.key = key
@@ -114,27 +61,40 @@ class Seal:
         self._numbers = itertools.count(1)
 
     def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
+        """Seal a packet, and return the payload and the attachment to send. Any thread.
+
+        Args:
+            where: The key that it will be sent by.
+            attachment: Sent beside it, authenticated but readable.
+            data: The packet.
+        """
         trailer = _TRAILER.pack(self.generation, next(self._numbers))
         attachment += trailer
         return self._cipher.encrypt(trailer, data, _bound(where, attachment)), attachment
 
 
 class Open:
-    """Opens what the other end's :class:`Seal` has sealed, once each."""
+    """Opens what the other end's :class:`Seal` has sealed, once each. Any thread."""
 
-    tag = TAG
-    trailer = TRAILER
+    tag = TAG  #: bytes by which a payload is longer than the data
+    trailer = TRAILER  #: bytes by which an attachment is longer than it was
 
     def __init__(self) -> None:
-        self._ciphers: dict[int, Cipher] = {}
+        self._ciphers: dict[int, ChaCha20Poly1305] = {}
         self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only of keys by which something true has come
 
     def use(self, key: bytes, generation: int = 0) -> Open:
+        """Open what is sealed with this key, too, and forget the oldest of more than :data:`GENERATIONS` keys."""
         self._ciphers = dict(sorted([*self._ciphers.items(), (generation, _cipher(key))])[-GENERATIONS:])
         self._windows = {at: window for at, window in self._windows.items() if at[1] in self._ciphers}
         return self
 
     def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
+        """Return the packet and its attachment of what came by a key; None if it came before, or can't be opened yet.
+
+        Raises:
+            DecodeError: The other end did not send this.
+        """
         trailer = attachment[-TRAILER:]
         if len(trailer) < TRAILER:
             raise DecodeError("it is not sealed")
@@ -154,12 +114,8 @@ class Open:
         return (data, attachment[:-TRAILER]) if window.is_new(number) else None
 
 
-def contents(opener: Opener, sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
-    """Open a sample as :meth:`Opener.open` does, without copying what is too large.
-
-    Args:
-        opener: Opens it.
-        sample: What Zenoh received.
+def contents(opener: Plain | Open, sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
+    """Open a sample as :meth:`Open.open` does, without copying what is too large.
 
     Returns:
         The packet and the attachment; None if it came before, or can't be opened yet.
@@ -200,11 +156,7 @@ class ReplayWindow:
 
 
 class TopicSeal:
-    """Seals what all applications of a proxy may read, with a key that changes when one of them is shut out.
-
-    Args:
-        clock: The monotonic clock [s].
-    """
+    """Seals what all applications of a proxy may read, with a key that changes when one of them is shut out."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -223,20 +175,13 @@ class TopicSeal:
         self.newest = Seal(os.urandom(KEY_BYTES), self.newest.generation + 1)
 
     def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
-        """Seal with the key in use; see :meth:`Sealer.seal`."""
+        """Seal with the key in use; see :meth:`Seal.seal`."""
         if self._in_use is not self.newest and self._clock() >= self._since:
             self._in_use = self.newest
         return self._in_use.seal(where, attachment, data)
 
 
-class Cipher(Protocol):
-    """An authenticated cipher, as the package cryptography has them."""
-
-    def encrypt(self, nonce: bytes, data: bytes, associated_data: bytes | None) -> bytes: ...
-    def decrypt(self, nonce: bytes, data: bytes, associated_data: bytes | None) -> bytes: ...
-
-
-def _cipher(key: bytes) -> Cipher:
+def _cipher(key: bytes) -> ChaCha20Poly1305:
     from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # with keys only
 
     return ChaCha20Poly1305(key)
@@ -256,4 +201,6 @@ def _bound(where: str, attachment: bytes) -> bytes:
     return where.encode() + b"\0" + attachment
 
 
+Sealer: TypeAlias = Plain | Seal | TopicSeal
+Opener: TypeAlias = Plain | Open
 _MASK: Final = (1 << WIDTH) - 1

@@ -24,6 +24,7 @@ from skyloop.network.registry import ConnectionRegistry, Item
 from skyloop.network.sealing import PLAIN, TopicSeal, contents
 from skyloop.network.session import Session, acquire, host_name, load, release, undeclare
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_frame, check_name, check_packet
+from skyloop.transport.composite import CompositeServer
 from skyloop.transport.priority import SUPERSEDED, is_command
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ FAREWELL_S: Final = 0.5  #: how long a transport server that stops waits for its
 _POLL_S: Final = 0.5
 _REFUSED: Final = b""  # in place of a packet that was
 _COMMAND: Final = b"c"  # in place of a command: the one that waits first in the connection's backlog
-_UPWARD: Final = (layout.ASK, layout.ORDER, layout.COMMAND)
 _log = logging.getLogger(__name__)
 
 
@@ -117,7 +117,7 @@ class FabricServer(TransportServer):
 
     def _declare(self, session: Session) -> None:
         z, name, call = session.zenoh, self._name, session.callback
-        for way in _UPWARD:
+        for way in layout.WAYS:
             self._declared.append(z.declare_subscriber(layout.upward(way, name, "*", "*"), call(self._on_packet)))
         self._declared.append(z.declare_queryable(layout.info(name), call(self._answer_info)))
         self._declared.append(z.declare_queryable(layout.join(name, "*", "*"), call(self._registry.on_join)))
@@ -331,3 +331,8 @@ class FabricServer(TransportServer):
             handler.malformed(connection.peer, self._publisher.problem(connection, message.topic))
         else:
             handler.packet(connection.peer, packet)
+
+
+def beside(local: TransportServer, name: str, settings: FabricSettings, vehicle: str) -> TransportServer:
+    """Return a proxy's end on this host and on the network; the other arguments are a :class:`FabricServer`'s."""
+    return CompositeServer([local, FabricServer(name, settings, vehicle=vehicle)])

@@ -38,10 +38,6 @@ _ATTEMPTS: Final = 5  # to get a free port before somebody else has it
 class Session:
     """One shared Zenoh session; :func:`release` gives it back.
 
-    Args:
-        settings: How to join the network.
-        part: What the session is.
-
     Raises:
         LinkError: The network can't be joined.
         MissingExtraError: The extra ``network`` is not installed.
@@ -148,12 +144,7 @@ class _Pool:
             return session
 
     def release(self, session: Session, *, linger: bool = True) -> None:
-        """Give a session back.
-
-        Args:
-            session: From :meth:`acquire`.
-            linger: Whether it stays open for :data:`LINGER_S` without users; else it is closed at once.
-        """
+        """Give a session back, which stays open for :data:`LINGER_S` without users if it may linger."""
         with self._changed:
             session.users -= 1
             session.idle_since = time.monotonic() if linger else -LINGER_S
@@ -253,9 +244,6 @@ def renewed(session: Session) -> Session:
     """Replace a session, which nobody else uses, by one at the same addresses with the newest roster.
 
     All its links end and are made again.
-
-    Args:
-        session: From :func:`acquire`; it is released.
 
     Raises:
         LinkError: The keys were revoked, or an address is not free again within :data:`REOPEN_S`.

@@ -59,16 +59,7 @@ class Subscription:
         self._ended = False
 
     def declare(self, session: Session, name: str, connection: str) -> list[Any]:
-        """Subscribe on a Zenoh session.
-
-        Args:
-            session: The session.
-            name: The proxy's name.
-            connection: This connection's id.
-
-        Returns:
-            What was declared; the caller undeclares it.
-        """
+        """Subscribe on a Zenoh session, and return what was declared, for the caller to undeclare."""
         z, call, topic = session.zenoh, session.callback, self._topic
         if not topic.startswith(_VIDEO):
             return [z.declare_subscriber(layout.topic(name, topic), call(self._on_packet))]
@@ -82,11 +73,6 @@ class Subscription:
 
     def deliver(self, handler: ClientHandler, packet: bytes, number: int) -> bytes:
         """Deliver the next item to the handler.
-
-        Args:
-            handler: The application's.
-            packet: As it was given to ``enqueue``.
-            number: As it was given to ``enqueue``.
 
         Returns:
             The packet by which to acknowledge it to the proxy; empty for none.

@@ -46,12 +46,7 @@ class Backlog:
     """
 
     def __init__(self, limit: int, reserve: int = RESERVE) -> None:
-        """Initialise an empty backlog.
-
-        Args:
-            limit: Bytes, beyond which frames and feedback are dropped.
-            reserve: Bytes beyond the limit for items that are dropped last.
-        """
+        """Limit frames and feedback to so many bytes, and what is dropped last to so many more."""
         self.dropped: Counts = Counter()
         self._limit = limit
         self._ceiling = limit + reserve

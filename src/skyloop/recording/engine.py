@@ -9,12 +9,11 @@ from typing import Any, Final
 
 from skyloop.child_process import leave_to_parent
 from skyloop.client import Drone
-from skyloop.errors import UsageError
 from skyloop.messages import Severity
 from skyloop.recording.backlog import Backlog
 from skyloop.recording.layout import ClockPair, DroneRecord, to_plain
 from skyloop.recording.options import MB, Options, RecorderEvent, Status
-from skyloop.recording.taps import Tap
+from skyloop.recording.taps import Tap, check_names
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter
 
@@ -32,22 +31,13 @@ class Engine:
         on_event: Callable[[RecorderEvent], None] = lambda _: None,
         **writing: Any,
     ) -> None:
-        """Initialise the recorder without opening a file.
-
-        Args:
-            drones: Connected ones, with different names.
-            path: The first file.
-            options: What to record and how.
-            on_event: Called with each event, on the writing thread.
-            **writing: Replaces the disk, for tests.
+        """Initialise the recorder without opening a file; ``on_event`` is called on the writing thread.
 
         Raises:
             UsageError: Two drones have the same name.
             UnknownNameError: No drone has a camera that the options name.
         """
-        names = [drone.name for drone in drones]
-        if len(set(names)) < len(names):
-            raise UsageError(f"the drones of one recording need different names, not {', '.join(names)}")
+        check_names(drones, "recording")
         options.check_cameras(camera.name for drone in drones for camera in drone.capabilities.cameras)
         self._on_event = on_event
         self._backlog = Backlog(round(options.buffer_mb * MB))
@@ -90,11 +80,7 @@ class Engine:
         self._ended_ns = time.monotonic_ns()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write what was received, and close the file. Idempotent.
-
-        Args:
-            timeout_s: How long to wait for the disk.
-        """
+        """Write what was received, and close the file. Idempotent."""
         if self._ended_ns is not None:
             return
         self._ended_ns = time.monotonic_ns()

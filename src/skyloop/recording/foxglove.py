@@ -82,15 +82,7 @@ def timestamp(unix_ns: int) -> Timestamp:
 
 
 def image(drone: str, camera: str, captured_ns: int, data: bytes, format_: str) -> bytes:
-    """Encode an image.
-
-    Args:
-        drone: The drone's name.
-        camera: The camera's name.
-        captured_ns: Unix time.
-        data: A file of that format.
-        format_: ``jpeg`` or ``png``.
-    """
+    """Encode an image, a file of the format ``jpeg`` or ``png``, that was captured at this Unix time."""
     message = CompressedImage(
         timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=format_
     )
@@ -98,14 +90,7 @@ def image(drone: str, camera: str, captured_ns: int, data: bytes, format_: str) 
 
 
 def video(drone: str, camera: str, captured_ns: int, data: bytes) -> bytes:
-    """Encode one frame of H.264.
-
-    Args:
-        drone: The drone's name.
-        camera: The camera's name.
-        captured_ns: Unix time.
-        data: An access unit in Annex B form, with SPS and PPS if it is a key frame.
-    """
+    """Encode one frame of H.264: an access unit in Annex B form, with SPS and PPS if it is a key frame."""
     message = CompressedVideo(
         timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=H264
     )
@@ -113,16 +98,7 @@ def video(drone: str, camera: str, captured_ns: int, data: bytes) -> bytes:
 
 
 def calibration(drone: str, camera: str, at_ns: int, width: int, height: int, intrinsics: Intrinsics) -> bytes:
-    """Encode a camera's intrinsics.
-
-    Args:
-        drone: The drone's name.
-        camera: The camera's name.
-        at_ns: Unix time.
-        width: Of the images to which they apply [px].
-        height: Of the images to which they apply [px].
-        intrinsics: Of the camera.
-    """
+    """Encode a camera's intrinsics for images of this size [px]."""
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
     message = CameraCalibration(
         timestamp=timestamp(at_ns),

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from skyloop.address import is_loopback
 from skyloop.client import Authority, Drone, connect
 from skyloop.client.channels import Listener
 from skyloop.errors import ParameterError, SkyloopError, UnknownNameError
@@ -157,10 +158,7 @@ def is_trusted(origin: str) -> bool:
     if parts.scheme == "https" and (name == _FOXGLOVE or name.endswith(f".{_FOXGLOVE}")):
         return True
     if parts.scheme in ("http", "https"):
-        try:
-            return name == "localhost" or ipaddress.ip_address(name).is_loopback
-        except ValueError:
-            return False
+        return is_loopback(name)
     return parts.scheme == "file"  # the application's own; "null" may be any page's
 
 

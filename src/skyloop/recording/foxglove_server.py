@@ -6,8 +6,6 @@ of its own and drops the oldest messages of a viewer that does not read them.
 
 from __future__ import annotations
 
-import contextlib
-import ipaddress
 import logging
 import threading
 from collections import Counter
@@ -16,6 +14,7 @@ from dataclasses import dataclass
 from time import monotonic_ns
 from typing import Any, Final
 
+from skyloop.address import is_loopback
 from skyloop.client import Drone
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UsageError
 from skyloop.extend import Known
@@ -28,8 +27,9 @@ from skyloop.recording.foxglove_access import OriginDoor, ParameterDesk, Written
 from skyloop.recording.layout import Channel, ClockPair, FrameRecord, Topic
 from skyloop.recording.options import VIDEO
 from skyloop.recording.output import Message, Schema
+from skyloop.recording.taps import check_names
 from skyloop.recording.translation import Picture, Translator
-from skyloop.recording.view import Source, check_names
+from skyloop.recording.view import Source
 
 PORT: Final = 8765  #: that Foxglove asks for by itself
 WAITING: Final = 512  #: messages that may wait for a viewer; then its oldest are dropped
@@ -55,7 +55,7 @@ class FoxgloveServer:
             LinkError: The address can't be listened on.
             MissingExtraError: The extra ``[foxglove]`` is not installed.
         """
-        check_names(drones)
+        check_names(drones, "view")
         if priority is not None and not is_loopback(host):
             raise UsageError(
                 f"parameters can't be written from beyond this machine, and {host} is open to others: Foxglove's "
@@ -271,15 +271,6 @@ class _Listener:
     def on_connection_graph_unsubscribe(self) -> None: ...
 
 
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address."""
-    if host == "localhost":
-        return True
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return False
-
-
 def _sdk() -> Any:
     try:
         import foxglove
@@ -310,13 +301,7 @@ class ViewTopic:
 
 
 def topics(drone: str, capabilities: Capabilities, *, far: bool) -> Iterator[ViewTopic]:
-    """Yield the topics of a drone.
-
-    Args:
-        drone: The drone's name.
-        capabilities: Of the drone.
-        far: Whether its frames are encoded for the way.
-    """
+    """Yield the topics of a drone, whose frames are encoded for the way if it is far."""
     for channel, kind in layout.TYPES.items():
         if channel not in _OTHERS:
             yield ViewTopic(str(Topic(drone, channel)), kind, (channel.value,))

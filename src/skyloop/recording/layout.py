@@ -11,12 +11,12 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import msgspec
 from msgspec import inspect
 
+from skyloop.clock import boot_id
 from skyloop.errors import FileFormatError
 from skyloop.messages import (
     Annotation,
@@ -101,29 +101,18 @@ class ClockPair(msgspec.Struct, frozen=True):
         """Read both clocks."""
         before = time.monotonic_ns()
         unix = time.time_ns()
-        return cls((before + time.monotonic_ns()) // 2, unix, os.getpid(), _boot_id())
+        return cls((before + time.monotonic_ns()) // 2, unix, os.getpid(), boot_id())
 
     def unix(self, monotonic_ns: int, offset_ns: int = 0) -> int:
-        """Convert a monotonic time to Unix time [ns].
+        """Convert a monotonic time to Unix time [ns]; ``offset_ns`` is its clock minus the recorder's.
 
         The result is limited to what a file can hold, so that a sample with an absurd time breaks no file.
-
-        Args:
-            monotonic_ns: The time.
-            offset_ns: Its clock minus the recorder's.
         """
         return min(max(0, monotonic_ns - offset_ns - self.monotonic_ns + self.unix_ns), _LAST_UNIX_NS)
 
     def monotonic(self, unix_ns: int, offset_ns: int = 0) -> int:
         """Convert Unix time [ns] to a monotonic time; the inverse of :meth:`unix`."""
         return unix_ns - self.unix_ns + self.monotonic_ns + offset_ns
-
-
-def _boot_id() -> str:
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    except OSError:
-        return ""
 
 
 # Metadata ------------------------------------------------------------------------------------------------------

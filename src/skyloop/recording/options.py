@@ -73,9 +73,6 @@ class Options(msgspec.Struct, frozen=True):
     def check_cameras(self, known: Iterable[str]) -> None:
         """Check the cameras that were chosen.
 
-        Args:
-            known: The cameras of all drones.
-
         Raises:
             UnknownNameError: No drone has a camera of that name.
         """
@@ -120,12 +117,7 @@ def numbered(path: Path, number: int) -> Path:
 
 
 def first_path(path: Path, drones: list[str], options: Options) -> Path:
-    """Return the path to record to; in a folder, a file named by drones and time.
-
-    Args:
-        path: A file, or an existing folder; a file without a suffix gets ``.mcap``.
-        drones: Their names.
-        options: Whether the recording is split, and may overwrite.
+    """Return the path to record to: a file, ``.mcap`` without a suffix, or in a folder one named by drones and time.
 
     Raises:
         UsageError: The file exists already, or its folder does not.
@@ -189,13 +181,7 @@ _MARGIN: Final = 1.25  #: factor of a limit that must be free again before more 
 
 
 def judge_room(free: int, floor: int, before: Room) -> Room:
-    """Decide what is written: all above the floor, no frames below it, nothing below a quarter of it.
-
-    Args:
-        free: Bytes that are free on the disk.
-        floor: Bytes that are to stay free.
-        before: The decision before; to write more again, a margin above the limit must be free.
-    """
+    """Decide what is written: all above the floor, no frames below it, nothing below a quarter of it."""
     margin = _MARGIN if before is not Room.ALL else 1.0
     if free >= floor * margin:
         return Room.ALL

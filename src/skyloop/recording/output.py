@@ -37,10 +37,6 @@ Opener = Callable[[Path, bool], Target]
 def open_target(path: Path, overwrite: bool) -> Target:
     """Open a file without a buffer.
 
-    Args:
-        path: The file.
-        overwrite: Whether an existing file is replaced.
-
     Raises:
         OSError: It exists, or can't be written.
     """
@@ -132,14 +128,7 @@ class RecordingFile:
     def __init__(
         self, path: Path, start: Start, clock: ClockPair, *, overwrite: bool = False, opener: Opener = open_target
     ) -> None:
-        """Create the file and write its metadata.
-
-        Args:
-            path: The file.
-            start: Metadata of the recording.
-            clock: Relates monotonic and Unix time.
-            overwrite: Whether an existing file is replaced.
-            opener: Opens the file.
+        """Create the file and write its metadata; ``clock`` relates monotonic and Unix time.
 
         Raises:
             OSError: The file can't be created or written.

@@ -101,15 +101,7 @@ def compressed(message: bytes, record: FrameRecord) -> bytes:
 
 
 def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:
-    """Decode JPEG or PNG.
-
-    Args:
-        data: The image file.
-        what: The frame, for error messages.
-        grey: Whether to return grey and not BGR.
-
-    Returns:
-        BGR, shape (h, w, 3), or grey (h, w), uint8.
+    """Decode JPEG or PNG to BGR, shape (height, width, 3), or grey (height, width), uint8.
 
     Raises:
         FileFormatError: It can't be decoded.
@@ -185,14 +177,7 @@ class Group:
         self._units.append(unit)
 
     def pixels(self, index: int, what: str) -> NDArray[np.uint8]:
-        """Decode one frame.
-
-        Args:
-            index: Of the frame in the group.
-            what: The frame, for error messages.
-
-        Returns:
-            BGR, shape (height, width, 3), uint8.
+        """Decode one frame to BGR, shape (height, width, 3), uint8.
 
         Raises:
             FileFormatError: The frame is damaged, or no H.264.
@@ -217,11 +202,6 @@ class Groups:
 
     def add(self, number: int, unit: bytes, *, key: bool) -> tuple[Group, int] | None:
         """Add a frame.
-
-        Args:
-            number: Of the frame.
-            unit: Its access unit.
-            key: Whether it is a key frame.
 
         Returns:
             The group and the index in it; None for a frame that can't be decoded, because one before it is missing.

@@ -123,11 +123,7 @@ def from_plain(plain: Any, kind: type[T]) -> T:
 
 
 def limited(value: Any, depth: int = MAX_DEPTH) -> Any:
-    """Return a JSON value unchanged if others can work with it.
-
-    Args:
-        value: The decoded JSON.
-        depth: How deeply it may be nested.
+    """Return a JSON value unchanged if others can work with it, nested at most ``depth`` deep.
 
     Raises:
         ValueError: A whole number has more than 64 bits, which neither NumPy nor a packet can hold, or the value is
@@ -368,12 +364,7 @@ class Course:
         self._log_ns = 0  # of the newest sample
 
     def follow(self, value: Any, log_ns: int = 0) -> int:
-        """Return the time of the next sample, in the order of the file.
-
-        Args:
-            value: The sample.
-            log_ns: When it was recorded, on the recorder's clock; 0: not known.
-        """
+        """Return the time of the next sample in the order of the file, recorded at ``log_ns`` (0: not known)."""
         own_ns = reported_ns(value)
         if own_ns is None:
             return self.newest_ns

@@ -106,9 +106,6 @@ class Recording:
     def open(cls, path: str | Path) -> Recording:
         """Open a recording.
 
-        Args:
-            path: The file.
-
         Raises:
             UsageError: The file does not exist or can't be read.
             FileFormatError: It is no MCAP file, or was not recorded by Skyloop.

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Self
 
 import msgspec
 
@@ -34,26 +34,11 @@ from skyloop.recording.options import (
 )
 
 
-class Backend(Protocol):
-    """What records: a process, or threads of this one."""
-
-    @property
-    def status(self) -> Status: ...
-    def start(self) -> None: ...
-    def stop(self) -> None: ...
-
-
 class Recorder:
     """A recording that runs until :meth:`close`, or to the end of its ``with`` block. May be used from any thread."""
 
     def __init__(self, drones: Sequence[Drone | str], path: Path, options: Options, in_process: bool) -> None:
         """Start the recording; applications call :func:`record`.
-
-        Args:
-            drones: Connected ones, or names of proxies.
-            path: The first file.
-            options: What to record and how.
-            in_process: Whether to record on threads of this process.
 
         Raises:
             UsageError: The drones have the same name, or the file can't be written.
@@ -62,7 +47,7 @@ class Recorder:
         """
         self._listening = [drone for drone in drones if isinstance(drone, Drone)]
         self._own: list[Drone] = []  # connected by this recorder
-        self._backend: Backend
+        self._backend: Engine | RecorderProcess
         if in_process:
             self._backend = self._within(drones, path, options)
         else:
@@ -248,14 +233,7 @@ class Line(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def run_child(order: Order) -> int:
-    """Record until standard input ends or SIGTERM arrives.
-
-    Args:
-        order: What to record.
-
-    Returns:
-        The exit code: 0, or 2 if the recording could not start.
-    """
+    """Record until standard input ends or SIGTERM arrives; return the exit code: 2 if it could not start, else 0."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     on_parent_end(stop.set)
@@ -299,11 +277,7 @@ class RecorderProcess:
     """A child process that records; it ends with :meth:`stop`, and with this process, however that ends."""
 
     def __init__(self, order: Order, on_event: Callable[[RecorderEvent], None] = lambda _: None) -> None:
-        """Start the child, and wait until it records.
-
-        Args:
-            order: What to record.
-            on_event: Called with the child's events, on a thread that reads them.
+        """Start the child, and wait until it records; ``on_event`` is called on a thread that reads its events.
 
         Raises:
             UsageError: The child can't record because of a wrong argument.
@@ -333,9 +307,6 @@ class RecorderProcess:
     def status(self) -> Status:
         """The newest status that the child reported."""
         return self._status
-
-    def start(self) -> None:
-        """Do nothing: the child was started by the constructor."""
 
     def stop(self) -> None:
         """Let the child write what was received and close its file, and wait for its end. Idempotent.

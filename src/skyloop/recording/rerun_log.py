@@ -100,10 +100,7 @@ class RerunLog:
         self._begin()
 
     def connect(self, url: str) -> None:
-        """Send to a viewer or a server.
-
-        Args:
-            url: Such as ``rerun+http://127.0.0.1:9876/proxy``.
+        """Send to a viewer or a server, at an address such as ``rerun+http://127.0.0.1:9876/proxy``.
 
         Raises:
             UsageError: The address makes no sense.
@@ -115,30 +112,15 @@ class RerunLog:
         self._begin()
 
     def add(self, drone: int, sample: Any) -> None:
-        """Add a sample, of a kind that is drawn; any other is left out.
-
-        Args:
-            drone: Its index.
-            sample: Of :mod:`skyloop.messages`.
-        """
+        """Add a sample of the drone of this index, if it is of a kind that is drawn."""
         self._drones[drone].add(sample)
 
     def add_picture(self, drone: int, record: FrameRecord, data: bytes) -> None:
-        """Add a frame.
-
-        Args:
-            drone: Its index.
-            record: Of the frame.
-            data: Its image file, or access unit of H.264, of which the first is a key picture.
-        """
+        """Add a frame: its image file, or access unit of H.264, of which the first is a key picture."""
         self._drones[drone].picture(record, data)
 
     def taken(self, timeout_s: float) -> bool:
-        """Return whether the viewer, or the disk, has taken all that was added.
-
-        Args:
-            timeout_s: How long to wait at most, above 0.
-        """
+        """Return whether the viewer, or the disk, takes all that was added within this time, above 0 [s]."""
         try:
             self._stream.flush(timeout_sec=timeout_s)
         except Exception:  # noqa: BLE001  (Rerun's own, which has no common base)
@@ -146,10 +128,7 @@ class RerunLog:
         return True
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Finish the file, or send what is left.
-
-        Args:
-            timeout_s: How long the viewer may take.
+        """Finish the file, or send what is left, for which the viewer may take so long [s].
 
         Raises:
             LinkError: The viewer does not take what is left, which is given up.

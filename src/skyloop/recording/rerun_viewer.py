@@ -25,8 +25,9 @@ from skyloop.recording.options import MB, VIDEO
 from skyloop.recording.pictures import Picture as RecordedPicture
 from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.rerun_log import RerunLog, Shown, rerun_sdk
+from skyloop.recording.taps import check_names
 from skyloop.recording.translation import Picture
-from skyloop.recording.view import Source, check_names
+from skyloop.recording.view import Source
 
 PORT: Final = 9876  #: of Rerun's viewer
 _START_S: Final = 20.0
@@ -67,7 +68,7 @@ class RerunViewer:
             NoAnswerError: It does not listen in time.
             MissingExtraError: The extra ``[rerun]`` is not installed.
         """
-        check_names(drones)
+        check_names(drones, "view")
         rerun_sdk()
         self.left_out = 0  #: samples for which the viewer was too slow
         self._ahead = 0  # bytes that the viewer may not have taken yet

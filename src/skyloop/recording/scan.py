@@ -173,13 +173,7 @@ def has_room(found: Scan, size: int) -> bool:
 
 
 def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | None = None) -> Iterator[Record]:
-    """Yield schemas, channels and messages of one piece, in the file's order.
-
-    Args:
-        file: The open file.
-        piece: Which part.
-        damaged: Called with a description of what can't be read.
-    """
+    """Yield schemas, channels and messages of a piece, in the file's order; ``damaged`` is told what can't be read."""
     try:
         if piece.size > MAX_CHUNK:
             raise ValueError(f"a part of {piece.size} bytes, and at most {MAX_CHUNK} are read at once")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +15,7 @@ from skyloop.client import Drone, Result
 from skyloop.client.channels import Listener, Mailbox
 from skyloop.client.frame import Arrival, to_bgr
 from skyloop.clock import nanoseconds
-from skyloop.errors import MissingExtraError, SkyloopError
+from skyloop.errors import MissingExtraError, SkyloopError, UsageError
 from skyloop.extend import Known, stream_channel, video_channel
 from skyloop.messages import (
     Annotation,
@@ -47,6 +47,17 @@ _log = logging.getLogger(__name__)
 Encode = Callable[[FrameHeader, "NDArray[np.uint8]"], bytes]
 
 
+def check_names(drones: Sequence[Drone], of: str) -> None:
+    """Check that the drones of a recording, or of a view, can be told apart.
+
+    Raises:
+        UsageError: Two drones have the same name.
+    """
+    names = [drone.name for drone in drones]
+    if len(set(names)) < len(names):
+        raise UsageError(f"the drones of one {of} need different names, not {', '.join(names)}")
+
+
 class Gaps:
     """Counts missing numbers in a rising sequence. A number that is not higher starts a new sequence."""
 
@@ -72,16 +83,7 @@ class Tap:
     def __init__(
         self, number: int, drone: Drone, options: Options, backlog: Backlog, *, encoded_far: bool = False
     ) -> None:
-        """Initialise without subscribing.
-
-        Args:
-            number: The drone's index in the recording.
-            drone: A connected drone.
-            options: What to record and how.
-            backlog: Where samples are put.
-            encoded_far: Over a network, let the proxy encode as H.264 what the vehicle does not, at the rate that the
-                path carries.
-        """
+        """Initialise without subscribing; ``encoded_far``: over a network the proxy encodes as H.264 what comes raw."""
         self.drone = drone
         self._number = number
         self._options = options
@@ -341,9 +343,6 @@ class Video:
 
 def encoder(options: Options) -> Encode:
     """Return a function that encodes images, shape (height, width, 3) BGR or (height, width), uint8.
-
-    Args:
-        options: Format and quality.
 
     Raises:
         MissingExtraError: OpenCV is not installed.

@@ -67,14 +67,7 @@ class Translator:
     def __init__(
         self, drone: str, capabilities: Capabilities, clock: ClockPair, offset_ns: Callable[[], int] = lambda: 0
     ) -> None:
-        """Initialise the translator.
-
-        Args:
-            drone: The drone's name.
-            capabilities: Of the drone.
-            clock: Relates the recorder's clock and Unix time.
-            offset_ns: Returns the proxy's clock minus the recorder's.
-        """
+        """Initialise the translator; ``offset_ns`` returns the proxy's clock minus the recorder's."""
         self._drone = drone
         self._cameras = capabilities.cameras
         self._camera_names = frozenset(camera.name for camera in capabilities.cameras)
@@ -104,11 +97,7 @@ class Translator:
         return self._makers[type(item.sample)](item.sample, self._clock.unix(item.received_ns))
 
     def prelude(self, now_ns: int) -> Iterator[Message]:
-        """Create the messages that make each file complete in itself: parameters, mountings and calibrations.
-
-        Args:
-            now_ns: On the recorder's clock.
-        """
+        """Create the messages that make each file complete in itself: parameters, mountings and calibrations."""
         at_ns = self._clock.unix(now_ns)
         for parameter in list(self._parameters.values()):
             yield from self._parameter(parameter, at_ns)

@@ -7,15 +7,15 @@ import os
 import threading
 import time
 from collections.abc import Sequence
+from itertools import chain
 from types import TracebackType
 from typing import Final, Protocol, Self
 
 from skyloop.client import Drone
-from skyloop.clock import nanoseconds
-from skyloop.errors import UsageError
+from skyloop.clock import beats, nanoseconds
 from skyloop.recording.backlog import Backlog, Item
 from skyloop.recording.options import MB, Options
-from skyloop.recording.taps import Tap
+from skyloop.recording.taps import Tap, check_names
 
 BEAT_S: Final = 0.02  #: period of polling the backlog, so that receiving threads need not wake the view
 _BATCH: Final = MB  # bytes that are shown before what is wanted is asked again
@@ -52,16 +52,12 @@ class View:
     """
 
     def __init__(self, drones: Sequence[Drone], screen: Screen) -> None:
-        """Initialise without subscribing.
-
-        Args:
-            drones: Connected ones, with different names.
-            screen: Where they are shown; closed with the view.
+        """Initialise without subscribing; the screen is closed with the view.
 
         Raises:
             UsageError: Two drones have the same name.
         """
-        check_names(drones)
+        check_names(drones, "view")
         self.failed = 0
         self.failed_why = ""
         self._drones = drones
@@ -108,16 +104,11 @@ class View:
     # The thread ------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        due_s = time.monotonic()
-        while True:
-            due_s = max(due_s + BEAT_S, time.monotonic())
-            ending = self._closing.wait(max(0.0, due_s - time.monotonic()))
+        for ending in chain((False for _ in beats(BEAT_S, self._closing)), (True,)):
             try:
                 self.step(time.monotonic_ns(), ending=ending)
             except Exception:  # noqa: BLE001  (a view that ended would show a standing picture of a flying drone)
                 _log.exception("the view goes on")
-            if ending:
-                return
 
     def step(self, now_ns: int, *, ending: bool = False) -> None:
         """Subscribe to what is wanted, and show what came. Called by the thread, or by a test."""
@@ -149,14 +140,3 @@ def give_way() -> None:
     """Lower this process's priority, and that of the threads that it starts from now on: who flies goes first."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)
-
-
-def check_names(drones: Sequence[Drone]) -> None:
-    """Check that drones can be told apart.
-
-    Raises:
-        UsageError: Two drones have the same name.
-    """
-    names = [drone.name for drone in drones]
-    if len(set(names)) < len(names):
-        raise UsageError(f"the drones of one view need different names, not {', '.join(names)}")

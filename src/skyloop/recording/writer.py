@@ -13,7 +13,7 @@ from typing import Final
 
 import msgspec
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import beats, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.messages import Severity
 from skyloop.messages.frame import H264, Chain
@@ -72,20 +72,7 @@ class FileWriter:
         opener: Opener = open_target,
         free: Callable[[Path], int] = free_space,
     ) -> None:
-        """Initialise the writer without opening a file.
-
-        Args:
-            path: The first file.
-            options: How to write.
-            backlog: What is written.
-            drones: Metadata of the drones.
-            translators: One for each drone, in the same order.
-            clock: Relates monotonic and Unix time.
-            tell: Called with a text and its severity, on the writing thread (for the first file on that of
-                :meth:`start`).
-            opener: Opens a file.
-            free: Returns the free bytes of a folder's disk.
-        """
+        """Initialise the writer without opening a file; ``tell`` is called on its thread, first on :meth:`start`'s."""
         self.state = RecorderState.STARTING
         self.reason = ""
         self.files: list[Path] = []
@@ -137,11 +124,7 @@ class FileWriter:
         self._thread.start()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write what was received, and close the file. Idempotent.
-
-        Args:
-            timeout_s: How long to wait; a disk that hangs longer is left to the thread.
-        """
+        """Write what was received, and close the file; a disk that hangs longer is left to the thread. Idempotent."""
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
@@ -172,14 +155,10 @@ class FileWriter:
             self._fail(error)
 
     def _work(self) -> None:
-        due_s = time.monotonic()
-        ending = False
-        while not ending:
-            due_s = max(due_s + BEAT_S, time.monotonic())
-            ending = self._closing.wait(max(0.0, due_s - time.monotonic()))
-            if ending:
-                self._look_due_ns = 0  # a last retry if it is paused, and the last counts
+        for _ in beats(BEAT_S, self._closing):
             self.step(time.monotonic_ns())
+        self._look_due_ns = 0  # a last retry if it is paused, and the last counts
+        self.step(time.monotonic_ns())
         self._end()
 
     def _fail(self, error: Exception) -> None:

@@ -103,12 +103,7 @@ class Bridge:
         self._stack.close()
 
     def run(self, stopping: threading.Event | None = None, shown: Callable[[], object] | None = None) -> None:
-        """Serve until the event is set.
-
-        Args:
-            stopping: Ends it; None: nothing does, but an exception such as KeyboardInterrupt.
-            shown: Called a few times a second, on this thread.
-        """
+        """Serve until the event is set, or an exception such as KeyboardInterrupt; ``shown`` is called now and then."""
         stopping = stopping or threading.Event()
         while True:
             for camera in self._cameras:

@@ -71,12 +71,7 @@ def namespaces_of(drones: tuple[str, ...]) -> dict[str, str]:
 
 
 class RosTime:
-    """Stamps of a drone's samples, on the clock of a node: the system's, or with ``use_sim_time`` that of ``/clock``.
-
-    Args:
-        node: Of rclpy.
-        drone: Connected.
-    """
+    """Stamps of a drone's samples on the clock of a node: the system's, or with ``use_sim_time`` that of ``/clock``."""
 
     def __init__(self, node: Any, drone: Drone) -> None:
         self._clock = node.get_clock()

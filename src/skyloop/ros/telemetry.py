@@ -32,14 +32,7 @@ JPEG_QUALITY: Final = 90
 
 
 class Telemetry:
-    """Publishes each feedback, to those topics that somebody subscribes to.
-
-    Args:
-        node: Of rclpy, in the drone's namespace.
-        drone: Connected.
-        time: Stamps of captures.
-        frames: Names of the drone's frames.
-    """
+    """Publishes each feedback, to those topics that somebody subscribes to."""
 
     def __init__(self, node: Any, drone: Drone, time: RosTime, frames: Frames) -> None:
         from geometry_msgs.msg import TwistStamped
@@ -245,15 +238,7 @@ def _or_nan(value: float | None) -> float:
 
 
 class CameraPublisher:
-    """Publishes one camera, while somebody subscribes to it: until then its frames are not asked for.
-
-    Args:
-        node: Of rclpy, in the drone's namespace.
-        drone: Connected.
-        camera: Of the drone.
-        time: Stamps of captures.
-        frames: Names of the drone's frames.
-    """
+    """Publishes one camera, while somebody subscribes to it: until then its frames are not asked for."""
 
     def __init__(self, node: Any, drone: Drone, camera: CameraInfo, time: RosTime, frames: Frames) -> None:
         from rclpy.qos import qos_profile_sensor_data

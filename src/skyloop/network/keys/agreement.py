@@ -34,11 +34,7 @@ _OFFER, _ANSWER = "offer", "answer"
 
 
 class KeyRing:
-    """Reads the folder of keys from time to time. All methods may be called from any thread.
-
-    Args:
-        credentials: As loaded; their roster is the one in force.
-    """
+    """Reads the folder of keys from time to time. All methods may be called from any thread."""
 
     def __init__(self, credentials: Credentials) -> None:
         self.credentials = credentials
@@ -75,9 +71,6 @@ class KeyRing:
 
         That is what expires within a week, once an hour, and a newer roster. A roster that can't be read is reported
         and changes nothing.
-
-        Args:
-            now: The time in UTC; by default of this machine.
 
         Returns:
             A sentence for each.
@@ -143,12 +136,7 @@ class Agreed:
 
 
 class Agreement:
-    """One end's part in the exchange.
-
-    Args:
-        ring: This end's keys, and the roster.
-        *terms: What the connection is about, the same for both ends.
-    """
+    """One end's part in the exchange, by its keys; ``terms`` are what the connection is about, the same for both."""
 
     def __init__(self, ring: KeyRing, *terms: str) -> None:
         self._ring = ring
@@ -166,10 +154,6 @@ class Agreement:
     def answer(self, offer: bytes, now: datetime | None = None) -> tuple[bytes, Agreed]:
         """Check the application's offer, and make the proxy's answer.
 
-        Args:
-            offer: As it came.
-            now: The time in UTC; by default of this machine.
-
         Returns:
             The answer, a :class:`Proof` as MessagePack, and what is agreed.
 
@@ -183,10 +167,6 @@ class Agreement:
 
     def accept(self, answer: bytes, now: datetime | None = None) -> Agreed:
         """Check the proxy's answer.
-
-        Args:
-            answer: As it came.
-            now: The time in UTC; by default of this machine.
 
         Returns:
             What is agreed.

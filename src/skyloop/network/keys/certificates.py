@@ -89,12 +89,7 @@ def certificate_pem(certificate: x509.Certificate) -> bytes:
 
 
 def make_authority(days: int, now: datetime) -> Authority:
-    """Make a new lab's authority. Its name ends in random digits, so that labs can be distinguished.
-
-    Args:
-        days: How long it is valid.
-        now: The time in UTC.
-    """
+    """Make a new lab's authority. Its name ends in random digits, so that labs can be distinguished."""
     key = new_key()
     name = _name(f"Skyloop lab {secrets.token_hex(4)}")
     certificate = (
@@ -109,15 +104,7 @@ def make_authority(days: int, now: datetime) -> Authority:
 def issue(
     authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Make a certificate for an identity.
-
-    Args:
-        authority: Signs it; needs its key.
-        identity: The holder.
-        key: The holder's key.
-        until: When it expires, in UTC; no later than the authority's certificate does.
-        now: The time in UTC.
-    """
+    """Make a certificate for an identity, signed by an authority that has its key, until its end at most."""
     assert authority.key is not None
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role in (KeyRole.PROXY, KeyRole.ROUTER):
@@ -137,15 +124,10 @@ def issue(
 
 
 def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
-    """Make an authority for cockpits' pages, which browsers are to trust: not the lab's, and for nothing else.
+    """Make an authority for pages, not the lab's, that may certify these names and all below them too, and no others.
 
     What it issues counts for private addresses, names of local networks, and the given ones: a browser that trusts it
     trusts it with no other site (name constraints, RFC 5280, 4.2.1.10).
-
-    Args:
-        names: More names that it may certify, with all below them.
-        days: How long it is valid.
-        now: The time in UTC.
     """
     key = new_key()
     name = _name(f"Skyloop pages {secrets.token_hex(4)}")
@@ -207,10 +189,6 @@ def may_certify(authority: Authority, name: str) -> bool:
 def read_certificate(content: bytes, path: Path) -> x509.Certificate:
     """Decode a certificate from a file.
 
-    Args:
-        content: PEM.
-        path: The file, for errors.
-
     Raises:
         FileFormatError: It is not a certificate.
     """
@@ -257,10 +235,6 @@ def signed_by(certificate: x509.Certificate, content: bytes, signature: bytes) -
 def read_key(content: bytes, path: Path) -> PrivateKey:
     """Decode a private key from a file.
 
-    Args:
-        content: PEM, not encrypted.
-        path: The file, for errors.
-
     Raises:
         FileFormatError: It is not such a key, or not one on a curve.
     """
@@ -274,12 +248,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Check that a certificate is an authority's.
-
-    Args:
-        certificate: The authority's.
-        key: Its key, None where nothing is issued.
-        path: The certificate's file, for errors.
+    """Check that a certificate is an authority's, whose key is None where nothing is issued.
 
     Raises:
         FileFormatError: It is not an authority's certificate.
@@ -298,10 +267,6 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
 
 def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
     """Return the identity that a certificate names.
-
-    Args:
-        certificate: The holder's.
-        path: Its file, for errors.
 
     Raises:
         FileFormatError: It names no role and drones.
@@ -331,11 +296,6 @@ def matches(key: PrivateKey, certificate: x509.Certificate) -> bool:
 def check_issued(certificate: x509.Certificate, authority: Authority, path: Path) -> None:
     """Check that an authority issued a certificate.
 
-    Args:
-        certificate: To check.
-        authority: The lab's.
-        path: The certificate's file, for errors.
-
     Raises:
         UsageError: Another authority issued it.
     """
@@ -349,11 +309,6 @@ def check_issued(certificate: x509.Certificate, authority: Authority, path: Path
 
 def check_time(certificate: x509.Certificate, what: str, now: datetime) -> None:
     """Check that a certificate is valid now.
-
-    Args:
-        certificate: To check.
-        what: What it belongs to, for errors.
-        now: The time in UTC.
 
     Raises:
         UsageError: It is not valid yet, or has expired.

@@ -118,11 +118,6 @@ def encode_roster(roster: Roster, authority: Authority) -> bytes:
 def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
     """Check the signature of a roster's file, then decode it.
 
-    Args:
-        content: The file.
-        authority: The lab's.
-        path: The file, for errors.
-
     Raises:
         FileFormatError: It is not a roster, is damaged, or has another format.
         UsageError: It was changed, or another authority signed it.
@@ -189,9 +184,6 @@ class Credentials:
     def ends(self, now: datetime | None = None) -> dict[str, str]:
         """Return what expires within a week or has expired: this key, and the lab's authority.
 
-        Args:
-            now: The time in UTC; by default of this machine.
-
         Returns:
             A sentence for people for each, by what it is about.
         """
@@ -211,10 +203,6 @@ class Credentials:
 
 def load(directory: Path | str, now: datetime | None = None) -> Credentials:
     """Read an identity's folder and check all that can be checked.
-
-    Args:
-        directory: The folder.
-        now: The time in UTC; by default of this machine.
 
     Raises:
         UsageError: Something is wrong with the folder; :class:`skyloop.errors.FileFormatError` for a file that is
@@ -251,13 +239,7 @@ def read_public(directory: Path) -> tuple[Authority, Roster]:
 
 
 def expiry_warning(what: str, end: datetime, now: datetime) -> str:
-    """Return a sentence for people if the end is less than a week away, or past; empty if not.
-
-    Args:
-        what: What ends.
-        end: When, in UTC.
-        now: The time in UTC.
-    """
+    """Return a sentence for people if the end is less than a week away, or past; empty if not."""
     left = end - now
     if left > NOTICE:
         return ""

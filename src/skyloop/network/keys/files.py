@@ -33,12 +33,7 @@ def make_directory(path: Path) -> None:
 
 
 def write(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Replace a file in one step.
-
-    Args:
-        path: The file.
-        content: All of it.
-        private: Whether only its owner may read it, from its first byte on.
+    """Replace a file in one step; a private one can be read by its owner only, from its first byte on.
 
     Raises:
         UsageError: It can't be written.
@@ -59,10 +54,6 @@ def write(path: Path, content: bytes, *, private: bool = False) -> None:
 def read(path: Path, what: str) -> bytes:
     """Read a file of at most :data:`MAX_BYTES`.
 
-    Args:
-        path: The file.
-        what: What it holds, for errors.
-
     Raises:
         UsageError: It can't be read, or is too large.
     """
@@ -71,10 +62,6 @@ def read(path: Path, what: str) -> bytes:
 
 def read_private(path: Path, what: str) -> bytes:
     """Read a file that must not be open to others, as somebody else may have the key then.
-
-    Args:
-        path: The file.
-        what: What it holds, for errors.
 
     Raises:
         UsageError: It can't be read, is too large, or is open to others.

@@ -130,9 +130,6 @@ class Lab:
                 left of the authority's time.
             now: The time in UTC; by default of this machine.
 
-        Returns:
-            The identity's entry in the roster.
-
         Raises:
             UsageError: ``days`` is out of range, the authority has expired, the name was revoked and its lost key is
                 still valid, or a file can't be written.
@@ -163,9 +160,6 @@ class Lab:
         """Revoke an identity, and delete its folder's files here.
 
         It takes effect wherever the new roster has arrived.
-
-        Returns:
-            The identity's entry in the roster.
 
         Raises:
             UnknownNameError: The roster has no such name.

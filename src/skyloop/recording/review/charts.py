@@ -71,6 +71,21 @@ class TimeAxis:
         return LEFT + (t_s - self.begin_s) / span * (WIDTH - LEFT - RIGHT)
 
 
+def spans(t_s: Floats, names: NDArray[np.str_], styles: dict[str, str], end_s: float) -> list[Span]:
+    """Return the stretches with one name that has a style, where ``*`` is any other; the last ends at ``end_s``."""
+    found: list[Span] = []
+    if not len(t_s):
+        return found
+    begins = np.concatenate(([0], np.flatnonzero(names[1:] != names[:-1]) + 1))
+    ends = np.concatenate((t_s[begins[1:]], [end_s]))
+    for begin, end in zip(begins, ends, strict=True):
+        name = str(names[begin])
+        style = styles.get(name, styles.get("*", ""))
+        if name and style:
+            found.append(Span(float(t_s[begin]), float(end), name.replace("_", " "), style))
+    return found
+
+
 def ticks(low: float, high: float, most: int = 5) -> list[float]:
     """Round numbers from low to high, at most so many or one more: 1, 2 or 5 times a power of ten apart."""
     if not high > low:
@@ -83,13 +98,7 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def limits(lines: Sequence[Line], *, least_span: float, zero: bool = False) -> tuple[float, float]:
-    """Return the limits of the vertical axis: all known values with a margin.
-
-    Args:
-        lines: What is drawn.
-        least_span: Least distance between the limits.
-        zero: Whether 0 must be within the limits.
-    """
+    """Return limits of the vertical axis, so far apart at least: all known values with a margin, and 0 if wanted."""
     known = [values for line in lines if (values := line.values[np.isfinite(line.values)]).size]
     if not known:
         return 0.0, least_span
@@ -359,13 +368,7 @@ def facts(pairs: Sequence[tuple[str, str]]) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], classes: Sequence[str]) -> str:
-    """Return a table as HTML.
-
-    Args:
-        head: Titles.
-        rows: Cells, which are HTML.
-        classes: Of the columns: ``n`` is a number.
-    """
+    """Return a table as HTML, as its cells are; a column of the class ``n`` is one of numbers."""
     titles = "".join(f'<th class="{kind}">{escape(title)}</th>' for title, kind in zip(head, classes, strict=True))
     lines = "".join(
         "<tr>" + "".join(f'<td class="{kind}">{cell}</td>' for cell, kind in zip(row, classes, strict=True)) + "</tr>"

@@ -16,8 +16,7 @@ from skyloop.files import replacing
 from skyloop.messages import Applied, Feedback
 from skyloop.recording.layout import Channel
 from skyloop.recording.reader import Recording
-from skyloop.recording.review.charts import Line, Mark, Page, TimeAxis, band_chart, facts, limits, table
-from skyloop.recording.review.flight import spans
+from skyloop.recording.review.charts import Line, Mark, Page, TimeAxis, band_chart, facts, limits, spans, table
 from skyloop.recording.review.tables import ACTION_FIELDS, begin_ns
 
 RATE_HZ: Final = 100.0  #: rate at which both are compared; a command holds until the next one
@@ -207,13 +206,7 @@ _NEW: Final[dict[str, Any]] = {"color": "#d9480f", "lw": 1.4, "ls": "--"}
 
 
 def write_comparison(found: Comparison, old: str, new: str, path: Path) -> None:
-    """Write the comparison.
-
-    Args:
-        found: The comparison.
-        old: Name of the older recording.
-        new: Name of the newer one.
-        path: Ends in ``.html``, or in ``.png``, which needs Matplotlib.
+    """Write the comparison of recordings of these names as a ``.html``, or by Matplotlib as a ``.png``.
 
     Raises:
         UsageError: The file can't be written.

@@ -82,11 +82,6 @@ class Episode:
 def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> Form:
     """Return what can be known in each row of a recording.
 
-    Args:
-        tables: Of one drone; see :func:`skyloop.recording.review.tables.tables`.
-        cameras: Whose pictures are wanted.
-        fps: Rows a second.
-
     Raises:
         FileFormatError: The recording has no feedback, no set-points, or no frames of a camera.
         UsageError: It was flown by several kinds of set-points, or by positions.
@@ -256,11 +251,7 @@ Pixels = NDArray[np.uint8]
 
 
 class Film:
-    """One camera's pictures of all episodes, one after the other, at a steady rate: H.264 in an MP4 file.
-
-    Args:
-        path: The file; it stands there once the film is closed without an error.
-        fps: Pictures a second.
+    """One camera's pictures of all episodes at a steady rate: H.264 in an MP4 file, there once it is closed well.
 
     Attributes:
         width: Of the pictures [px]; 0 before the first.
@@ -296,13 +287,7 @@ class Film:
         self._opened.__exit__(kind, error, trace)
 
     def add(self, recording: Recording, drone: str, camera: str, wanted_ns: Sequence[Times]) -> None:
-        """Encode the pictures of a recording's rows.
-
-        Args:
-            recording: The recording.
-            drone: The drone's name.
-            camera: The camera's name.
-            wanted_ns: The capture of each row's picture, of each episode, in order.
+        """Encode the pictures of a recording's rows, by the capture of each, of each episode in order.
 
         Raises:
             FileFormatError: The first picture can't be decoded.
@@ -369,11 +354,7 @@ class Film:
 
 
 def numbers_stats(values: NDArray[Any]) -> dict[str, Any]:
-    """Return what a dataset says of a column's numbers, each as a list: one, or one for each of a row's.
-
-    Args:
-        values: Shape (rows,) or (rows, n).
-    """
+    """Return what a dataset says of a column's numbers, each as a list: one, or one for each of a row's."""
     columns = values.reshape(len(values), -1).astype(np.float64)
     found = {"min": columns.min(0), "max": columns.max(0), "mean": columns.mean(0), "std": columns.std(0)}
     found |= {name: np.quantile(columns, share, axis=0) for name, share in _QUANTILES.items()}

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import base64
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from skyloop.clock import NS_PER_S
+from skyloop.errors import FileFormatError, MissingExtraError
 from skyloop.messages import FlightState
+from skyloop.messages.frame import H264
 from skyloop.recording.layout import Channel
+from skyloop.recording.pictures import Picture
 from skyloop.recording.reader import Progress, Recording
-from skyloop.recording.review import flight
-from skyloop.recording.review.charts import Floats, Line, Page, TimeAxis, band_chart, facts, limits, map_chart, table
-from skyloop.recording.review.flight import figures
+from skyloop.recording.review.charts import (
+    Floats,
+    Line,
+    Mark,
+    Page,
+    TimeAxis,
+    band_chart,
+    facts,
+    limits,
+    map_chart,
+    spans,
+    table,
+)
 from skyloop.recording.review.summary import Summary, summarise
 from skyloop.recording.review.tables import Table, tables
 
@@ -34,20 +49,18 @@ _LINKS: Final = {"up": "", "closed": "calm", "*": "alarm"}
 _COMMANDS: Final = {"idle": "", "emergency_stop": "alarm", "takeoff": "rising", "land": "falling", "*": "flying"}
 _COLOURS: Final = ("c1", "c2", "c3", "c4", "c5", "c6")
 _MOST_EVENTS: Final = 500
+_LONGEST_STEP_S: Final = 0.5  #: over a longer step a velocity is not integrated
+_WIDTH: Final = 360  #: of a thumbnail [px]
+_QUALITY: Final = 80
+_TELLING: Final = ("state_changed", "collision", "failsafe", "emergency", "authority_preempted")
+_NEAR: Final = 0.4  #: share of the usual distance: an even frame is left out if one at an event is nearer than this
 _SAME_CLOCK_S: Final = 60.0  #: a longer delay is left out: the two clocks are unrelated
 
 
 def write_report(
     recording: Recording, drone: str, path: Path, *, pictures: int = 8, progress: Progress | None = None
 ) -> None:
-    """Write the report, reading the recording three times.
-
-    Args:
-        recording: The recording.
-        drone: The drone's name.
-        path: The file.
-        pictures: Greatest number of key frames for each camera.
-        progress: Called with the share that was done, 0 to 1.
+    """Write the report, reading the recording three times, with at most so many key frames of each camera.
 
     Raises:
         UsageError: The file can't be written.
@@ -72,10 +85,10 @@ def make_page(recording: Recording, drone: str, found: dict[str, Table], summary
     axis = TimeAxis(0.0, max([*ends, 0.1]))
     page = Page(f"{drone}: flight report", axis)
     feedback, commands = found.get("feedback"), found.get("commands")
-    way = None if feedback is None else flight.way(feedback)
+    way = None if feedback is None else way_of(feedback)
     _head(page, recording, drone, summary)
     frames = sum(len(one) for name, one in found.items() if name.startswith("frames."))
-    page.add(facts(flight.facts(feedback, commands, way, frames, axis.end_s)))
+    page.add(facts(flight_facts(feedback, commands, way, frames, axis.end_s)))
     for note in (*summary.notes, *_losses(summary, drone)):
         page.add(f'<p class="note">{escape(note)}</p>')
     if feedback is None:
@@ -107,7 +120,7 @@ def _losses(summary: Summary, drone: str) -> Iterator[str]:
             yield f"{words} {what}"
 
 
-def _path(page: Page, feedback: Table, way: flight.Way) -> None:
+def _path(page: Page, feedback: Table, way: Way) -> None:
     page.way(way.t_s, way.x, way.y)
     t_s = feedback.numbers("t_s")
     high = Line("altitude", t_s, feedback.numbers("altitude_m"))
@@ -132,13 +145,11 @@ def _bands(found: dict[str, Table], axis: TimeAxis) -> str:
             ("failsafe", "failsafe", _FAILSAFES),
             ("link", "vehicle_link", _LINKS),
         ):
-            rows.append((title, flight.spans(t_s, feedback[column].astype(np.str_), styles, axis.end_s)))
+            rows.append((title, spans(t_s, feedback[column].astype(np.str_), styles, axis.end_s)))
     if commands is not None:
         asked = np.where(commands["app_id"] > 0, commands["asked"], "")
-        rows.append(("asked for", flight.spans(commands.numbers("t_s"), asked, _COMMANDS, axis.end_s)))
-    return band_chart(
-        "bands", [(title, spans) for title, spans in rows if spans], flight.marks(found.get("events")), axis
-    )
+        rows.append(("asked for", spans(commands.numbers("t_s"), asked, _COMMANDS, axis.end_s)))
+    return band_chart("bands", [(title, spans) for title, spans in rows if spans], marks(found.get("events")), axis)
 
 
 def _charts(
@@ -280,3 +291,158 @@ def _channels(page: Page, summary: Summary) -> None:
     ]
     head = ("channel", "count", "rate [Hz]", "gaps", "missing", "size [MB]", "delay [ms]: median (p99)")
     page.add("<h2>Channels</h2>" + table(head, rows, ("", "n", "n", "n", "n", "n", "")))
+
+
+# Its course and figures -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """Where the drone was, in world axes: x east, y north [m]."""
+
+    t_s: Floats
+    x: Floats
+    y: Floats
+    source: str  #: where that is known from, in words
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path over ground."""
+        return float(np.nansum(np.hypot(np.diff(self.x), np.diff(self.y))))
+
+
+def way_of(feedback: Table) -> Way | None:
+    """Return where the drone was; None if nothing is known of that.
+
+    From the vehicle's position; else from the simulator's true one; else from its integrated velocity.
+    """
+    t_s = feedback.numbers("t_s")
+    for source, x, y in (
+        ("the vehicle's own position", "position_x_m", "position_y_m"),
+        ("the simulator's true position", "native.truth.x", "native.truth.y"),
+    ):
+        if feedback.known(x) and feedback.known(y):
+            return Way(t_s, feedback.numbers(x), feedback.numbers(y), source)
+    if not (feedback.known("velocity_forward_m_s") and feedback.known("yaw_rad")):
+        return None
+    forward, left = feedback.numbers("velocity_forward_m_s"), feedback.numbers("velocity_left_m_s")
+    yaw = feedback.numbers("yaw_rad")
+    steps = np.diff(t_s, prepend=t_s[:1])
+    steps = np.where(steps > _LONGEST_STEP_S, 0.0, steps)
+    east = np.nan_to_num(forward * np.cos(yaw) - left * np.sin(yaw))
+    north = np.nan_to_num(forward * np.sin(yaw) + left * np.cos(yaw))
+    return Way(t_s, np.cumsum(east * steps), np.cumsum(north * steps), "summed up from the velocity: it drifts")
+
+
+def marks(events: Table | None) -> list[Mark]:
+    """Convert events to marks on the time axis."""
+    if events is None:
+        return []
+    rows = zip(events.numbers("t_s"), events["text"], events["severity"], strict=True)
+    return [Mark(float(t), str(text), str(severity)) for t, text, severity in rows]
+
+
+def airborne_s(feedback: Table) -> float:
+    """Return how long the drone was airborne [s]."""
+    flying = np.isin(feedback["state"], [state.value for state in FlightState if state.airborne])
+    steps = np.diff(feedback.numbers("t_s"))
+    return float(steps[flying[:-1]].sum()) if len(steps) else 0.0
+
+
+def flight_facts(
+    feedback: Table | None, commands: Table | None, path: Way | None, frames: int, seconds: float
+) -> list[tuple[str, str]]:
+    """Return the figures at the head of a report: name and value; only those that are known."""
+    found = [("recorded", f"{seconds:.1f} s")]
+    if feedback is not None and len(feedback):
+        found.append(("in the air", f"{airborne_s(feedback):.1f} s"))
+        altitude = feedback.numbers("altitude_m")
+        if feedback.known("altitude_m"):
+            found.append(("highest", f"{np.nanmax(altitude):.2f} m"))
+        speed = np.hypot(feedback.numbers("velocity_forward_m_s"), feedback.numbers("velocity_left_m_s"))
+        if np.isfinite(speed).any():
+            found.append(("fastest", f"{np.nanmax(speed):.2f} m/s"))
+        if path is not None:
+            found.append(("way", f"{path.length_m:.1f} m"))
+        battery = feedback.numbers("battery")
+        battery = battery[np.isfinite(battery)]
+        if len(battery):
+            found.append(("battery", f"{battery[0]:.0%} → {battery[-1]:.0%}"))
+    if commands is not None:
+        found.append(("commands", str(len(commands))))
+    if frames:
+        found.append(("frames", str(frames)))
+    return found
+
+
+# Key frames -----------------------------------------------------------------------------------------------------
+
+
+def moments(first_s: float, last_s: float, events: Table | None, most: int) -> list[tuple[float, str]]:
+    """Select times to show, in order, each with the reason: up to half at events, the others evenly. Pure."""
+    if most < 1 or last_s < first_s:
+        return []
+    chosen: list[tuple[float, str]] = []
+    if events is not None:
+        rows = zip(events.numbers("t_s"), events["kind"], events["severity"], events["text"], strict=True)
+        candidates = [
+            (float(t), str(text))
+            for t, kind, severity, text in rows
+            if first_s <= t <= last_s and (kind in _TELLING or severity != "info")
+        ]
+        step = max(1, -(-len(candidates) // max(1, most // 2)))
+        chosen = candidates[::step]
+    even = np.linspace(first_s, last_s, most)
+    distance = (last_s - first_s) / max(1, most - 1)
+    for t in even:
+        if len(chosen) < most and all(abs(t - other) > _NEAR * distance for other, _ in chosen):
+            chosen.append((float(t), ""))
+    return sorted(chosen)
+
+
+def figures(recording: Recording, drone: str, camera: str, frames: Table, events: Table | None, most: int) -> list[str]:
+    """Return thumbnails as HTML, each of the first frame from its moment on."""
+    t_s, seq = frames.numbers("t_s"), frames["seq"]
+    wanted: dict[int, tuple[float, str]] = {}
+    for moment, why in moments(float(t_s[0]), float(t_s[-1]), events, most):
+        index = min(int(np.searchsorted(t_s, moment - 1e-9)), len(t_s) - 1)
+        wanted.setdefault(int(seq[index]), (float(t_s[index]), why))
+    shown = []
+    for picture in recording.pictures(drone, camera):
+        found = wanted.pop(picture.header.seq, None)
+        if found is not None:
+            shown.append(_figure(picture, *found))
+        if not wanted:
+            break
+    return [figure for figure in shown if figure]
+
+
+def _figure(picture: Picture, t_s: float, why: str) -> str:
+    data, form = thumbnail(picture)
+    if not data:
+        return ""
+    source = f"data:image/{form};base64,{base64.b64encode(data).decode()}"
+    text = escape(why) or f"frame {picture.header.seq}"
+    caption = f"<figcaption><b>{t_s:.1f} s</b> {text}</figcaption>"
+    return f'<figure><img src="{source}" alt="frame at {t_s:.1f} s">{caption}</figure>'
+
+
+def thumbnail(picture: Picture) -> tuple[bytes, str]:
+    """Return a small image and its format.
+
+    It is as recorded where it can't be scaled here, and empty if it is damaged, or H.264 that can't be decoded here.
+    """
+    try:
+        image = picture.pixels()
+    except MissingExtraError:
+        return (b"", "") if picture.record.format == H264 else (picture.compressed, picture.record.format)
+    except FileFormatError:
+        return b"", ""
+    import cv2
+
+    height, width = image.shape[:2]
+    shown: Any = image
+    if width > _WIDTH:
+        shown = cv2.resize(image, (_WIDTH, round(height * _WIDTH / width)), interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return (bytes(data), "jpeg") if done else (b"", "")

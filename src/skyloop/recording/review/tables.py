@@ -116,17 +116,7 @@ def tables(
     channels: Collection[Channel] = tuple(Channel),
     progress: Progress | None = None,
 ) -> dict[str, Table]:
-    """Read the tables of a drone.
-
-    Args:
-        recording: The recording.
-        drone: The drone's name.
-        channels: Which ones.
-        progress: Called with the share that was read, 0 to 1.
-
-    Returns:
-        By name (``feedback``, ``commands``, ``frames.CAMERA`` …), in the order of the channels; without empty ones.
-    """
+    """Read the tables of a drone, by name (``feedback``, ``frames.CAMERA`` …) in the order of the channels."""
     builders: dict[str, _Builder] = {}
     for item, at_ns, first_ns in timed(recording, drone, channels, progress):
         name = item.channel.value + (f".{item.camera}" if item.camera else "")
@@ -254,9 +244,6 @@ def export_csv(found: dict[str, Table], folder: Path) -> list[Path]:
 
     A text that a spreadsheet would take for a formula gets an apostrophe before it, because applications, and those who
     made the file, choose such texts.
-
-    Returns:
-        The files.
     """
     _make_folder(folder)
     written = []
@@ -273,9 +260,6 @@ def export_csv(found: dict[str, Table], folder: Path) -> list[Path]:
 
 def export_parquet(found: dict[str, Table], folder: Path) -> list[Path]:
     """Write ``CHANNEL.parquet`` for each table; what is not known is null.
-
-    Returns:
-        The files.
 
     Raises:
         MissingExtraError: PyArrow is not installed.
@@ -297,15 +281,7 @@ def export_parquet(found: dict[str, Table], folder: Path) -> list[Path]:
 
 
 def export_npz(found: dict[str, Table], path: Path) -> list[Path]:
-    """Write one compressed ``.npz`` with an array ``CHANNEL/COLUMN`` for each column.
-
-    Args:
-        found: Tables by their names.
-        path: Gets the ending ``.npz`` if it has another one.
-
-    Returns:
-        The file.
-    """
+    """Write one compressed ``.npz``, whose ending the path gets, with an array ``CHANNEL/COLUMN`` for each column."""
     arrays = {f"{name}/{column}": values for name, table in found.items() for column, values in table.columns.items()}
     path = path if path.suffix == ".npz" else path.with_suffix(".npz")
     with replacing(path) as part:
@@ -317,12 +293,6 @@ def read(
     recording: Recording, drone: str, channels: Collection[Channel] | None, progress: Progress | None = None
 ) -> dict[str, Table]:
     """Read the tables to export.
-
-    Args:
-        recording: The recording.
-        drone: The drone's name.
-        channels: Which ones; None reads all.
-        progress: Called with the share that was read, 0 to 1.
 
     Raises:
         FileFormatError: The recording has none of these channels.

@@ -132,12 +132,7 @@ def _images(pictures: Iterator[Picture]) -> Iterator[tuple[int, NDArray[np.uint8
 
 
 class _Encoder:
-    """Encodes frames of the first one's size into a video.
-
-    Args:
-        container: PyAV's.
-        begin_ns: From when the time counts that is burnt in; None to burn in none.
-    """
+    """Encodes frames of the first one's size, and burns in the time since ``begin_ns`` (None: no time)."""
 
     def __init__(self, container: Any, begin_ns: int | None) -> None:
         self._container = container
