@@ -203,7 +203,8 @@ class TargetFollower(AirframeLaw):
             if frame.captured_ns > state.captured_ns:
                 state = msgspec.structs.replace(state, yaw_rad=motion.yaw)
         size = (frame.shape[1], frame.shape[0])
-        view = Camera.at(self._camera, state, body, frame.intrinsics, size, rates)
+        risen_m = None if self._relative else float(motion.position[2])
+        view = Camera.at(self._camera, state, body, frame.intrinsics, size, rates, risen_m)
         if view is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
         if self._finder is None:
