@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 from collections.abc import Callable
 from contextlib import suppress
@@ -31,6 +32,7 @@ RECORDINGS: Final = ("replay:", "video:")  #: how addresses of what was recorded
 SHOWN_S: Final = 8.0  #: for the vehicle to show that its motors are stopped: as long as the stop may be repeated
 STOPPER: Final = "cockpit stop"  #: the application that sends emergency stops, and nothing else
 RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
+_log = logging.getLogger(__name__)
 
 
 class FlyingSession(Protocol):
@@ -224,7 +226,10 @@ class Station:
         self._stops += 1
         try:
             for session in self.sessions:
-                session.stand_down("the motors were stopped")
+                try:
+                    session.stand_down("the motors were stopped")
+                except Exception:  # noqa: BLE001  (whatever is wrong with one page, the motors are stopped)
+                    _log.exception("%s could not stand down", session.app)
             stopper = await self._send_stop(until_ns)
             sent()
             await asyncio.to_thread(_wait_until_stopped, stopper, stopper.now_ns)
