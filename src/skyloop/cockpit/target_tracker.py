@@ -18,7 +18,7 @@ import numpy as np
 
 from skyloop.client.frame import Arrival, compressed
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.control.follow_target import detections_of
+from skyloop.control.target_follower import detections_of
 from skyloop.errors import DecodeError, MissingExtraError, RefusedError, SkyloopError, UsageError
 from skyloop.estimation import assignment
 from skyloop.messages import Text
