@@ -64,8 +64,8 @@ from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError,
 from skyloop.messages import Fate, FlightState, Land, Takeoff
 
 if TYPE_CHECKING:
-    from skyloop.cockpit.pilot_connection import PilotConnection
     from skyloop.cockpit.station import Station
+    from skyloop.cockpit.takeover import PilotConnection
     from skyloop.control.waypoint import Waypoint
     from skyloop.messages import Event
 

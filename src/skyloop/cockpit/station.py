@@ -22,7 +22,7 @@ from skyloop.messages import EventKind, FlightState
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.cockpit.pilot_connection import PilotConnection
+    from skyloop.cockpit.takeover import PilotConnection
     from skyloop.messages import Feedback
 
 TELEMETRY_HZ: Final = 18.0
@@ -173,7 +173,7 @@ class Station:
         Raises:
             SkyloopError: It can't be opened within :data:`PILOT_S`.
         """
-        from skyloop.cockpit.pilot_connection import PilotConnection
+        from skyloop.cockpit.takeover import PilotConnection
 
         def connect() -> PilotConnection:
             return PilotConnection.open(self.found.dial, app, PILOT_S)
