@@ -104,13 +104,7 @@ class PlaceFlight:
         return self._job is not None
 
     def watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
-        """Watch a flight that was commanded.
-
-        Args:
-            command: The page's.
-            pilot: Holds the authority.
-            leg: The flight.
-        """
+        """Watch a flight that was commanded."""
         self.cancel()
         self._station.goals[self._app] = leg.goal
         self._job = asyncio.create_task(self._watch(command, pilot, leg))

@@ -107,11 +107,6 @@ class SmallVideoSender:
 
     The next message is sent when the page has drawn the one before: a slow page gets fewer frames, never older ones,
     and holds nobody else up.
-
-    Args:
-        socket: Accepted already.
-        stations: All drones, by name.
-        counts: Of all pages.
     """
 
     def __init__(self, socket: WebSocket, stations: Mapping[str, Station], counts: PageCounts) -> None:

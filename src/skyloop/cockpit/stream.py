@@ -44,14 +44,7 @@ class PageCounts:
 
 
 class VideoSender:
-    """Sends one camera to one page until the page goes away: as JPEGs, or as H.264 to a page that decodes it.
-
-    Args:
-        socket: Accepted already.
-        station: The drone.
-        feed: The camera.
-        counts: Of all pages.
-    """
+    """Sends one camera to one page until the page goes away: as JPEGs, or as H.264 to a page that decodes it."""
 
     def __init__(self, socket: WebSocket, station: Station, feed: CameraFeed, counts: PageCounts) -> None:
         self._socket = socket
@@ -205,12 +198,7 @@ class VideoSender:
 
 
 class BroadcastSender:
-    """Sends the messages of a broadcast to one page until the page goes away.
-
-    Args:
-        socket: Accepted already.
-        broadcast: Makes the messages.
-    """
+    """Sends the messages of a broadcast to one page until the page goes away."""
 
     def __init__(self, socket: WebSocket, broadcast: PeriodicBroadcast) -> None:
         self._socket = socket
@@ -249,12 +237,7 @@ class BroadcastSender:
 
 
 class TelemetrySender(BroadcastSender):
-    """Sends a drone's state and events; before them the vehicle, whenever it is another one.
-
-    Args:
-        socket: Accepted already.
-        station: The drone.
-    """
+    """Sends a drone's state and events; before them the vehicle, whenever it is another one."""
 
     def __init__(self, socket: WebSocket, station: Station) -> None:
         super().__init__(socket, station.broadcast)
@@ -275,11 +258,7 @@ class TelemetrySender(BroadcastSender):
 
 
 class PageSocket:
-    """Sends messages to one page, and passes on the commands that it sends. On the event loop.
-
-    Args:
-        socket: Accepted already.
-    """
+    """Sends messages to one page, and passes on the commands that it sends. On the event loop."""
 
     def __init__(self, socket: WebSocket) -> None:
         self._socket = socket

@@ -245,10 +245,6 @@ class QueueTracker:
     def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
         """Return the position in the queue.
 
-        Args:
-            status: The connection's.
-            now_ns: The monotonic clock.
-
         Returns:
             None for who does not wait. It is equal to the last one until the status changes.
         """

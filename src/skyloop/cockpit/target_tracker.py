@@ -74,9 +74,6 @@ class KeptFrames:
     def find(self, captured_ns: int) -> Arrival:
         """Return the frame of that capture.
 
-        Args:
-            captured_ns: On the proxy's clock.
-
         Raises:
             RefusedError: It is not kept; the message says why.
         """

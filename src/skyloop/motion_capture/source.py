@@ -357,9 +357,6 @@ class ChildSource:
     def start(self, timeout_s: float) -> None:
         """Start the child, and wait for the first frame.
 
-        Args:
-            timeout_s: How long to wait.
-
         Raises:
             LinkError: No frame came within that time.
             MissingExtraError: The ``motioncapture`` package is not installed.
