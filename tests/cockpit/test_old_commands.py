@@ -31,8 +31,8 @@ from skyloop.cockpit.commands import (
     untimely,
 )
 from skyloop.cockpit.control_session import ControlSession
+from skyloop.cockpit.station import PilotConnection
 from skyloop.cockpit.stream import PageSocket
-from skyloop.cockpit.takeover import PilotConnection
 from skyloop.messages import (
     EmergencyStop,
     Event,

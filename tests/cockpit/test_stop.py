@@ -10,7 +10,7 @@ import pytest
 
 from skyloop.cockpit import station
 from skyloop.cockpit.control_session import ControlSession
-from skyloop.cockpit.takeover import PilotConnection
+from skyloop.cockpit.station import PilotConnection
 from skyloop.errors import DriverError, UnsupportedError
 from skyloop.messages import AnyAction, EmergencyStop, Fate, FlightState, Hover, Outcome, Refusal, Velocity
 from tests.cockpit.fake import Node, open_socket, until

@@ -13,7 +13,8 @@ from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.drone import open_drone
 from skyloop.cockpit import takeover
 from skyloop.cockpit.commands import decode_command
-from skyloop.cockpit.takeover import PilotConnection, QueuePosition, QueueTracker, TakeoverQuestions
+from skyloop.cockpit.station import PilotConnection
+from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
 from skyloop.errors import DecodeError
 from skyloop.messages import Event, EventKind, FlightState
 from tests.cockpit.fake import Node, until

@@ -9,8 +9,8 @@ observes; a page that takes control gets a pilot's connection of its own for as 
   stops all drones; ``feeds`` bring what the client delivers onto the event loop, ``encoded_feed`` pictures and H.264 as
   it comes, of which ``page_stream`` chooses what a page gets; ``telemetry`` is the view model; ``stream`` sends, one
   object per open socket;
-- ``control_session`` flies for a page that took control, by ``commands``, through a connection of its own, which
-  ``takeover`` has, with asking for control before it is taken;
+- ``control_session`` flies for a page that took control, by ``commands``, through a connection of its own;
+  ``takeover`` is asking for control before it is taken;
 - ``recordings`` records and replays; ``reports`` makes reports in a child process;
 - ``testing`` is a page without a browser, ``child`` runs the cockpit beside a program;
 - ``static`` is the page itself, built; nothing is fetched from elsewhere.

@@ -28,7 +28,7 @@ from skyloop.vision.tracking import Box, checked_box
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.commands import FollowTarget, SelectTarget, SetFollowMode
-    from skyloop.cockpit.takeover import PilotConnection
+    from skyloop.cockpit.station import PilotConnection
     from skyloop.messages import AnyAction
 
 STOPPED_S: Final = 0.5  #: without a new frame for so long it hovers

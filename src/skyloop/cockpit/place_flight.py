@@ -21,8 +21,7 @@ from skyloop.messages import Feedback, FlightState, Hover, Land, Position, Retur
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.commands import AnyCommand, GoTo
-    from skyloop.cockpit.station import Station
-    from skyloop.cockpit.takeover import PilotConnection
+    from skyloop.cockpit.station import PilotConnection, Station
     from skyloop.control.route import Route
 
 GOTO_M_S: Final = 1.0  #: greatest speed on the way to a place
