@@ -14,7 +14,7 @@ import pytest
 from skyloop.client.frame import Frame
 from skyloop.clock import nanoseconds
 from skyloop.control import ChaseSettings, FollowTarget
-from skyloop.control.chase_law import TargetPhase
+from skyloop.control.chase_settings import TargetPhase
 from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import RangeEstimator, estimator_of
 from skyloop.control.target_view import BoxView, Camera

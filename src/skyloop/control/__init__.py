@@ -2,8 +2,7 @@
 
 from skyloop.control.approach import ApproachMarker, LandOnMarker, OrbitMarker, OrbitPlace
 from skyloop.control.behaviour import Behaviour
-from skyloop.control.chase_law import FollowMode
-from skyloop.control.chase_settings import ChaseSettings
+from skyloop.control.chase_settings import ChaseSettings, FollowMode
 from skyloop.control.controller import Controller, RunSummary
 from skyloop.control.follow import FollowMarker
 from skyloop.control.gates import FIVE_GATES, RACE_GATES, RACE_TRACK, Course, FlyThroughGates, GateKind, course_in

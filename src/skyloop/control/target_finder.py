@@ -401,10 +401,7 @@ class TargetFinder:
             self._twin_ns = at_ns
 
     def _is_expected(self, target: SceneObject, found: SceneObject, mean: float, at_ns: int) -> bool:
-        """Whether a newcomer moves as the target should, as far as its colours leave a doubt.
-
-        If the target is known to have a twin, it must also be about where it should be.
-        """
+        """Whether a newcomer moves as the target should, in doubt; and is where it should be, if that has a twin."""
         assert target.estimator.seen_ns is not None
         expected, is_at = target.estimator.at(at_ns), found.estimator.at(at_ns)
         unseen_s = seconds(at_ns - target.estimator.seen_ns)
