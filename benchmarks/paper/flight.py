@@ -22,7 +22,7 @@ from skyloop.control.path_following import Waypoints
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
-    from skyloop.control.position import Fix, PositionSource
+    from skyloop.control.waypoint import Fix, PositionSource
     from skyloop.messages import Feedback
 
 FLUSH_S: Final = 1.0

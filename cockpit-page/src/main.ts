@@ -34,7 +34,7 @@ import { RecordingList } from "./recordings.js";
 import { isRecording, Safety } from "./safety.js";
 import { SettingsDialog } from "./settingsdialog.js";
 import { LastingSocket } from "./socket.js";
-import { followTheme } from "./theme.js";
+import { followTheme } from "./settings.js";
 import type { Own } from "./tile.js";
 
 const DRAW_MS = 45;

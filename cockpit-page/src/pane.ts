@@ -20,7 +20,7 @@ import { named, t } from "./language/index.js";
 import type { Deed } from "./keys.js";
 import { MapPanel } from "./mappanel.js";
 import type { Alarm, DroneRow, State, Vehicle } from "./model.js";
-import { Parameters } from "./parameters.js";
+import { Parameters, Writes } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
 import { Preflight } from "./preflight.js";
@@ -35,7 +35,6 @@ import { Strip } from "./strip.js";
 import { Thumbs } from "./thumbs.js";
 import { Stage } from "./video.js";
 import { type Body, othersOf, type Scene } from "./world.js";
-import { Writes } from "./writes.js";
 
 export interface PaneHost {
   /** Of the last overview. */

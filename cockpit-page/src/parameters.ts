@@ -1,10 +1,54 @@
 // Parameters: read when they are shown, written with the drone's own answer beside them.
 
-import { get, errorText } from "./api.js";
+import { errorText, get } from "./api.js";
 import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import { plain } from "./format.js";
 import { t } from "./language/index.js";
 import type { Parameter, Value } from "./model.js";
-import { parse, Presses, rangeText, valueText } from "./values.js";
+
+export function valueText(value: Value | null): string {
+  if (value === null) return "–";
+  if (Array.isArray(value)) return value.map((one) => String(one)).join(", ");
+  return String(value);
+}
+
+/** What was written, as the parameter's type; or what is wrong, in words. Ranges are the drone's own affair. */
+export function parse(parameter: Pick<Parameter, "type">, text: string): { value: Value } | { problem: string } {
+  const written = text.trim();
+  if (parameter.type === "text") return { value: text };
+  if (parameter.type === "bool") {
+    return written === "true" || written === "false" ? { value: written === "true" } : { problem: t.parameters.boolNeeded };
+  }
+  const parts = parameter.type === "vector" ? written.split(/\s*,\s*|\s+/) : [written];
+  const numbers = parts.map((one) => (one === "" ? Number.NaN : Number(one)));
+  if (!numbers.every(Number.isFinite)) return { problem: parameter.type === "vector" ? t.parameters.numbersNeeded : t.parameters.numberNeeded };
+  if (parameter.type === "vector") return { value: numbers };
+  const value = numbers[0] as number;
+  if (parameter.type === "int" && !Number.isInteger(value)) return { problem: t.parameters.wholeNeeded };
+  return { value };
+}
+
+/** Presses that come sooner after the one before are one press: a finger that taps twice, or a key that is held [ms]. */
+export const ONE_PRESS_MS = 700;
+
+/** Tells the presses of a button that does something once each time. */
+export class Presses {
+  private newest_ms = Number.NEGATIVE_INFINITY;
+
+  isNew(now_ms: number): boolean {
+    const since_ms = now_ms - this.newest_ms;
+    this.newest_ms = now_ms;
+    return since_ms >= ONE_PRESS_MS;
+  }
+}
+
+export function rangeText(parameter: Pick<Parameter, "minimum" | "maximum" | "choices">): string {
+  if (parameter.choices.length) return parameter.choices.map(valueText).join(" | ");
+  const { minimum, maximum } = parameter;
+  if (minimum !== null && maximum !== null) return `${plain(minimum)} … ${plain(maximum)}`;
+  if (minimum !== null) return `≥ ${plain(minimum)}`;
+  return maximum === null ? "" : `≤ ${plain(maximum)}`;
+}
 
 /** Only some of them: what is said where there are none, and the name of the list. */
 export interface Choice {
@@ -158,4 +202,48 @@ function editorOf(parameter: Parameter): Editor {
   }
   const numeric = parameter.type === "int" || parameter.type === "float";
   return h("input", { ...label, type: "text", inputmode: numeric ? "decimal" : "text", autocomplete: "off", spellcheck: "false", value: valueText(parameter.value) });
+}
+
+const ANSWER_MS = 4000;
+
+export class Writes {
+  private under: { name: string; done: (why: string) => void } | null = null;
+  private last: Promise<unknown> = Promise.resolve();
+
+  constructor(private readonly send: (name: string, value: string | number) => void) {}
+
+  /** Returns why it was refused; empty if it was written. */
+  write(name: string, value: string | number): Promise<string> {
+    const answer = this.last.then(() => this.one(name, value));
+    this.last = answer;
+    return answer;
+  }
+
+  /** The drone's answer. Whether it was to something written here. */
+  done(name: string): boolean {
+    return this.end(this.under?.name === name, "");
+  }
+
+  /** A refusal names no parameter: it is of what is under way. */
+  refused(why: string): boolean {
+    return this.end(this.under !== null, why);
+  }
+
+  private end(mine: boolean, why: string): boolean {
+    if (mine) this.under?.done(why);
+    return mine;
+  }
+
+  private one(name: string, value: string | number): Promise<string> {
+    return new Promise((resolve) => {
+      const late = setTimeout(() => this.under?.done(t.parameters.noAnswer), ANSWER_MS);
+      const done = (why: string): void => {
+        clearTimeout(late);
+        this.under = null;
+        resolve(why);
+      };
+      this.under = { name, done };
+      this.send(name, value);
+    });
+  }
 }

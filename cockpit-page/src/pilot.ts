@@ -42,6 +42,7 @@ export class Pilot {
   /** How this page lost the control that it had; it stays until the person takes control or puts it away. */
   ended = "";
   private flight = 0; // the number of what took the place of what this page had under way
+  private replaced: { going: boolean; following: boolean } | null = null; // which flies on if that is refused; null once the cockpit has it
   private steering = false;
   private stopping = false; // the emergency stop is not shown by the vehicle yet, or no round of the sticks has seen it
   private stopped = false; // it is answered: the next round ends it
@@ -208,10 +209,14 @@ export class Pilot {
 
   /** Send what takes the place of what this page has under way: if it can't be sent, that ends all the same. */
   private replace(command: Command): boolean {
-    if (this.commands.canSend(command)) this.end();
+    const { going, following } = this;
+    const can = this.commands.canSend(command);
+    if (can) this.end();
     else this.rest();
+    this.replaced = null;
     const sent = this.send(command);
     this.flight = this.commands.newest;
+    if (can) this.replaced = { going, following };
     return sent;
   }
 
@@ -228,6 +233,7 @@ export class Pilot {
     if (!open && this.mine) this.ended = t.pilot.broke;
     this.connected = open;
     this.stopping = this.stopped = false;
+    this.replaced = null;
     this.end();
     this.authority = NOBODY;
     this.questions = [];
@@ -239,6 +245,11 @@ export class Pilot {
   private refused(command: string, why: string, n: number): void {
     if (command === "stop") this.stopped = true;
     if (["goto", "route", "return", "follow_mode"].includes(command) && this.isNewest(n)) this.end(); // sticks fly on until they are let go
+    if (n === this.flight && this.replaced) {
+      this.going ||= this.replaced.going;
+      this.following ||= this.replaced.following;
+      this.replaced = null;
+    }
     this.listener.refused(command, why);
   }
 
@@ -262,6 +273,8 @@ export class Pilot {
     } else if (message.type === "follow") {
       this.following = message.state === "flying" || message.state === "waiting";
       this.listener.follow?.(message);
+    } else if (message.type === "sent") {
+      if (message.n === this.flight) this.replaced = null;
     } else if (message.type === "done") {
       if (message.do === "stop") this.stopped = true;
       if ((message.do === "goto" || message.do === "return") && this.isNewest(message.n)) this.going = false;

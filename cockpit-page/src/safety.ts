@@ -2,7 +2,7 @@
 
 import type { ServerClock } from "./clock.js";
 import { type Answer, CommandSender, type CommandSocket, type Result } from "./commands.js";
-import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { type Countdown, type Deadly, holdButton } from "./hold.js";
 import { t } from "./language/index.js";
 import type { DroneRow } from "./model.js";
@@ -116,7 +116,8 @@ export class Safety {
 
   private every(deed: Deed): Deadly {
     const count = this.flying;
-    const which = count === 1 ? t.safety.theOnly : t.safety.allOf(count);
+    // Whoever holds it before this page knows a drone is not kept from it: the cockpit knows them, and says if there are none.
+    const which = count === 0 ? t.safety.every : count === 1 ? t.safety.theOnly : t.safety.allOf(count);
     return { what: deed === "land_all" ? t.safety.landThese(which) : t.safety.motorsOff(which), act: () => this.send(deed) };
   }
 
@@ -158,7 +159,6 @@ export class Safety {
     showFate(this.own, this.fate, target?.result ?? null);
     for (const deed of Object.keys(this.all) as Deed[]) {
       const { button, fate } = this.all[deed];
-      setDisabled(button, this.flying === 0);
       showFate(button, fate, this.commands.result(deed));
     }
   }

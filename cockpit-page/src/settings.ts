@@ -1,4 +1,5 @@
-// What the person chose for this browser: remembered in it, and the same in all of its tabs.
+// What the person chose for this browser: remembered in it, and the same in all of its tabs. Its colours follow the system, unless
+// the person chose those, too.
 
 import { memory } from "./dom.js";
 
@@ -64,3 +65,16 @@ export class Settings {
 }
 
 export const settings = new Settings(memory);
+
+/** Keeps the page's colours as they are set; `changed` after each change, for what is painted. */
+export function followTheme(changed: () => void): void {
+  const system = window.matchMedia("(prefers-color-scheme: light)");
+  const apply = (): void => {
+    const chosen = settings.get("theme");
+    document.documentElement.dataset["theme"] = chosen === "system" ? (system.matches ? "light" : "dark") : chosen;
+    changed();
+  };
+  apply();
+  system.addEventListener("change", apply);
+  settings.on("theme", apply);
+}

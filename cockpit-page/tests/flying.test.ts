@@ -80,3 +80,28 @@ test("an Enter that is held presses what it moved the focus to no more: a place 
   Object.assign(document, { activeElement: { matches: (what: string) => what.includes("textarea"), dataset: {} } });
   assert.equal(prevented({ code: "Enter", repeat: true }), false, "a note has as many lines as are typed");
 });
+
+test("a page that stood still, as in the browser's cache, flies nothing that is held, until it was centred", async (context) => {
+  context.mock.timers.enable({ apis: ["setInterval"] });
+  const { pads } = browser();
+  const [{ Flying }, { Hands, isCentred }] = [await import("../src/flying.js"), await import("../src/sticks.js")];
+  const told: string[] = [];
+  let now_ms = 1000;
+  context.mock.method(performance, "now", () => now_ms);
+  const pilot = { isFlyable: true, mine: true, rest: () => told.push("rest"), steer: (sticks: Sticks) => told.push(isCentred(sticks) ? "centred" : "flies") };
+  const flown = { pilot: pilot as never, hands: new Hands(), thumbs: { sticks: { forward: 0, left: 0, up: 0, yaw_rate: 0 }, touches: 0, release: () => undefined }, isStopped: false };
+  new Flying({ flown: () => [flown], selected: () => flown, act: () => undefined, hold: () => undefined, inputs: () => undefined });
+  const push = (forward: number, after_ms: number): void => {
+    now_ms += after_ms;
+    pads[0] = { id: "pad", index: 0, mapping: "standard", connected: true, axes: [0, 0, 0, forward], buttons: Array.from({ length: 17 }, () => ({ pressed: false })) };
+    context.mock.timers.tick(50);
+  };
+  push(0, 50);
+  push(-0.8, 50);
+  push(-0.8, 5000);
+  push(-0.8, 50);
+  assert.deepEqual(told, ["centred", "flies", "rest", "centred", "centred"]);
+  push(0, 50);
+  push(-0.8, 50);
+  assert.equal(told.at(-1), "flies");
+});

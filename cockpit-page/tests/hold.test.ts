@@ -6,6 +6,7 @@ import { ServerClock } from "../src/clock.js";
 import type { CommandSocket } from "../src/commands.js";
 import { Countdown, HOLD_MS, holdButton } from "../src/hold.js";
 import { Safety, type Target } from "../src/safety.js";
+import type { Handlers } from "../src/socket.js";
 
 /** As much of an element as a button needs that is held. */
 class Part extends EventTarget {
@@ -100,11 +101,18 @@ test("a button that is gone holds nothing", () => {
   assert.deepEqual(stopped, []);
 });
 
-function aimed(): Stops & { safety: Safety; target: (name: string) => Target } {
+interface Line extends CommandSocket {
+  isOpen: boolean;
+  handlers: Handlers;
+  sent: Record<string, unknown>[];
+}
+
+function aimed(): Stops & { safety: Safety; target: (name: string) => Target; line: Line } {
   const all = stops();
-  const connect = (): CommandSocket => ({ send: () => true, close: () => undefined, again: () => undefined }) as unknown as CommandSocket;
+  const line: Line = { isOpen: false, handlers: { message: () => undefined }, sent: [], send: (message) => line.isOpen && line.sent.push(message as Record<string, unknown>) > 0, close: () => undefined };
+  const connect = (handlers: Handlers): CommandSocket => Object.assign(line, { handlers });
   const target = (name: string): Target => ({ name, result: null, stop: () => all.stopped.push(name) });
-  return { ...all, safety: new Safety(connect, new ServerClock(), all.countdown), target };
+  return { ...all, safety: new Safety(connect, new ServerClock(), all.countdown), target, line };
 }
 
 test("whatever keys aim at, a drone's own button stops that drone", () => {
@@ -138,4 +146,18 @@ test("keys that are held stop nothing else once another drone is seen, and end o
   safety.hold("one");
   pass(HOLD_MS);
   assert.deepEqual(stopped, ["other", "right"]);
+});
+
+test("Stop all that is held before this page knows a drone, or its cockpit answers, is sent as soon as it can be", () => {
+  const { safety, line } = aimed();
+  const all = made.findLast((part) => part.getAttribute("aria-keyshortcuts") === "Control+Shift+Enter") as Part;
+  safety.know([]);
+  all.tell("pointerdown", FIRST);
+  pass(HOLD_MS);
+  all.tell("pointerup", FIRST);
+  assert.equal((safety.message as unknown as Part).textContent, "Stop all · pending");
+  line.isOpen = true;
+  line.handlers.state?.(true, 0, "");
+  line.handlers.message(JSON.stringify({ type: "pong", n: line.sent.at(-1)?.["n"], now_s: 1000 }));
+  assert.deepEqual(line.sent.map((message) => message["do"]), ["ping", "stop_all"]);
 });

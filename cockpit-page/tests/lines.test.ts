@@ -299,6 +299,29 @@ test("what is to take the place of a flight and can't be sent leaves it hovering
   }
 });
 
+test("what was to take the place of a flight and was refused, as it came too late, leaves it under way: it hovers when the page is left", () => {
+  for (const act of [(pilot: Pilot) => pilot.act("hover"), (pilot: Pilot) => pilot.act("land"), (pilot: Pilot) => pilot.goTo(4, 5, 6), (pilot: Pilot) => pilot.release()]) {
+    const { pilot, sent, receive, live } = flown();
+    live();
+    receive(held(true));
+    pilot.goTo(1, 2, 3);
+    receive({ type: "sent", do: "goto", n: sent.at(-1)?.["n"] });
+    act(pilot);
+    assert.ok(!pilot.following);
+    const { do: what, n } = sent.at(-1) as Sent;
+    receive({ type: "refused", do: what, n, why: "it arrived 0.6 s after it was requested" });
+    assert.ok(pilot.going);
+    pilot.rest();
+    assert.equal(sent.at(-1)?.["automatic"], true);
+    pilot.goTo(1, 2, 3);
+    act(pilot);
+    const last = sent.at(-1) as Sent;
+    receive({ type: "sent", do: last["do"], n: last["n"] });
+    receive({ type: "refused", do: last["do"], n: last["n"], why: "ended on the way" });
+    assert.ok(!pilot.going, "the cockpit had it: what was before is over");
+  }
+});
+
 test("a hover that nobody pressed says so, and sticks say how often hands were seen", () => {
   const { pilot, sent, receive, live } = flown();
   live();

@@ -19,7 +19,7 @@ import { lacking } from "../src/recordings.js";
 import { isRecording, outcome } from "../src/safety.js";
 import { CENTRED, DEAD_BAND, deadBand, Hands, isCentred, Latch, merge, PACES, type Pace, ramp, RAMP_S, scale } from "../src/sticks.js";
 import { lineText, nowText } from "../src/strip.js";
-import { ONE_PRESS_MS, parse, Presses, rangeText } from "../src/values.js";
+import { ONE_PRESS_MS, parse, Presses, rangeText } from "../src/parameters.js";
 import { othersOf } from "../src/world.js";
 import { around, gridStep, toMetres, toPixels, zoomed } from "../src/view.js";
 import { arrow, nearest } from "../src/maptool.js";

@@ -2,10 +2,10 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { corners, hull, rayEnd, turned } from "../src/geometry.js";
+import { corners, hull, rayEnd, turned } from "../src/worldlayer.js";
 import type { Zone } from "../src/surroundings.js";
 import { type Finding, TakeOffQuestion } from "../src/preflight.js";
-import { Writes } from "../src/writes.js";
+import { Writes } from "../src/parameters.js";
 import { type Bounds, fields, handles, rectangle, round, writes, zoneAt, zoneName, zonesText } from "../src/zones.js";
 
 const near = (is: readonly number[], should: readonly number[]): void => should.forEach((value, place) => assert.ok(Math.abs((is[place] as number) - value) < 1e-9, `${is} is not ${should}`));

@@ -18,7 +18,7 @@ from benchmarks.paper import evaluation, report
 from benchmarks.paper.evaluation import RECORDER, Experiment, distances_to_round, evaluate, numbered
 from benchmarks.paper.flight import PaperFlight
 from benchmarks.paper.marks import CORNERS
-from skyloop.control.position import Fix, fix_of
+from skyloop.control.waypoint import Fix, fix_of
 from skyloop.errors import FileFormatError
 from skyloop.transport.testing import wait_until
 from tests.support.commands import Running

@@ -14,7 +14,7 @@ from skyloop.client import AuthorityStatus, Drone
 from skyloop.cockpit.commands import decode_command
 from skyloop.cockpit.control_session import SILENT_S
 from skyloop.cockpit.fleet import Fleet
-from skyloop.cockpit.pilot_connection import PilotConnection
+from skyloop.cockpit.station import PilotConnection
 from skyloop.control import Controller
 from skyloop.control.follow import FollowMarker
 from skyloop.errors import DecodeError, RefusedError

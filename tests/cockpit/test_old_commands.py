@@ -31,7 +31,7 @@ from skyloop.cockpit.commands import (
     untimely,
 )
 from skyloop.cockpit.control_session import ControlSession
-from skyloop.cockpit.pilot_connection import PilotConnection
+from skyloop.cockpit.station import PilotConnection
 from skyloop.cockpit.stream import PageSocket
 from skyloop.messages import (
     EmergencyStop,

@@ -11,9 +11,9 @@ import pytest
 
 from skyloop.cockpit import control_session
 from skyloop.cockpit.fleet import Fleet
-from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.routes import MOST_CHECKED, CheckedRoutes, RouteFiles
+from skyloop.cockpit.station import PilotConnection
 from skyloop.control.route import Conditions, Route, RouteWaypoint, check_route
 from skyloop.errors import RefusedError, UnknownNameError, UsageError
 from skyloop.messages import AnyAction, FlightState, Hover

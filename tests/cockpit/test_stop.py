@@ -9,7 +9,8 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.cockpit import station
-from skyloop.cockpit.pilot_connection import PilotConnection
+from skyloop.cockpit.control_session import ControlSession
+from skyloop.cockpit.station import PilotConnection
 from skyloop.errors import DriverError, UnsupportedError
 from skyloop.messages import AnyAction, EmergencyStop, Fate, FlightState, Hover, Outcome, Refusal, Velocity
 from tests.support.cockpit import Node, open_socket, until
@@ -110,6 +111,21 @@ def test_a_stop_of_all_silences_the_sticks_of_every_page(client: TestClient, nod
             everybody.wait("each", drone="alpha", state="done")
             assert node.flyer.state is FlightState.EMERGENCY
     assert count(node, EmergencyStop()) >= 1
+
+
+def test_a_fault_in_what_a_page_flies_keeps_no_stop_away(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: ControlSession, why: str) -> None:
+        raise ZeroDivisionError(why)
+
+    with page(client) as pilot, open_socket(client, "control") as socket:
+        pilot.take().take_off()
+        monkeypatch.setattr(ControlSession, "stand_down", fail)
+        everybody = Page(socket)
+        everybody.say("stop_all")
+        everybody.wait("each", drone="alpha", state="done")
+        assert node.flyer.state is FlightState.EMERGENCY
 
 
 def test_a_stop_that_the_vehicle_refuses_is_told_with_its_reason(

@@ -13,7 +13,7 @@ from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.drone import open_drone
 from skyloop.cockpit import takeover
 from skyloop.cockpit.commands import decode_command
-from skyloop.cockpit.pilot_connection import PilotConnection
+from skyloop.cockpit.station import PilotConnection
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
 from skyloop.errors import DecodeError
 from skyloop.messages import Event, EventKind, FlightState

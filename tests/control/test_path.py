@@ -9,8 +9,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from skyloop.control.motion_profile import MotionProfile
-from skyloop.control.path import Circle, FunctionPath, Lemniscate, Path, Polyline, Spline
+from skyloop.control.path import Circle, FunctionPath, Lemniscate, MotionProfile, Path, Polyline, Spline
 from skyloop.errors import UsageError
 
 SQUARE = [(0, 0, 1), (2, 0, 1), (2, 2, 1), (0, 2, 1), (0, 0, 1)]

@@ -15,7 +15,7 @@ from skyloop.control.limiting import SetpointLimits
 from skyloop.control.path import Circle, Polyline
 from skyloop.control.path_law import AlongPath, FixedYaw, LookAt, PathLaw, PathSettings
 from skyloop.control.pid import Gains
-from skyloop.control.position import Fix, fix_of
+from skyloop.control.waypoint import Fix, fix_of
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, Velocity
 

@@ -14,7 +14,7 @@ import pytest
 from skyloop.client.frame import Frame
 from skyloop.clock import nanoseconds
 from skyloop.control import ChaseSettings, FollowTarget
-from skyloop.control.chase_law import TargetPhase
+from skyloop.control.chase_settings import TargetPhase
 from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import RangeEstimator, estimator_of
 from skyloop.control.target_view import BoxView, Camera
@@ -54,6 +54,7 @@ class Watching:
         self.at_s, self._z, self._speed = 0.0, z, speed_m_s
         self._rng, self._error = np.random.default_rng(seed), np.zeros(2)
         self.misread = still  # by how much its altimeter is wrong [m], by the time [s]
+        self.strayed: Callable[[float], float] | None = None  # the same of its velocity, added up; None: unknown
 
     def view(self, up_m: float) -> tuple[BoxView, Camera]:
         self._error = 0.9 * self._error + self._rng.normal(0.0, 0.44, 2)
@@ -65,7 +66,9 @@ class Watching:
         up, down = (self._error * (0.5 + 0.03 * height)).tolist()
         view = BoxView.of((x, y + up, width, height - up + down), camera, 0.06)
         assert view is not None
-        return view, replace(camera, position=np.add(camera.position, (0.0, 0.0, self.misread(self.at_s))))
+        rise_m = None if self.strayed is None else up_m + self.strayed(self.at_s)
+        position = np.add(camera.position, (0.0, 0.0, self.misread(self.at_s)))
+        return view, replace(camera, position=position, rise_m=rise_m)
 
     def run(self, seconds: float, motion: Callable[[float], float] = still) -> TargetState:
         for _ in range(round(seconds / PERIOD_S)):
@@ -145,6 +148,41 @@ def test_a_jump_of_the_altimeter_is_no_motion_that_shows_the_range(misread: Call
         assert not watching.run(0.5).range_known
     found = watching.run(4.0, bobbing)
     assert not found.range_known or found.range_m == pytest.approx(PICTURE[0], rel=0.4)
+
+
+@pytest.mark.parametrize("ramp_m_s", [-0.3, -0.2, -0.1, 0.05, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize("thing", [PICTURE, PERSON], ids=["picture", "person"])
+def test_a_slow_drift_of_the_altimeter_is_no_motion_that_shows_the_range(
+    thing: tuple[float, float, float], ramp_m_s: float
+) -> None:
+    """Where the ground rises or falls, or the altimeter drifts: a picture 3.5 m away was known to be 16 m away."""
+    watching = Watching(thing, z=2.1 if thing is PICTURE else 1.2)
+    watching.strayed = lambda at_s: 0.015 * at_s
+    watching.misread = lambda at_s: ramp_m_s * max(0.0, at_s - 1.0) if at_s < 8.0 else 7.0 * ramp_m_s
+    for _ in range(16):
+        assert not watching.run(0.5).range_known, "it has not moved"
+    found = watching.run(8.0, bobbing)
+    assert not found.range_known or found.range_m == pytest.approx(thing[0], rel=0.4)
+
+
+@pytest.mark.parametrize("thing", [PICTURE, PERSON], ids=["picture", "person"])
+@pytest.mark.parametrize("drift_m_s", [-0.04, 0.04])
+def test_a_climb_that_is_known_with_an_error_shows_the_range_all_the_same(
+    thing: tuple[float, float, float], drift_m_s: float
+) -> None:
+    watching = Watching(thing, z=2.1 if thing is PICTURE else 1.2)
+    watching.strayed = lambda at_s: drift_m_s * at_s
+    found = watching.run(12.0, bobbing)
+    assert found.range_known
+    assert found.range_m == pytest.approx(thing[0], rel=0.4)
+
+
+def test_a_climb_that_is_added_up_anew_is_no_motion_that_shows_the_range() -> None:
+    """As after states that were stamped ahead."""
+    watching = Watching(PICTURE)
+    watching.strayed = lambda at_s: -4.0 * (at_s > 12.0)
+    assert watching.run(12.0, bobbing).range_known
+    assert not watching.run(1.0).range_known
 
 
 def test_what_hangs_above_the_vehicle_does_not_stand_on_the_ground() -> None:

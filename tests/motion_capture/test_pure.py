@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.motion_capture import BodyPose, TrackState, calibrate, parse_system
-from skyloop.motion_capture.pose import Quaternion, Vector, matrix, mean_quaternion, multiply, plausible, z_up
-from skyloop.motion_capture.tracking import Track
-from skyloop.motion_capture.worker import LENGTH, RawFrame, read, write
+from skyloop.motion_capture.pose import Quaternion, Track, Vector, matrix, mean_quaternion, multiply, plausible, z_up
+from skyloop.motion_capture.source import LENGTH, RawFrame, read, write
 
 MS = 1_000_000
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)

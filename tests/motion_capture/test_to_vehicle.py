@@ -13,7 +13,7 @@ import skyloop
 from skyloop.clock import monotonic_ns
 from skyloop.errors import AuthorityError, UsageError
 from skyloop.motion_capture import MotionCapture, parse_system
-from skyloop.motion_capture.worker import RawFrame
+from skyloop.motion_capture.source import RawFrame
 from skyloop.transport.testing import wait_until
 
 pytest.importorskip("pymavlink", reason="needs pymavlink: skyloop install mavlink")

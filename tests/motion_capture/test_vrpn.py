@@ -17,9 +17,8 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.motion_capture import BodyPose, TrackEvent, TrackState, mocap, parse_system
 from skyloop.motion_capture import vrpn as client
 from skyloop.motion_capture.capture import MAX_UNKNOWN, MotionCapture
-from skyloop.motion_capture.source import ChildSource
+from skyloop.motion_capture.source import ChildSource, RawFrame
 from skyloop.motion_capture.vrpn import COOKIE, SETTLE_S, SensorSelection, TrackerPose, split_name
-from skyloop.motion_capture.worker import RawFrame
 from skyloop.transport.testing import wait_until
 from tests.motion_capture import vrpn as server
 from tests.motion_capture.moving import BODIES, pose

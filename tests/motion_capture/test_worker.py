@@ -18,10 +18,9 @@ import pytest
 from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError, MissingExtraError, UsageError
 from skyloop.messages import FlightState
-from skyloop.motion_capture import MotionCapture, TrackState, parse_system, worker
+from skyloop.motion_capture import MotionCapture, TrackState, parse_system
 from skyloop.motion_capture.capture import TrackEvent
-from skyloop.motion_capture.source import ChildSource
-from skyloop.motion_capture.worker import RawFrame, read
+from skyloop.motion_capture.source import MISSING, ChildSource, RawFrame, main, read
 from skyloop.transport.testing import wait_until
 
 SYSTEM = parse_system("vicon://192.0.2.1")
@@ -69,8 +68,8 @@ def test_frames_are_written_until_it_fails(
     module: Any = package(2, error)
     monkeypatch.setitem(sys.modules, "motioncapture", module)
     written: list[bytes] = []
-    monkeypatch.setattr(worker, "open_output", lambda: Collect(written))
-    assert worker.main("vicon", msgspec.json.encode(SYSTEM.configuration).decode()) == code
+    monkeypatch.setattr("skyloop.motion_capture.source.open_output", lambda: Collect(written))
+    assert main("vicon", msgspec.json.encode(SYSTEM.configuration).decode()) == code
     assert module.made == [("vicon", {"hostname": "192.0.2.1"})]
     stream = io.BytesIO(b"".join(written))
     first = read(stream)
@@ -93,7 +92,7 @@ class Collect(io.BytesIO):
 
 def test_without_the_package_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "motioncapture", None)
-    assert worker.main("vicon", "{}") == worker.MISSING
+    assert main("vicon", "{}") == MISSING
 
 
 def source(code: str, taken: list[RawFrame], told: list[str]) -> ChildSource:
@@ -182,7 +181,7 @@ def test_it_may_be_closed_by_its_own_callback() -> None:
 def test_a_child_that_sends_nonsense_is_replaced() -> None:
     told: list[str] = []
     taken: list[RawFrame] = []
-    good = "from skyloop.motion_capture.worker import *; write(sys.stdout.buffer, RawFrame(1, {}));"
+    good = "from skyloop.motion_capture.source import *; write(sys.stdout.buffer, RawFrame(1, {}));"
     failing = source(good + "sys.stdout.buffer.write(b'\\xff' * 9); sys.stdout.flush()", taken, told)
     failing.start(20.0)
     wait_until(lambda: len(taken) >= 2, "a second child was started")

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds
 from skyloop.control.airframe import Motion, TiltVelocity
-from skyloop.control.chase_law import ChaseLaw, FollowMode, TargetPhase
-from skyloop.control.chase_settings import ChaseSettings
+from skyloop.control.chase_law import ChaseLaw
+from skyloop.control.chase_settings import ChaseSettings, FollowMode, TargetPhase
 from skyloop.control.target_estimate import TRAITS, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import estimator_of
 from skyloop.control.target_view import BoxView, Camera

@@ -472,6 +472,7 @@ export const en = {
     holdAll: "Press and hold: of all drones",
     emergency: "Emergency: press and hold",
     aimless: "No drone that flies is opened and seen here: hold Stop all, or open one",
+    every: "all drones",
     theOnly: "the only drone",
     landThese: (which: string) => `Land ${which}`,
     allOf: (count: number) => `all ${count} drones`,

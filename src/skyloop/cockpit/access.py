@@ -192,12 +192,7 @@ class Pairing:
             self.on_expired()
 
     def person(self, code: str, address: str) -> Person | None:
-        """Return who sent a code, and use it up; None if it is not the one that works.
-
-        Args:
-            code: The code.
-            address: From where it came.
-        """
+        """Return who sent a code, and use it up; None if it is not the one that works."""
         works = self._code != "" and self._clock() < self._until_ns
         if not works or not hmac.compare_digest(self._code.encode(), code.encode()):
             return None

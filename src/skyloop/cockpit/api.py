@@ -83,10 +83,6 @@ def answered(handler: Handler) -> Handler:
 async def while_wanted(request: Request, work: Coroutine[Any, Any, T]) -> T:
     """Run work for a request, and cancel it as soon as who asked is gone.
 
-    Args:
-        request: The request.
-        work: The work.
-
     Returns:
         What ``work`` returns.
 

@@ -64,8 +64,7 @@ from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError,
 from skyloop.messages import Fate, FlightState, Land, Takeoff
 
 if TYPE_CHECKING:
-    from skyloop.cockpit.pilot_connection import PilotConnection
-    from skyloop.cockpit.station import Station
+    from skyloop.cockpit.station import PilotConnection, Station
     from skyloop.control.waypoint import Waypoint
     from skyloop.messages import Event
 

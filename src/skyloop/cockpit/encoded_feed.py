@@ -14,7 +14,7 @@ import threading
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
 
@@ -51,12 +51,18 @@ BITS: Final = 0.12  #: for a pixel of a picture that moves
 _FPS: Final = 30.0  # of a camera that doesn't say
 
 
+P = TypeVar("P")
+
+
 @dataclass(frozen=True, slots=True)
-class NumberedFrame:
-    """One frame on its way to pages; ``serial`` counts the frames of this process, across restarts of the proxy."""
+class Numbered(Generic[P]):
+    """A picture on its way to pages. Its number counts those of this process, across restarts of the proxy.
+
+    Of H.264 it grows by one where the picture follows the one before.
+    """
 
     serial: int
-    frame: Frame
+    picture: P
 
 
 class CameraFeed:
@@ -70,7 +76,7 @@ class CameraFeed:
 
     def __init__(self, drone: Drone, camera: str, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
-        self.newest: NumberedFrame | None = None
+        self.newest: Numbered[Frame] | None = None
         self.encoded = 0  #: frames that were made a JPEG
         self._drone = drone
         self._clock = clock
@@ -110,13 +116,13 @@ class CameraFeed:
         """
         if self._listener is None or not self._serial:
             return None
-        return seconds(self._clock() - self._since_ns) if self.newest is None else self.newest.frame.age_s
+        return seconds(self._clock() - self._since_ns) if self.newest is None else self.newest.picture.age_s
 
-    async def jpeg(self, picture: NumberedFrame) -> bytes:
+    async def jpeg(self, picture: Numbered[Frame]) -> bytes:
         """Return the picture as a JPEG file; it is encoded once for all pages, on a thread."""
         if self._jpeg is None or self._jpeg[0] != picture.serial:
             loop = asyncio.get_running_loop()
-            self._jpeg = picture.serial, loop.run_in_executor(_ENCODER, to_jpeg, picture.frame)
+            self._jpeg = picture.serial, loop.run_in_executor(_ENCODER, to_jpeg, picture.picture)
             self.encoded += 1
         return await asyncio.shield(self._jpeg[1])
 
@@ -130,7 +136,7 @@ class CameraFeed:
         if self._listener is None:  # cancelled while this was on its way
             return
         self._serial += 1
-        self.newest = NumberedFrame(self._serial, frame)
+        self.newest = Numbered(self._serial, frame)
         for wake in self._wakes:
             wake()
 
@@ -294,14 +300,6 @@ def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Fo
     return Form(next((rate for rate in RATES if rate >= good_kbit_s), RATES[-1]), scale, max_fps)
 
 
-@dataclass(frozen=True, slots=True)
-class NumberedPicture:
-    """A picture on its way to pages; ``serial`` grows by one where it follows the one before, across restarts of it."""
-
-    serial: int
-    picture: EncodedFrame
-
-
 class EncodedFeed:
     """The newest pictures of one form, while a page wants them. Made and used on the event loop.
 
@@ -326,7 +324,7 @@ class EncodedFeed:
         self._serial = 0
         self._lock = threading.Lock()  # guards the following
         self._wakes: dict[object, Wake | None] = {}  # by page
-        self._pictures: deque[NumberedPicture] = deque(maxlen=KEPT)
+        self._pictures: deque[Numbered[EncodedFrame]] = deque(maxlen=KEPT)
 
     @property
     def wanted(self) -> bool:
@@ -399,7 +397,7 @@ class EncodedFeed:
             with self._lock:
                 self._pictures.clear()
 
-    def after(self, serial: int, *, follows: bool) -> tuple[list[NumberedPicture], int]:
+    def after(self, serial: int, *, follows: bool) -> tuple[list[Numbered[EncodedFrame]], int]:
         """Return the pictures that a page is to get next, in order, and how many it misses before them.
 
         Args:
@@ -436,7 +434,7 @@ class EncodedFeed:
         with self._lock:
             last = self._pictures[-1].picture.seq if self._pictures else 0
             self._serial += 1 if picture.seq == last + 1 else 2
-            self._pictures.append(NumberedPicture(self._serial, picture))
+            self._pictures.append(Numbered(self._serial, picture))
             self._came_ns = self._clock()
             wakes = [wake for wake in self._wakes.values() if wake is not None]
         captured_ns = picture.captured_ns - self._drone.clock_offset_ns

@@ -17,8 +17,7 @@ from skyloop.cockpit.feeds import call_soon
 from skyloop.cockpit.place_flight import UP
 from skyloop.cockpit.target_tracker import Follower, FrameKeeper, TargetTracker, TrackReport
 from skyloop.cockpit.telemetry import number, vector
-from skyloop.control.chase_law import FollowMode
-from skyloop.control.chase_settings import ChaseSettings
+from skyloop.control.chase_settings import ChaseSettings, FollowMode
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, LinkError, RefusedError, SkyloopError, UnknownNameError
 from skyloop.messages import CameraInfo, Failsafe, Feedback, FrameHeader, Value
@@ -28,7 +27,7 @@ from skyloop.vision.tracking import Box, checked_box
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.commands import FollowTarget, SelectTarget, SetFollowMode
-    from skyloop.cockpit.pilot_connection import PilotConnection
+    from skyloop.cockpit.station import PilotConnection
     from skyloop.messages import AnyAction
 
 STOPPED_S: Final = 0.5  #: without a new frame for so long it hovers

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.encoded_feed import EncodedFeed, Form, NumberedPicture, form_for
+from skyloop.cockpit.encoded_feed import EncodedFeed, Form, Numbered, form_for
 from skyloop.cockpit.feeds import Wake
 from skyloop.errors import SkyloopError
 from skyloop.messages import CameraInfo, EncodedFrame
@@ -94,7 +94,6 @@ class PagePath:
 class Sent:
     """A picture that a page is to get."""
 
-    serial: int
     picture: EncodedFrame
     form: Form
     age_s: float
@@ -170,9 +169,7 @@ class PageStream:
         now_ns = self._clock() + self._station.drone.clock_offset_ns
         self._late_s = seconds(now_ns - pictures[-1].picture.published_ns)
         form, late = feed.form, self.path.late_here
-        return [
-            Sent(one.serial, one.picture, form, seconds(now_ns - one.picture.captured_ns), late) for one in pictures
-        ]
+        return [Sent(one.picture, form, seconds(now_ns - one.picture.captured_ns), late) for one in pictures]
 
     def sent(self, number: int, one: Sent) -> None:
         """Note under which number a picture that was taken is sent."""
@@ -203,7 +200,7 @@ class PageStream:
             self._station.free_name(self._name)
             self._name = ""
 
-    def _ready(self, feed: EncodedFeed, serial: int) -> list[NumberedPicture]:
+    def _ready(self, feed: EncodedFeed, serial: int) -> list[Numbered[EncodedFrame]]:
         """Return the pictures of a form after one that the page can decode; ask for a key picture if there is none."""
         pictures, self._missed = feed.after(serial, follows=self._follows)
         if not pictures and self._missed:

@@ -21,8 +21,7 @@ from skyloop.messages import Feedback, FlightState, Hover, Land, Position, Retur
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.commands import AnyCommand, GoTo
-    from skyloop.cockpit.pilot_connection import PilotConnection
-    from skyloop.cockpit.station import Station
+    from skyloop.cockpit.station import PilotConnection, Station
     from skyloop.control.route import Route
 
 GOTO_M_S: Final = 1.0  #: greatest speed on the way to a place
@@ -104,13 +103,7 @@ class PlaceFlight:
         return self._job is not None
 
     def watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
-        """Watch a flight that was commanded.
-
-        Args:
-            command: The page's.
-            pilot: Holds the authority.
-            leg: The flight.
-        """
+        """Watch a flight that was commanded."""
         self.cancel()
         self._station.goals[self._app] = leg.goal
         self._job = asyncio.create_task(self._watch(command, pilot, leg))

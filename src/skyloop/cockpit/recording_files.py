@@ -50,9 +50,6 @@ class Notes(msgspec.Struct, frozen=True):
 def check_name(text: str) -> str:
     """Return the name of a recording's file as a person gave it, with its ending.
 
-    Args:
-        text: With or without ``.mcap``.
-
     Raises:
         UsageError: It can't be a name here, with the reason.
     """

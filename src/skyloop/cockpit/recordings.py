@@ -175,9 +175,6 @@ class Recordings:
     async def stop(self, number: str) -> Json:
         """Stop a recording, and wait until its file is closed.
 
-        Args:
-            number: The recording's ``id``.
-
         Returns:
             The recording, as JSON values.
 
@@ -274,9 +271,6 @@ class Recordings:
 
     async def replayed(self, name: str) -> Json:
         """Return what a replay's bar shows of its recording.
-
-        Args:
-            name: Of the proxy.
 
         Returns:
             The file's name, what :func:`skyloop.cockpit.reports.timeline` returns, and the notes, as JSON values.

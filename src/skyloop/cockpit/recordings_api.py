@@ -62,12 +62,7 @@ class _Playback(msgspec.Struct):
 
 
 class RecordingsApi:
-    """The routes below ``/api/recordings`` and ``/api/replays``.
-
-    Args:
-        fleet: The drones.
-        recordings: Of the same drones.
-    """
+    """The routes below ``/api/recordings`` and ``/api/replays``."""
 
     def __init__(self, fleet: Fleet, recordings: Recordings) -> None:
         self._fleet = fleet

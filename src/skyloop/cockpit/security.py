@@ -105,15 +105,7 @@ def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "
 
 
 def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], names: Names, path: str = "") -> str:
-    """Return why a request does not come from our page; empty if it may.
-
-    Args:
-        kind: ``http`` or ``websocket``.
-        method: Of HTTP.
-        headers: Names and values.
-        names: This server's.
-        path: The request's.
-    """
+    """Return why a request does not come from our page; empty if it may."""
     given: dict[str, list[str]] = {"host": [], "origin": [], "sec-fetch-site": []}
     for name, value in headers:
         if (key := name.decode("latin-1").lower()) in given:
@@ -144,11 +136,6 @@ class Guard:
 
     It refuses what :func:`foreign` and :func:`needed` say; the others find in ``scope["person"]`` who asks (None: not
     known).
-
-    Args:
-        app: The application.
-        names: This server's.
-        gate: Decides who asks.
     """
 
     def __init__(self, app: ASGIApp, names: Names, gate: Gate) -> None:

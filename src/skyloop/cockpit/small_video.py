@@ -16,12 +16,11 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import monotonic_ns, seconds
-from skyloop.cockpit.encoded_feed import FPS, SmallFeed, SmallFrame, pack, rounded_width
+from skyloop.cockpit.encoded_feed import FPS, SmallFeed, pack, rounded_width
 from skyloop.cockpit.feeds import Wake
 from skyloop.cockpit.page_stream import PageStream
-from skyloop.cockpit.stream import encoding_values
+from skyloop.cockpit.stream import encoding_values, picture_values
 from skyloop.errors import SkyloopError
-from skyloop.messages import EncodedFrame
 
 if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
@@ -108,11 +107,6 @@ class SmallVideoSender:
 
     The next message is sent when the page has drawn the one before: a slow page gets fewer frames, never older ones,
     and holds nobody else up.
-
-    Args:
-        socket: Accepted already.
-        stations: All drones, by name.
-        counts: Of all pages.
     """
 
     def __init__(self, socket: WebSocket, stations: Mapping[str, Station], counts: PageCounts) -> None:
@@ -175,7 +169,8 @@ class SmallVideoSender:
             for one in stream.take():
                 picture = one.picture
                 stream.sent(self._number + 1, one)
-                yield _values(picture, one.age_s) | {"h264": encoding_values(one)}, picture.data
+                values = picture_values(picture, one.age_s, picture.width, picture.height)
+                yield values | {"h264": encoding_values(one)}, picture.data
             self._counts.frames_skipped += stream.skipped - before
             if stream.shows:
                 return
@@ -184,7 +179,8 @@ class SmallVideoSender:
             self._counts.frames_skipped += max(0, frame.serial - shown.sent - 1) if shown.sent else 0
             shown.sent = frame.serial
             now_ns = monotonic_ns() + station.drone.clock_offset_ns
-            yield _values(frame, seconds(now_ns - frame.captured_ns)), frame.jpeg
+            age_s = seconds(now_ns - frame.captured_ns)
+            yield picture_values(frame, age_s, frame.width, frame.height), frame.jpeg
 
     async def _receive(self) -> None:
         """Handle what the page sends until it is gone, or sends what makes no sense."""
@@ -218,15 +214,3 @@ class SmallVideoSender:
                 return f"at most {MAX_SHOWN} cameras are shown at a time"
             self._shown[message.show] = _Shown(message.width, message.h264)
         return ""
-
-
-def _values(picture: SmallFrame | EncodedFrame, age_s: float) -> dict[str, Any]:
-    """Return what a page is told of a picture."""
-    captured = str(picture.captured_ns)  # too large for JavaScript's numbers
-    return {
-        "seq": picture.seq,
-        "captured_ns": captured,
-        "age_s": age_s,
-        "width": picture.width,
-        "height": picture.height,
-    }

@@ -11,7 +11,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -44,14 +44,7 @@ class PageCounts:
 
 
 class VideoSender:
-    """Sends one camera to one page until the page goes away: as JPEGs, or as H.264 to a page that decodes it.
-
-    Args:
-        socket: Accepted already.
-        station: The drone.
-        feed: The camera.
-        counts: Of all pages.
-    """
+    """Sends one camera to one page until the page goes away: as JPEGs, or as H.264 to a page that decodes it."""
 
     def __init__(self, socket: WebSocket, station: Station, feed: CameraFeed, counts: PageCounts) -> None:
         self._socket = socket
@@ -153,20 +146,13 @@ class VideoSender:
             self._number += 1
             stream.sent(self._number, one)
             self._sent_ns = picture.captured_ns
-            head = {
-                "ack": self._number,
-                "camera": picture.camera,
-                "seq": picture.seq,
-                "captured_ns": str(picture.captured_ns),
-                "age_s": one.age_s,
-                "now_s": seconds(monotonic_ns()),
-                "width": picture.width,
-                "height": picture.height,
-                "h264": encoding_values(one),
-            }
-            await self._socket.send_bytes(pack(head, picture.data))
+            values = picture_values(picture, one.age_s, picture.width, picture.height)
+            await self._socket.send_bytes(pack(self._head(values) | {"h264": encoding_values(one)}, picture.data))
             self._counts.frames_sent += 1
         self._counts.frames_skipped += stream.skipped - before
+
+    def _head(self, values: dict[str, Any]) -> dict[str, Any]:
+        return {"ack": self._number, "camera": self._feed.camera, **values, "now_s": seconds(monotonic_ns())}
 
     async def _send_frame(self) -> None:
         picture = self._feed.newest
@@ -176,18 +162,9 @@ class VideoSender:
             return
         skipped = picture.serial - self._sent - 1 if self._sent else 0
         jpeg = await self._feed.jpeg(picture)
-        frame = picture.frame
+        frame = picture.picture
         self._number += 1
-        head = {
-            "ack": self._number,
-            "camera": frame.camera,
-            "seq": frame.seq,
-            "captured_ns": str(frame.captured_ns),
-            "age_s": frame.age_s,
-            "now_s": seconds(monotonic_ns()),
-            "width": frame.shape[1],
-            "height": frame.shape[0],
-        }
+        head = self._head(picture_values(frame, frame.age_s, frame.shape[1], frame.shape[0]))
         self._waiting, self._sent, self._sent_ns = self._number, picture.serial, frame.captured_ns
         await self._socket.send_bytes(pack(head, jpeg))
         self._counts.frames_sent += 1
@@ -221,12 +198,7 @@ class VideoSender:
 
 
 class BroadcastSender:
-    """Sends the messages of a broadcast to one page until the page goes away.
-
-    Args:
-        socket: Accepted already.
-        broadcast: Makes the messages.
-    """
+    """Sends the messages of a broadcast to one page until the page goes away."""
 
     def __init__(self, socket: WebSocket, broadcast: PeriodicBroadcast) -> None:
         self._socket = socket
@@ -265,12 +237,7 @@ class BroadcastSender:
 
 
 class TelemetrySender(BroadcastSender):
-    """Sends a drone's state and events; before them the vehicle, whenever it is another one.
-
-    Args:
-        socket: Accepted already.
-        station: The drone.
-    """
+    """Sends a drone's state and events; before them the vehicle, whenever it is another one."""
 
     def __init__(self, socket: WebSocket, station: Station) -> None:
         super().__init__(socket, station.broadcast)
@@ -291,11 +258,7 @@ class TelemetrySender(BroadcastSender):
 
 
 class PageSocket:
-    """Sends messages to one page, and passes on the commands that it sends. On the event loop.
-
-    Args:
-        socket: Accepted already.
-    """
+    """Sends messages to one page, and passes on the commands that it sends. On the event loop."""
 
     def __init__(self, socket: WebSocket) -> None:
         self._socket = socket
@@ -355,6 +318,21 @@ def _said(text: str) -> _FromPage | None:
     except msgspec.DecodeError:
         return None
     return said if said.ack is not None or said.h264 is not None or said.key else None
+
+
+class Captured(Protocol):
+    """A picture, by as much of it as pages are told."""
+
+    @property
+    def seq(self) -> int: ...
+    @property
+    def captured_ns(self) -> int: ...
+
+
+def picture_values(picture: Captured, age_s: float, width: int, height: int) -> dict[str, Any]:
+    """Return what a page is told of a picture, as JSON values."""
+    captured = str(picture.captured_ns)  # too large for JavaScript's numbers
+    return {"seq": picture.seq, "captured_ns": captured, "age_s": age_s, "width": width, "height": height}
 
 
 def encoding_values(one: Sent) -> dict[str, Any]:

@@ -19,8 +19,8 @@ from skyloop.messages import Event, EventKind, LinkState
 
 if TYPE_CHECKING:
     from skyloop.cockpit.commands import Answer
-    from skyloop.cockpit.pilot_connection import PilotConnection
-    from skyloop.cockpit.station import Station
+    from skyloop.cockpit.station import PilotConnection, Station
+
 
 Json = dict[str, Any]
 
@@ -124,10 +124,6 @@ class QueueTracker:
 
     def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
         """Return the position in the queue.
-
-        Args:
-            status: The connection's.
-            now_ns: The monotonic clock.
 
         Returns:
             None for who does not wait. It is equal to the last one until the status changes.

@@ -18,7 +18,7 @@ import numpy as np
 
 from skyloop.client.frame import Arrival, compressed
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.control.follow_target import detections_of
+from skyloop.control.target_follower import detections_of
 from skyloop.errors import DecodeError, MissingExtraError, RefusedError, SkyloopError, UsageError
 from skyloop.estimation import assignment
 from skyloop.messages import Text
@@ -73,9 +73,6 @@ class KeptFrames:
 
     def find(self, captured_ns: int) -> Arrival:
         """Return the frame of that capture.
-
-        Args:
-            captured_ns: On the proxy's clock.
 
         Raises:
             RefusedError: It is not kept; the message says why.

@@ -24,7 +24,7 @@ from skyloop.vision import MarkerDetector
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
     from skyloop.control.path_law import PathSettings
-    from skyloop.control.position import PositionSource
+    from skyloop.control.waypoint import PositionSource
     from skyloop.messages import Attitude, Feedback, Vector, Velocity
 
 _LONGEST_STEP_S = 0.2

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import DRAG_PER_S, Motion
-from skyloop.control.chase_settings import ChaseSettings
+from skyloop.control.chase_settings import LOSSES, ChaseSettings, FollowMode, TargetPhase
 from skyloop.control.filters import LowPass
 from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened, within
 from skyloop.control.response import Predicted, ResponseSettings, VelocityResponse
@@ -42,31 +41,6 @@ _EITHER_SIDE = 0.2  # of the clearance: it may pass on either side of somebody w
 _SWEEP_BACK = 0.4  # of the sweep: to where the target was not going
 _THERE_M = 0.1  # from a height that it flies to for the parallax: on to the other
 _ALONG_M_S = 0.4  # a target that is slower has no direction to be behind or beside of
-
-
-class FollowMode(StrEnum):
-    """What to do about a target."""
-
-    FOLLOW = "follow"  #: keep a distance, and a side if one was given
-    ORBIT = "orbit"  #: circle it, also while it moves
-    LOOK = "look"  #: turn to it, and stay
-
-
-class TargetPhase(StrEnum):
-    """What becomes of it."""
-
-    LOOKING = "looking for the target"  #: it was not seen yet: turning on the spot
-    RANGING = "range not yet known: turns only"  #: seen, but perhaps far nearer than it seems
-    FOLLOWING = "following"
-    ORBITING = "orbiting"
-    WATCHING = "looking at it"
-    PREDICTING = "hidden: on by its last motion"
-    HOVERING = "lost: hovering where it went out of sight"
-    SEARCHING = "lost: looking around"
-    GIVEN_UP = "lost for too long: given up"
-
-
-LOSSES = frozenset({TargetPhase.PREDICTING, TargetPhase.HOVERING, TargetPhase.SEARCHING, TargetPhase.GIVEN_UP})
 
 
 class _Now(NamedTuple):
@@ -263,14 +237,7 @@ class ChaseLaw:
         return aside, math.copysign(s.search_rad_s, self._sweep_first * (whole - swept))
 
     def _turn(self, own: Motion, state: TargetState, aside: float = 0.0, sweeping: float = 0.0) -> float:
-        """Return the yaw rate that turns it to the target, or beside it, and keeps it there.
-
-        Args:
-            own: The vehicle's motion.
-            state: The target's.
-            aside: To the left of the target [rad].
-            sweeping: How fast that changes [rad/s].
-        """
+        """Return the yaw rate that turns it to the target, or ``aside`` to its left [rad], and keeps it there."""
         offset = state.foot[:2] - own.position[:2]
         across = max(0.5, float(np.hypot(*offset)))
         error = wrap_angle(math.atan2(offset[1], offset[0]) + aside - own.yaw)

@@ -1,14 +1,40 @@
-"""Goal, gains and limits of :class:`skyloop.control.chase_law.ChaseLaw`."""
+"""What :class:`skyloop.control.chase_law.ChaseLaw` is to do, its gains and limits, and the phases in which it is."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 from skyloop.control.limiting import lowered
 from skyloop.errors import UsageError
 from skyloop.messages import Value
+
+
+class FollowMode(StrEnum):
+    """What to do about a target."""
+
+    FOLLOW = "follow"  #: keep a distance, and a side if one was given
+    ORBIT = "orbit"  #: circle it, also while it moves
+    LOOK = "look"  #: turn to it, and stay
+
+
+class TargetPhase(StrEnum):
+    """What becomes of it."""
+
+    LOOKING = "looking for the target"  #: it was not seen yet: turning on the spot
+    RANGING = "range not yet known: turns only"  #: seen, but perhaps far nearer than it seems
+    FOLLOWING = "following"
+    ORBITING = "orbiting"
+    WATCHING = "looking at it"
+    PREDICTING = "hidden: on by its last motion"
+    HOVERING = "lost: hovering where it went out of sight"
+    SEARCHING = "lost: looking around"
+    GIVEN_UP = "lost for too long: given up"
+
+
+LOSSES = frozenset({TargetPhase.PREDICTING, TargetPhase.HOVERING, TargetPhase.SEARCHING, TargetPhase.GIVEN_UP})
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.airframe import Motion, Part, VelocityLaw
+from skyloop.control.airframe import Motion, Part, TurningSearch, VelocityLaw
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
-from skyloop.control.search import TurningSearch
 from skyloop.messages import Feedback, Points, Polyline, Text
 from skyloop.messages.geometry import wrap_angle
 from skyloop.messages.relayed import Colour, Shape

@@ -24,10 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.airframe import Part, VelocityLaw
+from skyloop.control.airframe import Part, TurningSearch, VelocityLaw
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import SetpointLimits, clamped, shortened
-from skyloop.control.search import TurningSearch
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import wrap_angle
 

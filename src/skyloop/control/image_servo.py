@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.airframe import AirframeLaw, Part, VelocityLaw, not_ahead
+from skyloop.control.airframe import AirframeLaw, Part, TurningSearch, VelocityLaw, not_ahead
 from skyloop.control.behaviour import Behaviour, camera_info
 from skyloop.control.interaction import levelled, servo
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimits, clamped, shortened
 from skyloop.control.pid import Gains, VectorPi
-from skyloop.control.search import TurningSearch
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity

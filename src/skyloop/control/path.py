@@ -1,21 +1,99 @@
 """Paths: position and velocity by time. World axes x east, y north, z up [m]. Pure.
 
 Every object with :class:`Path`'s attributes is a path. Those of this module, but for a :class:`FunctionPath`, start and
-end at rest.
+end at rest: each stretch has its own speed limit, and the speeds at the joints come from one backward and one forward
+pass with ``v² = v₀² + 2·a·s`` (a trapezoidal profile; Biagiotti and Melchiorri, "Trajectory Planning for Automatic
+Machines and Robots", Springer 2008, section 3.2).
 """
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skyloop.control.limiting import within
-from skyloop.control.motion_profile import MotionProfile
 from skyloop.errors import MissingExtraError, UsageError
+
+#: Shorter stretches are skipped: the squares of the speeds that they allow would be too small for a float.
+SHORTEST_M: Final = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    begin_s: float
+    begin_m: float
+    speed: float
+    acceleration: float
+
+
+class MotionProfile:
+    """Distance and speed over time, from rest to rest."""
+
+    def __init__(self, stretches: Sequence[tuple[float, float]], acceleration_m_s2: float) -> None:
+        """Compute the profile.
+
+        Args:
+            stretches: Length [m] and greatest speed [m/s] of each. Speed 0 belongs to a stretch of length 0: a stop.
+                Stretches of at most :data:`SHORTEST_M` take no time.
+            acceleration_m_s2: For speeding up and slowing down; above 0.
+
+        Raises:
+            UsageError: A stretch would never end, because its speed limit is 0.
+        """
+        self._pieces: list[_Piece] = []
+        self.duration_s = 0.0  #: how long the whole profile takes
+        self.length_m = 0.0  #: its whole length
+        joints = _joint_speeds(stretches, acceleration_m_s2)
+        for (length, limit), (begin, end) in zip(stretches, itertools.pairwise(joints), strict=True):
+            self._stretch(length, limit, begin, end, acceleration_m_s2)
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Return the distance done [m] and the speed [m/s] at a time; at rest before 0 and from the end on."""
+        if t_s <= 0.0 or not self._pieces:
+            return 0.0, 0.0
+        if t_s >= self.duration_s:
+            return self.length_m, 0.0
+        piece = self._pieces[bisect.bisect_right(self._pieces, t_s, key=lambda one: one.begin_s) - 1]
+        dt = t_s - piece.begin_s
+        way = piece.begin_m + piece.speed * dt + piece.acceleration * dt * dt / 2
+        return min(self.length_m, way), max(0.0, piece.speed + piece.acceleration * dt)
+
+    def _stretch(self, length: float, limit: float, begin: float, end: float, a: float) -> None:
+        if length <= SHORTEST_M:
+            return
+        top = min(limit, math.sqrt((begin * begin + end * end) / 2 + a * length))
+        if not top > 0.0:
+            raise UsageError(f"a stretch of {length:g} m with a greatest speed of {limit:g} m/s has no end")
+        up, down = (top * top - begin * begin) / (2 * a), (top * top - end * end) / (2 * a)
+        self._piece(up, begin, a, (top - begin) / a)
+        cruise = max(0.0, length - up - down)
+        self._piece(cruise, top, 0.0, cruise / top)
+        self._piece(down, top, -a, (top - end) / a)
+
+    def _piece(self, length: float, speed: float, acceleration: float, lasts_s: float) -> None:
+        if lasts_s > 0.0:
+            self._pieces.append(_Piece(self.duration_s, self.length_m, speed, acceleration))
+            self.duration_s += lasts_s
+            self.length_m += length
+
+
+def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[float]:
+    """Return the speed before the first stretch, between each two, and after the last."""
+    limits = [limit for _, limit in stretches]
+    speeds = [0.0, *(min(pair) for pair in itertools.pairwise(limits)), 0.0]
+    for k in range(len(stretches) - 1, -1, -1):
+        speeds[k] = min(speeds[k], math.sqrt(speeds[k + 1] ** 2 + 2 * a * stretches[k][0]))
+    for k, (length, _) in enumerate(stretches):
+        speeds[k + 1] = min(speeds[k + 1], math.sqrt(speeds[k] ** 2 + 2 * a * length))
+    return speeds
+
 
 Array = NDArray[np.float64]
 _DIFFERENCE_S = 0.01
@@ -87,7 +165,16 @@ class FunctionPath:
         return (self.position(after) - self.position(before)) / (after - before)
 
 
-class Polyline:
+class _Profiled:
+    _profile: MotionProfile
+
+    @property
+    def duration_s(self) -> float:
+        """How long the path takes [s]."""
+        return self._profile.duration_s
+
+
+class Polyline(_Profiled):
     """Straight legs between points at one speed, with a stop at each corner, or with corners rounded by arcs."""
 
     def __init__(
@@ -134,11 +221,6 @@ class Polyline:
         self._profile = MotionProfile(stretches, acceleration)
         self._begins = np.cumsum([0.0, *(piece.length for piece in self._pieces)])
 
-    @property
-    def duration_s(self) -> float:
-        """How long the path takes [s]."""
-        return self._profile.duration_s
-
     def position(self, t_s: float) -> Array:
         """Return the position at a time [s], shape (3,) [m]."""
         piece, way, _ = self._at(t_s)
@@ -156,7 +238,7 @@ class Polyline:
         return self._pieces[k], way - float(self._begins[k]), speed
 
 
-class Circle:
+class Circle(_Profiled):
     """A circle about a centre at one height and speed, from rest to rest."""
 
     def __init__(
@@ -192,11 +274,6 @@ class Circle:
         speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
         self._profile = MotionProfile([(length, speed)], acceleration)
 
-    @property
-    def duration_s(self) -> float:
-        """How long the path takes [s]."""
-        return self._profile.duration_s
-
     def position(self, t_s: float) -> Array:
         """Return the position at a time [s], shape (3,) [m]."""
         angle, _ = self._angle(t_s)
@@ -212,7 +289,7 @@ class Circle:
         return self._begin + self._sense * way / self._radius, speed
 
 
-class Lemniscate:
+class Lemniscate(_Profiled):
     """A horizontal figure of eight, Gerono's: ``x = a·sin u``, ``y = a·sin u·cos u``, turned by ``yaw_rad``."""
 
     def __init__(
@@ -246,11 +323,6 @@ class Lemniscate:
         steepest = self._a * math.sqrt(2.0)  # way per u, where it is greatest
         turns = 2 * math.pi * _positive("laps", laps)
         self._profile = MotionProfile([(turns, speed / steepest)], acceleration / steepest)
-
-    @property
-    def duration_s(self) -> float:
-        """How long the path takes [s]."""
-        return self._profile.duration_s
 
     def position(self, t_s: float) -> Array:
         """Return the position at a time [s], shape (3,) [m]."""

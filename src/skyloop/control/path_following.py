@@ -14,8 +14,7 @@ from skyloop.clock import nanoseconds
 from skyloop.control.controller import Controller
 from skyloop.control.path import Path, Polyline
 from skyloop.control.path_law import FixedYaw, PathLaw, PathSettings, YawMode
-from skyloop.control.position import Fix, PositionSource, fix_of
-from skyloop.control.waypoint import Waypoint, lacking
+from skyloop.control.waypoint import Fix, PositionSource, Waypoint, fix_of, lacking
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
 from skyloop.messages import EventKind, Feedback, Severity, Vector

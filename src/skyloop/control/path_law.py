@@ -20,7 +20,7 @@ from skyloop.clock import seconds
 from skyloop.control.limiting import SetpointLimiter, SetpointLimits, lowered, within
 from skyloop.control.path import Path
 from skyloop.control.pid import Gains, VectorPi
-from skyloop.control.position import Fix
+from skyloop.control.waypoint import Fix
 from skyloop.errors import UsageError
 from skyloop.messages import Value, Velocity
 from skyloop.messages.geometry import turned, wrap_angle

@@ -8,6 +8,7 @@ and a thing that comes into view after a loss must be where the target can be, l
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,11 +105,9 @@ class TargetFinder:
         self.detections: tuple[Detection, ...] = ()
         self._first_box = box
         self._given, self._unnamed = traits, class_name is None
-        self._nominal_m = nominal_m
-        self._relative = relative
+        self._nominal_m, self._relative = nominal_m, relative
         self._tracker = LongTermTracker()
-        self._tracking = False
-        self._tracker_noise = _TRACKER_NOISE
+        self._tracking, self._tracker_noise = False, _TRACKER_NOISE
         self._scene: Scene | None = None
         self._number: int | None = None  # of the target in the scene
         self._frames: deque[_Seen] = deque(maxlen=_KEPT_FRAMES)
@@ -156,17 +155,10 @@ class TargetFinder:
         return sighting
 
     def detected(self, detections: Sequence[Detection], captured_ns: int, *, ground: bool) -> bool:
-        """Use detections that come later than the image that they were found in.
+        """Use detections that come later than their image; return whether they show the target, or may show it.
 
-        Where the tracker did not find the target in that image, or elsewhere, it goes on from there.
-
-        Args:
-            detections: Of one of the last images given to :meth:`see`; of another image they are ignored.
-            captured_ns: Of that image.
-            ground: Whether the camera's height above the ground is known.
-
-        Returns:
-            Whether they show the target, or may show it.
+        Where the tracker did not find the target in that image, or elsewhere, it goes on from there. Of an image that
+        is none of the last that were given to :meth:`see` they are ignored.
         """
         frame = next((one for one in self._frames if one.captured_ns == captured_ns), None)
         if frame is None:
@@ -228,8 +220,7 @@ class TargetFinder:
         view = BoxView.of(box, camera, _TRACKER_NOISE)
         if view is None:
             raise UsageError("the box is straight above or below the vehicle, where it has no bearing: turn or move")
-        name, nominal_m = self.class_name, self._nominal_m
-        self.estimator = estimator_of(name, traits, nominal_m=nominal_m, relative=self._relative)
+        self.estimator = estimator_of(self.class_name, traits, nominal_m=self._nominal_m, relative=self._relative)
         self.estimator.start(view, camera, captured_ns, ground=ground)
 
     def _decide(self, image: Image, camera: Camera, captured_ns: int, tracked: TrackResult) -> Sighting:
@@ -279,8 +270,8 @@ class TargetFinder:
         before = estimator.at(captured_ns)
         again = estimator.again(captured_ns)
         again.start(view, camera, captured_ns, ground=self._ground)
-        way = again.at(captured_ns).foot[:2] - before.foot[:2]
-        if float((way @ way) ** 0.5) > _FAST_M_S * unseen_s + before.place_m:
+        way_m = math.dist(again.at(captured_ns).foot[:2], before.foot[:2])
+        if way_m > _FAST_M_S * unseen_s + before.place_m:
             return False
         self.estimator = again
         return True
@@ -410,17 +401,12 @@ class TargetFinder:
             self._twin_ns = at_ns
 
     def _is_expected(self, target: SceneObject, found: SceneObject, mean: float, at_ns: int) -> bool:
-        """Whether a newcomer moves as the target should, as far as its colours leave a doubt.
-
-        If the target is known to have a twin, it must also be about where it should be.
-        """
+        """Whether a newcomer moves as the target should, in doubt; and is where it should be, if that has a twin."""
         assert target.estimator.seen_ns is not None
         expected, is_at = target.estimator.at(at_ns), found.estimator.at(at_ns)
         unseen_s = seconds(at_ns - target.estimator.seen_ns)
-        off_m, off_m_s = (
-            float(((one - other) @ (one - other)) ** 0.5)
-            for one, other in ((expected.foot[:2], is_at.foot[:2]), (expected.velocity, is_at.velocity))
-        )
+        off_m = math.dist(expected.foot[:2], is_at.foot[:2])
+        off_m_s = math.dist(expected.velocity, is_at.velocity)
         if self._twin_ns is not None and seconds(at_ns - self._twin_ns) < _TWIN_S:
             return off_m < _TWIN_OFF_M + _TWIN_OFF_M_S * unseen_s and off_m_s < _OTHER_WAY_M_S
         return mean < _TWIN or unseen_s > _GOES_ON_S or off_m_s < _OTHER_WAY_M_S
@@ -442,9 +428,10 @@ class TargetFinder:
         view = BoxView.of(thing.detection.box, frame.camera)
         if view is None:
             return thing.estimator
-        new = estimator_of(None, self._given, nominal_m=self._nominal_m, relative=self._relative)
         if isinstance(before, RangeEstimator):
             new = before.again(frame.captured_ns)
+        else:
+            new = estimator_of(None, self._given, nominal_m=self._nominal_m, relative=self._relative)
         new.start(view, frame.camera, frame.captured_ns, ground=self._ground)
         return new
 

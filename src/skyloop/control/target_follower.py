@@ -1,15 +1,16 @@
-"""Finds one target in frames and computes the set-points that keep it: all of following but the drone.
+"""Follow anything: what is in a box of the image, or whatever is of a class.
 
-No thread and no clock: a behaviour (:class:`skyloop.control.FollowTarget`), or a page, gives frames and feedback, and
-sends the set-points.
+:class:`TargetFollower` finds the target in frames and computes the set-points that keep it, without thread or clock;
+:class:`FollowTarget`, or a page, gives it frames and feedback, and sends the set-points.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 
 from skyloop.clock import seconds
 from skyloop.control.airframe import AirframeLaw, Part, not_ahead
-from skyloop.control.chase_law import LOSSES, ChaseLaw, FollowMode, TargetPhase
-from skyloop.control.chase_settings import ChaseSettings
+from skyloop.control.behaviour import Behaviour, camera_info
+from skyloop.control.chase_law import ChaseLaw
+from skyloop.control.chase_settings import LOSSES, ChaseSettings, FollowMode, TargetPhase
 from skyloop.control.target_estimate import TargetEstimator, Traits
 from skyloop.control.target_finder import Sighting, TargetFinder
 from skyloop.control.target_view import Camera, predicted_box
@@ -30,7 +32,9 @@ from skyloop.vision.object_tracks import Detection, ObjectDetector
 from skyloop.vision.tracking import Box, outline
 
 if TYPE_CHECKING:
-    from skyloop.client import Frame
+    from skyloop.client import Drone, Frame
+    from skyloop.client.results import Result
+
 
 Array = NDArray[np.float64]
 
@@ -203,7 +207,8 @@ class TargetFollower(AirframeLaw):
             if frame.captured_ns > state.captured_ns:
                 state = msgspec.structs.replace(state, yaw_rad=motion.yaw)
         size = (frame.shape[1], frame.shape[0])
-        view = Camera.at(self._camera, state, body, frame.intrinsics, size, rates)
+        risen_m = None if self._relative else float(motion.position[2])
+        view = Camera.at(self._camera, state, body, frame.intrinsics, size, rates, risen_m)
         if view is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
         if self._finder is None:
@@ -222,12 +227,7 @@ class TargetFollower(AirframeLaw):
         return self._drawing(frame.captured_ns)
 
     def detected(self, detections: Sequence[Detection], captured_ns: int) -> None:
-        """Use detections of a processor, which come later than their frame.
-
-        Args:
-            detections: Of one of the last frames.
-            captured_ns: Of that frame.
-        """
+        """Use detections of a processor in one of the last frames, which come later than that."""
         if self._finder is not None:
             ground = self.airframe.feedback is not None and self.airframe.feedback.altitude_m is not None
             if self._finder.detected(detections, captured_ns, ground=ground):
@@ -301,7 +301,10 @@ class TargetFollower(AirframeLaw):
         if estimator is None:
             return [*shapes, Text(self.phase.value, (8.0, 16.0), colour)]
         state = estimator.at(captured_ns)
-        self._remember(captured_ns, state.foot)
+        if not self._trace or seconds(captured_ns - self._trace[-1][0]) >= _TRACE_EACH_S:
+            self._trace.append((captured_ns, state.foot))
+        while self._trace and seconds(captured_ns - self._trace[0][0]) > _TRACE_S:
+            self._trace.popleft()
         trace = [pixel for _, foot in self._trace if (pixel := view.pixel(foot)) is not None]
         if len(trace) > 1 and not self._relative:
             shapes.append(Polyline(tuple(trace), False, colour))
@@ -319,8 +322,128 @@ class TargetFollower(AirframeLaw):
         text = f"{name}{sure}  {self.phase.value}  {state.range_m:.1f} ± {state.range_deviation_m:.1f} m"
         return [*shapes, Text(text, (8.0, 16.0), colour)]
 
-    def _remember(self, captured_ns: int, foot: Array) -> None:
-        if not self._trace or seconds(captured_ns - self._trace[-1][0]) >= _TRACE_EACH_S:
-            self._trace.append((captured_ns, foot))
-        while self._trace and seconds(captured_ns - self._trace[0][0]) > _TRACE_S:
-            self._trace.popleft()
+
+class FollowTarget(Behaviour):
+    """Keeps a target in view, at a distance; circles it; or only looks at it. It must be airborne when it runs.
+
+    The target is what is in a box of the first frame, or the largest thing of a class. It is tracked by its looks and,
+    where there is a detector, by its detections, and is not mixed up with look-alikes. While it is hidden the vehicle
+    flies on by its last motion for a moment, then hovers, then looks around; after ``give_up_s`` the behaviour ends,
+    hovering. The vehicle needs neither position nor map. One that reports no velocity is flown by attitude.
+
+    Attributes:
+        follower: What finds the target and computes the set-points.
+    """
+
+    name = "follow target"
+    losses = LOSSES
+
+    def __init__(
+        self,
+        drone: Drone,
+        box: Sequence[float] | None = None,
+        *,
+        class_name: str | None = None,
+        distance_m: float | None = None,
+        bearing_rad: float | None = None,
+        mode: FollowMode | str = FollowMode.FOLLOW,
+        detector: ObjectDetector | str | None = None,
+        height_m: float | None = None,
+        traits: Traits | None = None,
+        camera: str | None = None,
+        settings: ChaseSettings | None = None,
+    ) -> None:
+        """Initialise the behaviour.
+
+        Args:
+            drone: The drone to fly.
+            box: The target in the first frame: x, y, width, height [px].
+            class_name: Follow the largest thing of this class, if there is no box. Needs a detector.
+            distance_m: Horizontal distance to keep; None: the settings'.
+            bearing_rad: Where to be as seen from the target, counter-clockwise from where it moves to: 0 is ahead of
+                it, π behind. None: on any side, or the settings'.
+            mode: ``follow``, ``orbit`` or ``look``.
+            detector: Searches every frame; or the name of a processor whose results are detections, such as that of
+                ``skyloop detect``. None: the target is tracked by its looks alone.
+            height_m: How high the target is, if that is known, for its distance; else that of its class is taken. With
+                neither, the drone only turns until its own motion has shown the range.
+            traits: All that is known of the target, in place of ``height_m``.
+            camera: Whose frames to use; None is the vehicle's first camera.
+            settings: Of the law; None are the defaults. They are brought within the drone's ``limits.*``.
+
+        Raises:
+            UnknownNameError: There is no such camera.
+            UsageError: There is neither a box nor a class; or the camera does not look forward; or a number is out of
+                its range; or the vehicle reports no velocity, and takes no attitudes.
+            MissingExtraError: OpenCV or, for detections, SciPy is not installed.
+        """
+        given = {"distance_m": distance_m, "bearing_rad": bearing_rad}
+        chosen = replace(settings or ChaseSettings(), **{k: v for k, v in given.items() if v is not None})
+        chosen = chosen.within(dict(drone.config.items()))
+        if height_m is not None:
+            traits = replace(traits or Traits(), height_m=height_m, height_share=0.05)
+        if mode not in list(FollowMode):
+            raise UsageError(f"mode is {mode!r} and must be one of {', '.join(FollowMode)}")
+        if detector is not None and not isinstance(detector, str | ObjectDetector):
+            raise UsageError(f"detector is {detector!r} and must have detect(image), or be the name of a processor")
+        self.follower = TargetFollower(
+            camera_info(drone, camera),
+            box=None if box is None else _box(box),
+            class_name=class_name,
+            mode=FollowMode(mode),
+            detector=None if isinstance(detector, str) else detector,
+            detects=isinstance(detector, str),
+            traits=traits,
+            settings=chosen,
+        )
+        self.processors = (detector,) if isinstance(detector, str) else ()
+        super().__init__(drone, self.follower, camera)
+
+    @property
+    def phase(self) -> TargetPhase:
+        """What becomes of it."""
+        return self.follower.phase
+
+    @property
+    def status(self) -> FollowStatus:
+        """How it goes, as of the newest frame."""
+        return self.follower.status
+
+    def look(self, frame: Frame) -> list[Shape]:
+        """Find the target."""
+        return self.follower.look(frame)
+
+    def on_frame(self, frame: Frame) -> None:
+        """Find the target and steer; at the end of patience hover and let :meth:`run` return."""
+        super().on_frame(frame)
+        if self.follower.over and not self.done:
+            self.finish("gave up: the target was lost for too long")
+
+    def on_result(self, result: Result) -> None:
+        """Use the detections of a processor in frames of this behaviour's camera; it may see others' too."""
+        if result.camera == self._mounting.name:
+            self.follower.detected(detections_of(result.value), result.captured_ns)
+
+
+def _box(box: Sequence[float]) -> Box:
+    try:
+        x, y, width, height = (float(part) for part in box)
+    except (TypeError, ValueError):
+        raise UsageError(f"the box is {box!r} and must be x, y, width and height in pixels") from None
+    return x, y, width, height
+
+
+def detections_of(value: Any) -> list[Detection]:
+    """Return the detections in the value of a result of ``skyloop detect``; what is none is left out."""
+    found = []
+    given = value.get("detections") if isinstance(value, dict) else None
+    for one in given if isinstance(given, list | tuple) else ():
+        try:
+            x, y, width, height = (float(part) for part in one["box"])
+            score, class_id = float(one["score"]), int(one["class_id"])
+            name = str(one["class_name"])
+        except (KeyError, TypeError, ValueError, OverflowError):
+            continue
+        if all(map(math.isfinite, (x, y, width, height, score))) and min(width, height) > 0.0:
+            found.append(Detection((x, y, width, height), score, class_id, name))
+    return found

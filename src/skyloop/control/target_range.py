@@ -6,6 +6,9 @@ That is therefore one hypothesis among others, at ranges from near to far, with 
 "Bearings-only target motion analysis based on a multihypothesis Kalman filter and adaptive ownship motion control", IEE
 Proceedings 145(4), 1998; N. Peach, IEE Proceedings 142(1), 1995). While the vehicle stays, all of them fit. Once it has
 moved, above all up or down, where hardly any target moves, those at a wrong range do not.
+
+An altimeter that measures to rising ground, or drifts, tells of a motion that is none. What may hang is therefore seen
+from a height that follows the vehicle's own climb, and the altimeter only slowly.
 """
 
 from __future__ import annotations
@@ -37,6 +40,8 @@ _BASELINE: Final = 0.015  # how far off it must have been once, by range, before
 _JUMP_M: Final = 0.15  # by more the vehicle's height does not change at once, ...
 _JUMP_M_S: Final = 1.0  # ... nor faster than this: what its altimeter measures to is another thing
 _JUMPING_S: Final = 0.5  # a jump takes as long at most, where altimeters are filtered
+_STEADY_S: Final = 30.0  # in which the height of what may hang follows the altimeter, where the climb is known
+_APART_M: Final = 3.0  # by more than this ground and climb differ only after the climb was lost
 
 
 class RangeEstimator(TargetEstimator):
@@ -62,6 +67,7 @@ class RangeEstimator(TargetEstimator):
         self._stirred_m = 0.0  # the farthest that the vehicle ever was from there, across that line
         self._heights: deque[tuple[int, float]] = deque()  # when, and how high it was lately
         self._jumped_ns: int | None = None  # when its height jumped last
+        self._base_m = 0.0  # the height, as the altimeter says in the long run, from which the climb counts
         self._size_known = self._known = self._learns = False
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
@@ -71,6 +77,7 @@ class RangeEstimator(TargetEstimator):
         apparent size.
         """
         self._size_known = self.traits.height_m is not None and self.traits.height_share < SURE_OF_SIZE
+        self._base_m = _off_climb(camera)
         self._guesses, weights = [], []
         self._on_ground, self._known, self._learns = None, not ground, ground
         below = view.bottom is None or view.bottom < -LEAST_SLOPE
@@ -96,7 +103,10 @@ class RangeEstimator(TargetEstimator):
 
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
         """Return how badly a box fits, as :meth:`TargetEstimator.distance`: the best fit of all, and the mixture's."""
-        fits, costs = zip(*(guess.distance(view, camera, at_ns) for guess in self._guesses), strict=True)
+        cameras = self._cameras(camera)
+        fits, costs = zip(
+            *(guess.distance(view, one, at_ns) for guess, one in zip(self._guesses, cameras, strict=True)), strict=True
+        )
         likelihood = float(self._weights @ np.exp(-np.minimum(costs, 700.0) / 2.0))
         return min(fits), -2.0 * math.log(likelihood) if math.isfinite(min(costs)) and likelihood > 0.0 else math.inf
 
@@ -108,19 +118,22 @@ class RangeEstimator(TargetEstimator):
         """
         if self.seen_ns is None:
             return super().update(view, camera, at_ns)  # which says so
-        if self._learns and self._jumps(camera, at_ns):
+        apart_m, since_s = _off_climb(camera) - self._base_m, seconds(at_ns - self.seen_ns)
+        if self._learns and (self._jumps(camera, at_ns) or abs(apart_m) > _APART_M):
             self._seen_before = self.at(at_ns) if self._known else self._seen_before
             self.start(view, camera, at_ns, ground=True)
             return True
-        since_s = seconds(at_ns - self.seen_ns)
-        costs = np.minimum([guess.distance(view, camera, at_ns)[1] for guess in self._guesses], 1e9)
-        used = [guess.update(view, camera, at_ns) for guess in self._guesses]
+        self._base_m += apart_m * within(since_s / _STEADY_S, 0.0, 1.0)
+        seen_from = list(zip(self._guesses, self._cameras(camera), strict=True))
+        costs = np.minimum([guess.distance(view, one, at_ns)[1] for guess, one in seen_from], 1e9)
+        used = [guess.update(view, one, at_ns) for guess, one in seen_from]
         if not any(used):
             self.refused += 1
             return False
         self.seen_ns, self.refused = max(at_ns, self.seen_ns), 0
         # Of a vehicle that stays boxes tell nothing: the guess that counts on the least motion would win slowly.
-        told = 1.0 if self._size_known else within((self._stir(camera, since_s) / _STIRRED_M) ** 2, 0.0, 1.0)
+        stirred = self._stir(self._steady(camera), since_s) / _STIRRED_M
+        told = 1.0 if self._size_known else within(stirred**2, 0.0, 1.0)
         worse = np.minimum(costs - costs.min(), _WORST)
         self._weights = self._weights * np.exp(-0.5 * worse * told * within(since_s / _TOGETHER_S, 0.0, 1.0))
         self._drop()
@@ -190,6 +203,18 @@ class RangeEstimator(TargetEstimator):
         if self._on_ground not in self._guesses:
             self._on_ground = None
 
+    def _steady(self, camera: Camera) -> Camera:
+        """Return the camera at the height that follows the vehicle's own climb."""
+        if camera.rise_m is None:
+            return camera
+        x, y, _ = camera.position
+        return replace(camera, position=np.array([x, y, camera.rise_m + self._base_m]))
+
+    def _cameras(self, camera: Camera) -> list[Camera]:
+        """Return the camera for each guess: of what stands on the ground it is as high as the altimeter says."""
+        steady = self._steady(camera)
+        return [camera if guess is self._on_ground else steady for guess in self._guesses]
+
     def _jumps(self, camera: Camera, at_ns: int) -> bool:
         """Return whether the height jumps, or did a moment ago."""
         height, heights = float(camera.position[2]), self._heights
@@ -217,6 +242,11 @@ class RangeEstimator(TargetEstimator):
             told = self._size_known or self.traits.on_ground
             moved = self._stirred_m > _BASELINE * state.range_m
             self._known = share < _UNKNOWN if told else moved and share < _KNOWN
+
+
+def _off_climb(camera: Camera) -> float:
+    """Return by how much the height differs from the climb [m]."""
+    return 0.0 if camera.rise_m is None else float(camera.position[2]) - camera.rise_m
 
 
 def estimator_of(

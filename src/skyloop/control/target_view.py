@@ -41,6 +41,7 @@ class Camera:
         size: Width and height of the image [px].
         yaw_rad: Standard deviation of its yaw at the capture.
         tilt_rad: Standard deviation of its tilt.
+        rise_m: How high the vehicle's velocity, added up, has brought it, wherever the ground is [m]; None: not known.
     """
 
     position: Array
@@ -49,6 +50,7 @@ class Camera:
     size: tuple[int, int]
     yaw_rad: float = _YAW_RAD
     tilt_rad: float = _TILT_RAD
+    rise_m: float | None = None
 
     @classmethod
     def at(
@@ -59,6 +61,7 @@ class Camera:
         intrinsics: Intrinsics,
         size: tuple[int, int],
         rates_rad_s: tuple[float, float] = (0.0, 0.0),
+        risen_m: float | None = None,
     ) -> Camera | None:
         """Place a camera.
 
@@ -70,6 +73,7 @@ class Camera:
             size: Width and height of the image [px].
             rates_rad_s: Of yaw and of tilt, of a vehicle whose images and attitude have no common clock: the faster it
                 turns, the less certain its attitude is at the capture.
+            risen_m: How high the vehicle's velocity, added up, has brought it [m]; None: not known.
 
         Returns:
             None while the attitude is not known.
@@ -83,8 +87,9 @@ class Camera:
         yaw_rad = math.hypot(_YAW_RAD, _UNTIMELY_S * rates_rad_s[0])
         tilt_rad = math.hypot(_TILT_RAD, _UNTIMELY_S * rates_rad_s[1])
         offset = np.zeros(3) if mounting.position_m is None else np.asarray(mounting.position_m)
-        place, rotation = body + to_level @ offset, to_level @ mounting_rotation(mounting)
-        return cls(place, rotation, intrinsics, size, yaw_rad, tilt_rad)
+        aside, rotation = to_level @ offset, to_level @ mounting_rotation(mounting)
+        rise_m = None if risen_m is None else risen_m + float(aside[2])
+        return cls(body + aside, rotation, intrinsics, size, yaw_rad, tilt_rad, rise_m)
 
     def pixel(self, point: Array) -> tuple[float, float] | None:
         """Return where a point (3,) is in the image, or a little beside it [px]; None farther off.

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
-from skyloop.motion_capture.address import SIM, VRPN, System, parse_system
 from skyloop.motion_capture.capture import MotionCapture, Source, TrackEvent
-from skyloop.motion_capture.pose import BodyPose, Calibration, calibrate
-from skyloop.motion_capture.source import ChildSource, TruthSource
-from skyloop.motion_capture.tracking import TrackState
+from skyloop.motion_capture.pose import BodyPose, Calibration, TrackState, calibrate
+from skyloop.motion_capture.source import SIM, VRPN, ChildSource, RawFrame, System, TruthSource, parse_system
 from skyloop.motion_capture.vrpn import VrpnSource
-from skyloop.motion_capture.worker import RawFrame
 
 __all__ = [
     "BodyPose",

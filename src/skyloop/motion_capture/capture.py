@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
 
 from skyloop.client.channels import Channel, Listener
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.control.position import Fix
+from skyloop.control.waypoint import Fix
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import Severity
 from skyloop.messages.relayed import MOCAP
-from skyloop.motion_capture.address import System
-from skyloop.motion_capture.pose import REST_S, BodyPose, Calibration, calibrate, plausible, z_up
-from skyloop.motion_capture.tracking import Track, TrackState
-from skyloop.motion_capture.worker import RawFrame
+from skyloop.motion_capture.pose import REST_S, BodyPose, Calibration, Track, TrackState, calibrate, plausible, z_up
+from skyloop.motion_capture.source import RawFrame, System
 
 if TYPE_CHECKING:
     from skyloop.client import Drone

@@ -1,27 +1,237 @@
-"""Frames of a motion capture system from a child process, which is restarted when it dies."""
+"""Addresses of motion capture systems, and the child process that receives from one: :func:`main`.
+
+The ``motioncapture`` package waits in native code, without a timeout and partly with the interpreter locked. In its own
+process it can block nobody, and can be killed whatever it waits for. Each frame is written to standard output as a
+msgpack array, preceded by its length: when it was received, and position and quaternion of each body that is seen.
+"""
 
 from __future__ import annotations
 
+import os
+import struct
 import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, BinaryIO, Final, cast
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, cast
+from urllib.parse import SplitResult, parse_qsl, urlsplit
 
 import msgspec
 
 from skyloop.child_process import ChildProcess, RestartingChild
-from skyloop.errors import LinkError, MissingExtraError, UnsupportedError
+from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.motion_capture.address import System
-from skyloop.motion_capture.worker import MISSING, RawFrame, read
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from skyloop.client import Drone
     from skyloop.messages import Feedback
+
+
+#: By scheme of the address: the system's name in the ``motioncapture`` package, and its default axis that points up.
+#: VRPN has a client of its own here.
+SYSTEMS: Final = {
+    "vicon": ("vicon", "z"),
+    "optitrack": ("optitrack", "y"),  # Motive streams with y up by default
+    "qualisys": ("qualisys", "z"),
+    "vrpn": ("vrpn", "z"),
+}
+VRPN: Final = "vrpn"
+SIM: Final = "sim"
+OPTIONS: Final = {
+    "up": "the axis that points up in what the system sends: y or z",
+    "latency": "how old a pose is when it arrives [s], from exposure to here",
+    "interface": "address of the network interface that the system is on (OptiTrack)",
+    "port": "of the system's command channel (OptiTrack; default 1510)",
+    "sensor": "of trackers whose name in bodies has none (VRPN): a number from 0",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class System:
+    """A parsed address of a motion capture system."""
+
+    address: str
+    kind: str  #: as the ``motioncapture`` package names it, or ``sim``
+    host: str
+    up: str = "z"
+    latency_s: float = 0.0
+    settings: tuple[tuple[str, str], ...] = ()  #: further settings for the package
+    port: int | None = None  #: after the host in the address
+    sensor: int | None = None  #: of VRPN's trackers where the body's name has none
+
+    @property
+    def configuration(self) -> dict[str, str]:
+        """The settings with which the ``motioncapture`` package connects."""
+        host = self.host if self.port is None else f"{self.host}:{self.port}"
+        return {"hostname": host, **dict(self.settings)}
+
+
+def parse_system(address: str) -> System:
+    """Parse the address of a motion capture system.
+
+    Args:
+        address: ``vicon://HOST``, ``optitrack://HOST?up=z``, ``qualisys://HOST``, ``vrpn://HOST?sensor=2`` or
+            ``sim://``.
+
+    Raises:
+        UsageError: The address is malformed, or an option has a wrong value.
+        UnknownNameError: There is no such system or option.
+    """
+    parts = urlsplit(address) if isinstance(address, str) else urlsplit("")
+    if not parts.scheme or "://" not in address:
+        raise UsageError(f"{address!r} is no motion capture system: give one such as vicon://192.168.0.10 or sim://")
+    options = dict(parse_qsl(parts.query, keep_blank_values=True))
+    for name in options:
+        if name not in OPTIONS:
+            raise UnknownNameError(f"option of {parts.scheme}://", name, OPTIONS)
+    if parts.scheme == SIM:
+        if options or parts.netloc:
+            raise UsageError(f"{address!r}: sim:// takes no host and no options; the bodies name the drones")
+        return System(address, SIM, "")
+    if parts.scheme not in SYSTEMS:
+        raise UnknownNameError("motion capture system", parts.scheme, [*SYSTEMS, SIM])
+    if not parts.hostname:
+        raise UsageError(f"{address!r} names no host: {parts.scheme}://192.168.0.10")
+    kind, up = SYSTEMS[parts.scheme]
+    up = options.get("up", up)
+    if up not in ("y", "z"):
+        raise UsageError(f"{address!r}: up is {up!r} and must be y or z")
+    settings = [("interface_ip", options["interface"])] if "interface" in options else []
+    if command := _port(address, options):
+        settings.append(("port_command", command))
+    if settings and kind != "optitrack":
+        raise UsageError(f"{address!r}: interface and port are for optitrack:// only")
+    sensor = options.get("sensor")
+    if sensor is not None and kind != VRPN:
+        raise UsageError(f"{address!r}: sensor is for vrpn:// only")
+    if sensor is not None and not (sensor.isascii() and sensor.isdigit() and len(sensor) <= 9):
+        raise UsageError(f"{address!r}: sensor is {sensor!r} and must be a whole number from 0")
+    if kind == VRPN and parts.path.strip("/"):
+        raise UsageError(f"{address!r}: the tracker is named in bodies, as {{'alpha': {parts.path.strip('/')!r}}}")
+    port = _port_of_host(address, parts)
+    if port is not None and kind == "optitrack":
+        raise UsageError(f"{address!r}: the port of OptiTrack's command channel is an option, ?port={port}")
+    if port is not None and kind == "qualisys":  # which takes its base port by itself
+        settings.append(("port", str(port)))
+        port = None
+    latency_s = _latency(address, options)
+    number = None if sensor is None else int(sensor)
+    return System(address, kind, parts.hostname, up, latency_s, tuple(settings), port, number)
+
+
+def _latency(address: str, options: dict[str, str]) -> float:
+    text = options.get("latency", "0")
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0.0 <= value <= 1.0:
+        raise UsageError(f"{address!r}: latency is {text!r} and must be from 0 to 1 second")
+    return value
+
+
+def _port_of_host(address: str, parts: SplitResult) -> int | None:
+    """Return the port after the host; None if there is none."""
+    try:
+        return parts.port
+    except ValueError:
+        raise UsageError(f"{address!r}: the port must be a whole number from 1 to 65535") from None
+
+
+def _port(address: str, options: dict[str, str]) -> str | None:
+    text = options.get("port")
+    if text is not None and not (text.isascii() and text.isdigit() and 1 <= int(text) <= 65535):
+        raise UsageError(f"{address!r}: port is {text!r} and must be a whole number from 1 to 65535")
+    return text
+
+
+LENGTH: Final = struct.Struct("<I")
+MAX_FRAME: Final = 1 << 20  #: bytes; a system with thousands of bodies stays below
+MISSING: Final = 3  #: exit code where the package is missing
+
+Seen = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+
+
+class RawFrame(msgspec.Struct, frozen=True, array_like=True):
+    """What a system saw at one time, in its own axes."""
+
+    received_ns: int  #: ``time.monotonic_ns`` of this host
+    bodies: dict[str, Seen]  #: position [m] and quaternion (x, y, z, w) of each body that is tracked
+
+
+def read(stream: BinaryIO) -> RawFrame | None:
+    """Read the next frame.
+
+    Returns:
+        The frame; None at the end of the stream.
+
+    Raises:
+        msgspec.DecodeError: The data are no frame.
+    """
+    head = stream.read(LENGTH.size)
+    if len(head) < LENGTH.size:
+        return None
+    (size,) = LENGTH.unpack(head)
+    if size > MAX_FRAME:
+        raise msgspec.DecodeError(f"a frame of {size} bytes")
+    data = stream.read(size)
+    return None if len(data) < size else msgspec.msgpack.decode(data, type=RawFrame)
+
+
+def write(stream: BinaryIO, frame: RawFrame) -> None:
+    """Write a frame and flush."""
+    data = msgspec.msgpack.encode(frame)
+    stream.write(LENGTH.pack(len(data)) + data)
+    stream.flush()
+
+
+def seen(bodies: Any) -> dict[str, Seen]:
+    """Convert the package's bodies to plain numbers."""
+    found: dict[str, Seen] = {}
+    for name, body in bodies.items():
+        x, y, z = (float(value) for value in body.position)
+        turn = body.rotation
+        found[name] = ((x, y, z), (float(turn.x), float(turn.y), float(turn.z), float(turn.w)))
+    return found
+
+
+def open_output() -> BinaryIO:
+    """Return standard output for frames alone, and redirect what native code prints to standard error."""
+    output = os.fdopen(os.dup(1), "wb", buffering=0)
+    os.dup2(2, 1)
+    return output
+
+
+def main(kind: str, settings: str) -> int:
+    """Connect and write frames until the reader is gone.
+
+    Args:
+        kind: The system's name in the ``motioncapture`` package.
+        settings: JSON object of strings, for its ``connect``.
+
+    Returns:
+        The exit code: 0 when the reader is gone, :data:`MISSING` without the package, 1 for any other error.
+    """
+    try:
+        import motioncapture
+    except ImportError as error:
+        print(error, file=sys.stderr)
+        return MISSING
+    output = open_output()
+    try:
+        system = motioncapture.connect(kind, msgspec.json.decode(settings, type=dict[str, str]))
+        while True:
+            system.waitForNextFrame()
+            write(output, RawFrame(time.monotonic_ns(), seen(system.rigidBodies)))
+    except BrokenPipeError:
+        return 0  # the reader is gone
+    except Exception as error:  # noqa: BLE001  whatever the native code throws
+        print(error, file=sys.stderr)
+        return 1
 
 
 class TruthSource:
@@ -88,11 +298,11 @@ def true_pose(
     return (x, y, z), quaternion_from_euler(roll, pitch, yaw)
 
 
-#: Not ``-m``: the package imports the worker's module, of which Python would warn in each child.
+#: Not ``-m``: the package imports this module, of which Python would warn in each child.
 WORKER: Final = (
     sys.executable,
     "-c",
-    "import sys; from skyloop.motion_capture.worker import main; sys.exit(main(*sys.argv[1:]))",
+    "import sys; from skyloop.motion_capture.source import main; sys.exit(main(*sys.argv[1:]))",
 )
 AGAIN_S: Final = 0.5  #: pause before a child that ended is restarted
 SILENT_S: Final = 3.0  #: a child that sends nothing for so long is killed: its system may have been restarted
@@ -100,7 +310,7 @@ FIRST_S: Final = 10.0  #: the same before its first frame
 
 
 class ChildSource:
-    """Runs :mod:`skyloop.motion_capture.worker` for a system and passes each frame on, on its own thread.
+    """Runs :func:`main` in a child process for a system and passes each frame on, on its own thread.
 
     A child that ends or falls silent is replaced until :meth:`close`.
     """
@@ -146,9 +356,6 @@ class ChildSource:
 
     def start(self, timeout_s: float) -> None:
         """Start the child, and wait for the first frame.
-
-        Args:
-            timeout_s: How long to wait.
 
         Raises:
             LinkError: No frame came within that time.

@@ -37,8 +37,7 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import DecodeError, LinkError, UsageError
-from skyloop.motion_capture.address import System
-from skyloop.motion_capture.worker import RawFrame, Seen
+from skyloop.motion_capture.source import RawFrame, Seen, System
 
 DEFAULT_PORT: Final = 3883
 COOKIE_SIZE: Final = 24

@@ -9,10 +9,9 @@ from skyloop.vision.detector_layouts import Layout
 from skyloop.vision.flow import GroundTracker
 from skyloop.vision.gates import BlobDetector, BlobSighting, GateDetector, GateSighting, PoleDetector, PoleSighting
 from skyloop.vision.lens import project, undistort, unproject
-from skyloop.vision.markers import MarkerDetector, MarkerSighting
 from skyloop.vision.object_tracks import Detection, ObjectDetector, ObjectTracks, TrackedObject
 from skyloop.vision.onnx_detector import OnnxDetector
-from skyloop.vision.planar import PlanarSighting
+from skyloop.vision.planar import MarkerDetector, MarkerSighting, PlanarSighting
 from skyloop.vision.simulated import simulated_detector
 from skyloop.vision.trackers import CorrelationTracker, LearnedTracker, MedianFlowTracker
 from skyloop.vision.tracking import Tracker, TrackResult

@@ -17,7 +17,7 @@ import skyloop
 from skyloop.client import Authority
 from skyloop.client.drone import open_drone
 from skyloop.clock import ManualClock, monotonic_ns, nanoseconds
-from skyloop.cockpit.pilot_connection import PilotConnection
+from skyloop.cockpit.station import PilotConnection
 from skyloop.drivers.recording_sink import RecordingSink, SeenFrame
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import ParameterError, UnknownNameError
