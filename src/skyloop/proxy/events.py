@@ -29,7 +29,7 @@ MAX_TEXT: Final = 1000  #: characters of an event's text
 REPEAT_NS: Final = NS_PER_S  #: how often an event that goes on is published again
 #: A limit not touched for so long begins a new episode when it is touched again.
 EPISODE_NS: Final = NS_PER_S
-#: Why a landing is given up.
+#: Why a hover or a landing is given up.
 UNHEARD: Final = f"the vehicle was not heard for {seconds(BELIEF_NS):g} s, and may be on another flight by now"
 _ENFORCED: Final = "enforced: its position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
@@ -248,10 +248,10 @@ def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
-def landing_given_up_event() -> EventDraft:
-    """A pilot's landing is given up because the vehicle was not heard."""
-    text = f"the landing is given up: {UNHEARD}: land it again when it is heard"
-    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": "landing_given_up"})
+def given_up_event(what: str) -> EventDraft:
+    """A hover, or a landing, is given up because the vehicle was not heard."""
+    text = f"the {what} is given up: {UNHEARD}: {'land' if what == 'landing' else 'command'} it again when it is heard"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": f"{what}_given_up"})
 
 
 def drift_event(drifts: bool) -> EventDraft:

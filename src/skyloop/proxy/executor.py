@@ -114,17 +114,23 @@ class ActionExecutor:
         Raises:
             RefusedError: The vehicle is sure not to do it, as it is now.
         """
-        if type(action) in self.native and not (self.guarded and type(action) is Position and self.autopilot):
-            applied = self._driver.apply(action, new=new)
-            if self.autopilot is not None:
-                self.autopilot.stop(action.name)
-        else:
-            try:
-                self._driver.check(action)
-            except DriverError as error:
-                raise RefusedError(str(error), code=Refusal.WRONG_STATE) from error
-            self._start(action, now_ns)
-            applied = action
+        autopilot = self.autopilot
+        try:
+            if type(action) in self.native and not (self.guarded and type(action) is Position and autopilot):
+                applied = self._driver.apply(action, new=new)
+                if autopilot is not None:
+                    autopilot.stop(action.name)
+            else:
+                try:
+                    self._driver.check(action)
+                except DriverError as error:
+                    raise RefusedError(str(error), code=Refusal.WRONG_STATE) from error
+                self._start(action, now_ns)
+                applied = action
+        except Exception:
+            if autopilot is not None and isinstance(action, Hover | Land):
+                autopilot.brake()
+            raise
         self.flight.sent(applied)
         return applied
 
@@ -140,13 +146,15 @@ class ActionExecutor:
     def failsafe(self, action: Hover | Land, now_ns: int) -> bool:
         """Hover or land with nobody in command; returns whether it was taken. A failure is published, not raised."""
         if type(action) in self.native:
+            taken = False
             try:
                 taken = self._driver.failsafe(action)
             except Exception as error:  # noqa: BLE001  it is reported, and tried again
                 self._vehicle.driver_failed("failsafe", error)
-                return False
             if taken and self.autopilot is not None:
                 self.autopilot.stop(action.name)
+            elif self.autopilot is not None:
+                self.autopilot.brake()
         elif type(action) in self.supported:
             self._start(action, now_ns)
             taken = True

@@ -70,7 +70,7 @@ from skyloop.proxy.events import (
     emergency_event,
     enforcement_event,
     failsafe_event,
-    landing_given_up_event,
+    given_up_event,
     ownership_event,
     position_jumped_event,
     refused_event,
@@ -431,7 +431,8 @@ class CommandHandler:
         elif kind is Land:
             goes_on = ladder.lands_on
         else:
-            goes_on = ladder.step is Failsafe.HOVER and kind is Hover and not vehicle.link_up
+            asked_anew = ladder.given_up or vehicle.link_up
+            goes_on = ladder.step is Failsafe.HOVER and kind is Hover and not asked_anew
         if not (goes_on or ladder.idle):
             self._apply_failsafe(self.ladder.fresh_command(), now_ns)
         return applied, applied_ns
@@ -666,26 +667,29 @@ class CommandHandler:
         self._update_failsafe(now_ns)
 
     def _observe_silence(self, now_ns: int) -> None:
-        """Give up a landing when the vehicle has not been heard for long: by then it may be on another flight.
+        """Give up a hover or landing when the vehicle has not been heard for long: by then it may be on another flight.
 
-        One that the ladder ordered leaves what is found in the air to others: nobody is there to say whose it is.
+        A landing that the ladder ordered leaves what is found in the air to others at once: nobody is there to say
+        whose it is. After all else that is given up it does so when the vehicle is heard, as its pilot may be there.
         """
         if self._vehicle.link_up:
             self._heard_ns = now_ns
             return
-        landing = self._landing
-        if landing is None and not self.ladder.lands:
+        ladder, asked = self.ladder, self._asked(Hover, Land)
+        if asked is None and not ladder.acts:
             return
-        asked_ns = self.ladder.wanted_ns if landing is None else landing.asked_ns  # its pilot may have left
-        if now_ns - max(asked_ns, self._heard_ns) >= BELIEF_NS:
-            if landing is not None:
-                self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: land it again", Refusal.VEHICLE_LINK_LOST)
-            if landing is not None or self.ladder.lands_on:
-                self.ladder.give_up_landing()
-            elif not self.flight.forget():
-                return
-            self._events.publish_drafts(landing_given_up_event())
-            self._update_failsafe(now_ns)
+        asked_ns = ladder.wanted_ns if asked is None else asked.asked_ns  # its pilot may have left
+        if now_ns - max(asked_ns, self._heard_ns) < BELIEF_NS:
+            return
+        what = "landing" if ladder.lands or self._landing is not None else "hover"
+        if asked is not None:
+            self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: ask for it again", Refusal.VEHICLE_LINK_LOST)
+        if ladder.step is not Failsafe.LAND:
+            ladder.give_up()
+        elif not self.flight.forget():
+            return
+        self._events.publish_drafts(given_up_event(what))
+        self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
         """Act on a sleep of the computer: all that is known is older than its clock says."""
@@ -719,12 +723,17 @@ class CommandHandler:
                 self._start_over(Fate.JUMPED, now_ns)
         airspace.jumped_m = 0.0
 
+    def _asked(self, *kinds: type[Action]) -> Intent | None:
+        """What the holder asks for, where that is of one of these kinds and under way."""
+        holder = self.authority.holder
+        session = self._sessions.get(holder.app_id) if holder is not None else None
+        newest = None if session is None else session.intents.newest
+        return newest if newest is not None and type(newest.action) in kinds and not newest.over else None
+
     @property
     def _landing(self) -> Intent | None:
         """Its pilot's landing, where the vehicle is, that is under way."""
-        holder = self.authority.holder
-        session = self._sessions.get(holder.app_id) if holder is not None else None
-        return session.intents.newest if session is not None and session.intents.lands else None
+        return self._asked(Land)
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
         """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""
@@ -762,9 +771,11 @@ class CommandHandler:
         if self._left:
             self._events.publish_drafts(*news)
             return
+        vehicle, link_up = self._vehicle, self._vehicle.link_up
+        if link_up and self.ladder.given_up:
+            self.flight.forget()
         self._observe_flight(now_ns)
-        vehicle, state = self._vehicle, self._executor.state
-        feedback, link_up = vehicle.feedback_now, vehicle.link_up
+        feedback, state = vehicle.feedback_now, self._executor.state
         landing = None if link_up else self._landing
         if landing is not None and landing.begun:
             self.ladder.land_on(now_ns)  # no hover takes its pilot's landing back

@@ -184,7 +184,7 @@ class VehiclePublisher:
         self.reported_state = raw.state
         state = self.state_of(raw.state)
         intent, app_id, name = self._newest
-        outcome = intent.outcome(app_id, name)
+        outcome = intent.outcome(app_id, name, state)
         self._told = outcome.fate, outcome.reason
         sample = _replace(
             raw,

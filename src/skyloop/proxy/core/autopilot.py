@@ -117,6 +117,10 @@ class Autopilot:
         self.mode = Mode.OFF
         self.flight.let_go(action_name)
 
+    def brake(self) -> None:
+        """Fly on no longer: the vehicle failed at what was to take the place of this."""
+        self._target = Velocity()
+
     def refused(self, reported: FlightState) -> None:
         """The vehicle refused what it was sent: a take-off of one that ``reported`` to stand is over."""
         if self.flight.refused(reported):

@@ -129,9 +129,14 @@ class Intent:
         if kind is ResetEmergency and self.begun and state is not FlightState.EMERGENCY:
             self.end(Fate.COMPLETED)
 
-    def outcome(self, app_id: int, name: str) -> Outcome:
-        """What feedback tells of it; ``name``: of the application."""
+    def outcome(self, app_id: int, name: str, state: FlightState) -> Outcome:
+        """What feedback tells of it; ``name``: of the application, ``state``: the vehicle's in that feedback.
+
+        Nothing of a take-off that has just come to be in the air: others may have taken the vehicle on its way up.
+        """
         fate = self.fate  # first, as another thread may end it now
+        if fate is Fate.UNDER_WAY and state in _UP and self.begun and type(self.action) is Takeoff:
+            return Outcome()
         if not self.text:
             return Outcome(app_id, max(0, self.number), fate)
         text = shortened(f"{name}: {self.action.name} refused: {self.text}", MAX_OUTCOME_TEXT)
