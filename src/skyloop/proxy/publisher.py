@@ -157,7 +157,7 @@ class VehiclePublisher:
             name: The application's name.
         """
         self._newest = intent, app_id, name
-        if intent.over and (intent.fate, intent.reason) != self._told:
+        if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._told:
             self._published_ns = -KEEP_ALIVE_NS
 
     @property

@@ -43,7 +43,7 @@ from skyloop.messages.command import ENDINGS, MAX_OUTCOME_TEXT, SET_POINTS
 from skyloop.proxy.core.airspace import Airspace, Verdict
 from skyloop.proxy.core.authority import Authority
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
-from skyloop.proxy.core.flight import Flight, Whose
+from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, StartPoint
 from skyloop.proxy.core.settings import Clamp, ReturnSettings
 
@@ -301,29 +301,18 @@ class CommandChecks:
         return explain(refusal, command, intents.seq, now_ns=now_ns, max_age_ns=self.max_age_ns, lease=lease)
 
     def decide(
-        self,
-        action: AnyAction,
-        intent: Intent,
-        state: FlightState,
-        link: LinkState,
-        feedback: Feedback | None,
-        now_ns: int,
-        *,
-        new: bool,
-        automatic: bool = False,
+        self, action: AnyAction, intent: Intent, seen: Snapshot, *, new: bool, automatic: bool = False
     ) -> Decision:
         """Decide what the vehicle does of a command whose intent is under way. Not for an emergency stop.
 
         Args:
             action: any action but :class:`Idle` and :class:`EmergencyStop`.
             intent: what it is asked for, or repeated, by.
-            state: the flight state now.
-            link: the state of the link to the vehicle.
-            feedback: the newest sample, for altitude and position; None: none came yet.
-            now_ns: the time now, on the proxy's clock [ns].
+            seen: what is known of the vehicle.
             new: whether the application newly asked for it; else the library repeats it, or asks for it by itself.
             automatic: whether the library asks for it by itself.
         """
+        now_ns, state, feedback, link, _ = seen
         kind = type(action)
         policy = STATE_POLICIES[kind][state]
         if new and kind is ReturnToStart:
@@ -332,7 +321,7 @@ class CommandChecks:
             policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
             policy = StatePolicy.APPLY  # that it lands, or stands, was before: it may have heard something else since
-        problem = self._problem(action, policy, state, link, new=new, automatic=automatic)
+        problem = self._problem(action, policy, seen, new=new, automatic=automatic)
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
@@ -384,16 +373,10 @@ class CommandChecks:
         return decision.why if decision.action is None and decision.refusal is not None else ""
 
     def _problem(
-        self,
-        action: AnyAction,
-        policy: StatePolicy,
-        state: FlightState,
-        link: LinkState,
-        *,
-        new: bool,
-        automatic: bool,
+        self, action: AnyAction, policy: StatePolicy, seen: Snapshot, *, new: bool, automatic: bool
     ) -> tuple[Refusal, str] | None:
         """What forbids a command of the holder, whatever the policy of the flight state is."""
+        state, link = seen.state, seen.link
         kind = type(action)
         unheard = link is LinkState.LOST and kind in self._unheard and not automatic
         if link is not LinkState.UP and link is not LinkState.DEGRADED and not unheard:

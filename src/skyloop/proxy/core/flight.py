@@ -8,9 +8,8 @@ alone. The rules in words are in ``docs/proxy.md``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Final
+from typing import Final, NamedTuple
 
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.messages import (
@@ -20,6 +19,7 @@ from skyloop.messages import (
     Feedback,
     FlightState,
     Hover,
+    LinkState,
     Position,
     Takeoff,
     Velocity,
@@ -53,12 +53,21 @@ class Whose(Enum):
     OTHERS = auto()  #: somebody else does: a remote control, a ground station, another program
 
 
-@dataclass(frozen=True, slots=True)
-class Changed:
+class Changed(NamedTuple):
     """The flight is somebody else's now. ``why``: to be published, empty where it is already."""
 
     whose: Whose
     why: str = ""
+
+
+class Snapshot(NamedTuple):
+    """What is known of the vehicle where something is decided: read once, and passed on."""
+
+    now_ns: int
+    state: FlightState
+    feedback: Feedback | None  #: the newest sample; None: none came yet
+    link: LinkState
+    link_up: bool
 
 
 class Flight:
