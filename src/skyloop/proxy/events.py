@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import threading
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from skyloop.clock import NS_PER_S, Clock, seconds
 from skyloop.errors import shortened
@@ -22,6 +22,9 @@ from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
 from skyloop.proxy.core.settings import Clamp
 from skyloop.transport.base import EVENTS
 from skyloop.zones import THINNEST_M, ZONES, Space
+
+if TYPE_CHECKING:
+    from skyloop.proxy.requests import Session
 
 #: Command delays that the distribution is taken over: about a minute of one pilot at 32 Hz.
 WINDOW: Final = 2000
@@ -90,7 +93,8 @@ class EventPublisher:
         data: dict[str, Value] | None = None,
     ) -> None:
         """Publish one event now."""
-        self.publish_drafts(EventDraft(kind, text, severity, app, data or {}))
+        with self._lock:
+            self._send([EventDraft(kind, text, severity, app, data or {})])
 
     def publish_drafts(self, *drafts: EventDraft) -> None:
         """Publish these events now, in this order."""
@@ -311,34 +315,34 @@ def slept_event(slept_s: float) -> EventDraft:
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
-class EventContext(NamedTuple):
-    """What an event's text needs besides the change itself."""
-
-    now_ns: int
-    name: Callable[[int], str]  #: name of an application, by its number
-    identity: Callable[[int], str]  #: what the transport knows about an application
-    holder: str  #: name of who holds the authority now; empty for nobody
+def name_of(sessions: Mapping[int, Session], app_id: int) -> str:
+    """Return an application's name, by its number."""
+    session = sessions.get(app_id)
+    return session.name if session is not None else f"application {app_id}"
 
 
-def authority_event(effect: authority.Effect, context: EventContext) -> EventDraft:
-    """Return the event of one change of the authority."""
-    name, severity = context.name(effect.app_id), Severity.WARNING
+def authority_event(
+    effect: authority.Effect, sessions: Mapping[int, Session], holder: authority.QueueEntry | None, now_ns: int
+) -> EventDraft:
+    """Return the event of one change of the authority; ``holder``: who has it after all of them."""
+    name, severity = name_of(sessions, effect.app_id), Severity.WARNING
     data: dict[str, Value] = {"app_id": effect.app_id}
     if not isinstance(effect, authority.Queued | authority.Declined):
         data["lease"] = effect.lease
     by = ""
     if isinstance(effect, authority.Preempted | authority.Asked | authority.Withdrawn):
-        by = context.name(effect.by_id)
+        by = name_of(sessions, effect.by_id)
         data |= {"by": by, "by_id": effect.by_id}
     if isinstance(effect, authority.Preempted | authority.Asked):
         data["by_priority"] = effect.by_priority
     match effect:
         case authority.Granted():
             kind, severity, term = EventKind.AUTHORITY_GRANTED, Severity.INFO, ""
-            data |= {"priority": effect.priority, "identity": context.identity(effect.app_id)}
+            session = sessions.get(effect.app_id)
+            data |= {"priority": effect.priority, "identity": "" if session is None else session.peer.address}
             if effect.until_ns is not None:
                 data["until_ns"] = effect.until_ns
-                term = f", for {seconds(effect.until_ns - context.now_ns):.0f} s"
+                term = f", for {seconds(effect.until_ns - now_ns):.0f} s"
             text = f"{name} has the authority (priority {effect.priority}, lease {effect.lease}{term})"
         case authority.Queued():
             kind, severity = EventKind.AUTHORITY_QUEUED, Severity.INFO
@@ -349,8 +353,8 @@ def authority_event(effect: authority.Effect, context: EventContext) -> EventDra
                 text += f", for about {seconds(effect.wait_ns):.0f} s"
         case authority.Lost():
             kind, text = EventKind.AUTHORITY_LOST, f"{name} lost the authority: {effect.reason}"
-            data |= {"reason": effect.reason, "by": context.holder}
-            if effect.reason == "silent" and not context.holder:
+            data |= {"reason": effect.reason, "by": "" if holder is None else name_of(sessions, holder.app_id)}
+            if effect.reason == "silent" and holder is None:
                 text += "; it is still listed as the holder until another application asks"
         case authority.Preempted():
             kind = EventKind.AUTHORITY_PREEMPTED
@@ -359,13 +363,13 @@ def authority_event(effect: authority.Effect, context: EventContext) -> EventDra
             if effect.granted:
                 text = f"{name} handed the authority over to {by} (priority {effect.by_priority})"
         case authority.Asked():
-            kind, within_s = EventKind.AUTHORITY_ASKED, seconds(effect.until_ns - context.now_ns)
+            kind, within_s = EventKind.AUTHORITY_ASKED, seconds(effect.until_ns - now_ns)
             data["within_s"] = within_s
             if effect.term_ns is not None:
                 data["for_s"] = seconds(effect.term_ns)
             text = f"{by} (priority {effect.by_priority}) asks {name} for the authority, within {within_s:.0f} s"
         case authority.Declined():
-            kind, severity, by = EventKind.AUTHORITY_DECLINED, Severity.INFO, context.name(effect.holder_id)
+            kind, severity, by = EventKind.AUTHORITY_DECLINED, Severity.INFO, name_of(sessions, effect.holder_id)
             data |= {"by": by, "by_id": effect.holder_id, "reason": effect.reason}
             why = f": {effect.reason}" if effect.reason else ""
             text = f"{by} does not hand the authority over to {name} yet{why}"

@@ -51,6 +51,7 @@ from skyloop.proxy.events import (
     clamped_event,
     emergency_event,
     enforcement_event,
+    name_of,
     refused_event,
     taken_event,
     thin_zones_event,
@@ -182,7 +183,7 @@ class CommandHandler(FlightSupervisor):
             assert holder is not None  # a request leaves somebody in command
             if holder.app_id == app_id:
                 return AuthorityGranted(authority.lease, authority.until_ns or 0)
-            name, position = self._name(holder.app_id), authority.position(app_id)
+            name, position = name_of(self._sessions, holder.app_id), authority.position(app_id)
             wait_ns, asked = authority.wait_ns(app_id, now_ns), authority.asking(app_id, now_ns)
         if position:
             wait_s = None if wait_ns is None else seconds(wait_ns)
@@ -241,7 +242,7 @@ class CommandHandler(FlightSupervisor):
         vehicle, checks, flight = self._vehicle, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
-        if not flight.ours:
+        if flight.whose is not Whose.OURS:
             self._look(now_ns)
         intents = session.intents
         state = self._observe_intent(session, now_ns)  # what ends intents before this one came does not end this one
@@ -298,7 +299,7 @@ class CommandHandler(FlightSupervisor):
             if decision.takes_off:
                 flight.claim(now_ns)
                 self._rising_until_ns = intent.asked_ns + TAKEOFF_NS
-            if not flight.ours or kind is Takeoff:
+            if flight.whose is not Whose.OURS or kind is Takeoff:
                 self._take_vehicle(session, applied, new)
         intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
@@ -317,7 +318,7 @@ class CommandHandler(FlightSupervisor):
             asked_anew = ladder.given_up or vehicle.link_up
             goes_on = ladder.step is Failsafe.HOVER and kind is Hover and not asked_anew
         if not (goes_on or ladder.idle):
-            self._apply_failsafe(ladder.fresh_command(), now_ns)
+            self._events.publish_drafts(*self._apply_failsafe(ladder.fresh_command(), now_ns))
         return applied, applied_ns
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
@@ -409,6 +410,7 @@ class CommandHandler(FlightSupervisor):
         if type(command.action) is Takeoff:
             self._withdraw_takeoff(now_ns)
         if self.ladder.lands_on and type(command.action) is not Land and not command.automatic:
-            self._apply_failsafe(self.ladder.fresh_command(), now_ns)  # the landing is not wanted any more
+            drafts = self._apply_failsafe(self.ladder.fresh_command(), now_ns)  # the landing is not wanted any more
+            self._events.publish_drafts(*drafts)
             self.ladder.hand_over(now_ns)
         return self._refuse(session, command, reason, why)

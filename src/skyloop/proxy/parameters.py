@@ -311,12 +311,12 @@ class Parameters:
             self._changed = set()
             return self._settings
 
-    def set(self, name: str, value: Value) -> Parameter:
-        """Write one parameter and return it as it is now.
+    def set(self, name: str, value: Value, known: Parameter | None = None) -> Parameter:
+        """Write one parameter and return it as it is now; ``known``: as :meth:`get` returned it just now.
 
         Raises :class:`UnknownNameError`, :class:`ParameterError`, and whatever the driver raises.
         """
-        parameter = self.get(name)
+        parameter = known or self.get(name)
         value = check(parameter, value)
         with self._lock:
             is_driver = name in self._driver
@@ -403,22 +403,23 @@ class ParameterRequests:
 
     def set(self, session: Session, request: SetParameter, now_ns: int) -> AnyReply:
         """Write one for the holder of the authority. Raises what :meth:`Parameters.set` raises."""
-        waited_ns, momentary = self._clock() - now_ns, self._parameters.get(request.name).momentary
-        if momentary and waited_ns > MOMENT_NS:
-            why = f"{request.name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
+        name, value = request.name, request.value
+        waited_ns, known = self._clock() - now_ns, self._parameters.get(name)
+        if known.momentary and waited_ns > MOMENT_NS:
+            why = f"{name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
             return Refused(Refusal.STALE, why)
-        if request.name in self._free and session.role is Role.PILOT:
-            return ParameterValue(self._parameters.set(request.name, request.value))
+        if name in self._free and session.role is Role.PILOT:
+            return ParameterValue(self._parameters.set(name, value, known))
         if not self._handler.holds(session, request.lease):
             code = Refusal.FOREIGN_LEASE if request.lease else Refusal.NO_AUTHORITY
             return Refused(code, "writing a parameter needs the authority: request it, and name its lease")
-        if momentary and (problem := self._handler.problem_with_moment()):
-            return Refused(Refusal.WRONG_STATE, f"{request.name} is not done now: {problem}")
-        if request.name == "limits.altitude" and isinstance(request.value, int | float):
-            problem = self._handler.problem_with_ceiling(float(request.value))
+        if known.momentary and (problem := self._handler.problem_with_moment()):
+            return Refused(Refusal.WRONG_STATE, f"{name} is not done now: {problem}")
+        if name == "limits.altitude" and isinstance(value, int | float):
+            problem = self._handler.problem_with_ceiling(float(value))
             if problem:
-                return Refused(Refusal.OUT_OF_RANGE, f"{request.name} can't be {request.value:g} m now: {problem}")
-        parameter = self._parameters.set(request.name, request.value)
+                return Refused(Refusal.OUT_OF_RANGE, f"{name} can't be {value:g} m now: {problem}")
+        parameter = self._parameters.set(name, value, known)
         self._handler.configure(self._parameters.flight_settings())
         unit = f" {parameter.unit}" if parameter.unit else ""
         text = f"{session.name} set {parameter.name} to {parameter.value!r}{unit}"

@@ -13,6 +13,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from functools import partial
 from queue import SimpleQueue
 from typing import Any, Final, Protocol
 
@@ -248,7 +249,7 @@ class RequestDispatcher:
         if answer is not None:
             self._finish(session, request, answer(session, request.body, now_ns))
         else:
-            self._jobs.put(lambda: self._answer_later(session, request, now_ns))
+            self._jobs.put(partial(self._answer_later, session, request, now_ns))
 
     def _answer_later(self, session: Session, request: Request, now_ns: int) -> None:
         kind = type(request.body)

@@ -37,7 +37,6 @@ from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import BELIEF_NS, Snapshot, Whose
 from skyloop.proxy.events import (
     UNHEARD,
-    EventContext,
     EventDraft,
     EventPublisher,
     authority_event,
@@ -45,6 +44,7 @@ from skyloop.proxy.events import (
     drift_event,
     failsafe_event,
     given_up_event,
+    name_of,
     ownership_event,
     position_jumped_event,
     slept_event,
@@ -351,25 +351,12 @@ class FlightSupervisor:
                 session.intents.end(Fate.AUTHORITY)
                 self._tell(session)
                 self._withdraw_takeoff(now_ns)
-        ended = [self._authority_draft(one, now_ns) for one in effects if isinstance(one, Lost | Preempted)]
-        self._update_failsafe(now_ns, [*news, *ended], stamps=True)  # which hovers, before anybody learns of this
+        drafts = self._act(now_ns, stamps=True)  # which hovers, before anybody learns of any of this
+        holder, ended, rest = self.authority.holder, list(news), []
         for effect in effects:
-            if not isinstance(effect, Lost | Preempted):
-                self._events.publish_drafts(self._authority_draft(effect, now_ns))
-
-    def _authority_draft(self, effect: AuthorityEffect, now_ns: int) -> EventDraft:
-        holder = self.authority.holder
-        holder_name = "" if holder is None else self._name(holder.app_id)
-        return authority_event(effect, EventContext(now_ns, self._name, self._identity, holder_name))
-
-    def _identity(self, app_id: int) -> str:
-        """What the transport knows about an application."""
-        session = self._sessions.get(app_id)
-        return "" if session is None else session.peer.address
-
-    def _name(self, app_id: int) -> str:
-        session = self._sessions.get(app_id)
-        return session.name if session is not None else f"application {app_id}"
+            draft = authority_event(effect, self._sessions, holder, now_ns)
+            (ended if isinstance(effect, Lost | Preempted) else rest).append(draft)
+        self._events.publish_drafts(*ended, *drafts, *rest)
 
     def _stamp(self) -> None:
         """Let feedback show who is in command, the failsafe's step and whose the flight is."""
@@ -377,7 +364,7 @@ class FlightSupervisor:
         owner = authority.holder or authority.silent
         self._vehicle.stamp(
             {
-                "owner": self._name(owner.app_id) if owner is not None else None,
+                "owner": name_of(self._sessions, owner.app_id) if owner is not None else None,
                 "owner_id": owner.app_id if owner is not None else 0,
                 "owner_priority": owner.priority if owner is not None else None,
                 "lease": authority.lease,
@@ -390,14 +377,16 @@ class FlightSupervisor:
 
     # Failsafe -----------------------------------------------------------------------------------------------------
 
-    def _update_failsafe(self, now_ns: int, news: Sequence[EventDraft] = (), *, stamps: bool = False) -> None:
-        """Let the ladder decide and act.
+    def _update_failsafe(self, now_ns: int) -> None:
+        """Let the ladder decide and act, and publish what it did."""
+        drafts = self._act(now_ns)
+        if drafts:
+            self._events.publish_drafts(*drafts)
 
-        ``news``: to be published then, before its own; ``stamps``: who is in command has changed.
-        """
+    def _act(self, now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
+        """Let the ladder decide and act; return what is to be published. ``stamps``: who is in command has changed."""
         if self._left:
-            self._events.publish_drafts(*news)
-            return
+            return []
         ladder, flight = self.ladder, self.flight
         if self._vehicle.link_up and ladder.given_up:
             flight.forget()
@@ -416,32 +405,26 @@ class FlightSupervisor:
             shown=seen.link_up or Land not in self._executor.native,
         )
         effects = ladder.update(now_ns, inputs)
-        if effects or news or stamps:
-            self._apply_failsafe(effects, now_ns, news, stamps=stamps)
+        return self._apply_failsafe(effects, now_ns, stamps=stamps) if effects or stamps else []
 
-    def _apply_failsafe(
-        self, effects: list[FailsafeEffect], now_ns: int, news: Sequence[EventDraft] = (), *, stamps: bool = False
-    ) -> None:
-        """Act first, as each event takes its time, and publish then."""
-        drafts = [*news]
+    def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
+        """Do what the ladder decided; return what is to be published then, as each event takes its time."""
         if stamps or any(isinstance(effect, StepChange) for effect in effects):
             self._stamp()
-        try:
-            for effect in effects:
-                if isinstance(effect, StepChange):
-                    if effect.step is not Failsafe.NONE:
-                        self._end_intents(Fate.FAILSAFE, self._clock())
-                    drafts.append(failsafe_event(effect))
-                elif isinstance(effect, BatteryLow):
-                    drafts.append(battery_event(effect))
-                elif isinstance(effect.action, ReturnToStart):
-                    self._back.begin(effect.action, now_ns)
-                    self.ladder.attempted(True)
-                else:
-                    self.checks.back = None
-                    taken = self._executor.failsafe(effect.action, now_ns)
-                    self.ladder.attempted(taken)
-                    if taken:
-                        self._echo_own(effect.action, now_ns)
-        finally:
-            self._events.publish_drafts(*drafts)
+        for effect in effects:
+            if isinstance(effect, StepChange):
+                if effect.step is not Failsafe.NONE:
+                    self._end_intents(Fate.FAILSAFE, self._clock())
+            elif isinstance(effect, BatteryLow):
+                continue
+            elif isinstance(effect.action, ReturnToStart):
+                self._back.begin(effect.action, now_ns)
+                self.ladder.attempted(True)
+            else:
+                self.checks.back = None
+                taken = self._executor.failsafe(effect.action, now_ns)
+                self.ladder.attempted(taken)
+                if taken:
+                    self._echo_own(effect.action, now_ns)
+        drafts = [failsafe_event(one) for one in effects if isinstance(one, StepChange)]
+        return drafts + [battery_event(one) for one in effects if isinstance(one, BatteryLow)]

@@ -393,7 +393,8 @@ class CommandChecks:
                 return Refusal.WRONG_STATE, f"{others}, and {what} does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
-        if self._ladder.lands_for_battery and (kind in SET_POINTS or (automatic and kind is not Land)):
+        by_itself = automatic and kind is not Land
+        if self._ladder.step is Failsafe.LAND and self._ladder.lands_for_battery and (by_itself or kind in SET_POINTS):
             what = "returns to its start" if self._ladder.returning else "lands"
             return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
         if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:

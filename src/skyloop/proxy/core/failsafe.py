@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import NS_PER_S
 from skyloop.messages import Failsafe, FlightState, Hover, Land, ReturnToStart
 from skyloop.proxy.core.settings import FailsafeSettings
 
@@ -105,11 +105,11 @@ def due(
         return Failsafe.LAND, "battery_return"
     silent_ns = now_ns - inputs.last_command_ns
     silence = "silent" if inputs.pilot == "held" else inputs.pilot
-    if silent_ns >= nanoseconds(settings.land_after_s):
+    if silent_ns >= settings.land_after_s * NS_PER_S:
         return Failsafe.LAND, silence
     if inputs.state is FlightState.LANDING:  # better to end a landing than to hang over the place
         return Failsafe.NONE, ""
-    if silent_ns >= nanoseconds(settings.hover_after_s) or inputs.pilot == "gone":
+    if silent_ns >= settings.hover_after_s * NS_PER_S or inputs.pilot == "gone":
         return Failsafe.HOVER, silence
     if not inputs.link_up:
         return Failsafe.HOVER, "vehicle_link"
@@ -272,5 +272,5 @@ class FailsafeLadder:
             return []
         if isinstance(wanted, ReturnToStart) and state is FlightState.TAKING_OFF:
             return []
-        self._next_try_ns = now_ns + nanoseconds(self.settings.retry_s)
+        self._next_try_ns = now_ns + int(self.settings.retry_s * NS_PER_S)
         return [FailsafeAction(wanted)]

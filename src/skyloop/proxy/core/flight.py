@@ -41,6 +41,7 @@ STALL_HEADWAY: Final = 0.02  #: [m]
 BLIND_NS: Final = 15 * NS_PER_S  #: of a landing that nothing shows, nobody can say by then what became of it
 
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
+_AIRBORNE: Final = frozenset(state for state in FlightState if state.airborne)
 _MANOEUVRES: Final = (FlightState.TAKING_OFF, FlightState.LANDING)
 _FLYING: Final = (Takeoff, Hover, Attitude, Velocity, Position)
 
@@ -114,7 +115,7 @@ class Flight:
             if self._has_no_notion or state in _MANOEUVRES:
                 return state
             return state if reported is FlightState.FLYING and state is FlightState.HOVERING else reported
-        if not self._has_no_notion or (reported.airborne and not state.airborne):
+        if not self._has_no_notion or (reported in _AIRBORNE and state not in _AIRBORNE):
             return reported
         return state
 
@@ -123,7 +124,7 @@ class Flight:
 
         A vehicle of which nothing is known flies if it was seen to, or from the first command to do so.
         """
-        return state.airborne or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
+        return state in _AIRBORNE or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
 
     def may_begin(self, now_ns: int) -> bool:
         """Return whether a take-off was asked for that does not show yet: what stands may be about to fly."""
@@ -205,7 +206,7 @@ class Flight:
             self._stands(now_ns)
         else:
             self._grounded_ns = None
-            if state.airborne:
+            if state in _AIRBORNE:
                 self._seen_up = True
             if flies:
                 self._claimed_until_ns = None  # the take-off shows
