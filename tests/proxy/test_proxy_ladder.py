@@ -775,7 +775,12 @@ def test_what_is_steered_in_software_stands_still_where_the_vehicle_fails_to_hov
         monkeypatch.setattr(bench.driver, "_apply", broken)
         if by == "its pilot":
             pilot.command(action)
-            bench.run(0.3, lambda: (bench.driver.report(), pilot.command(action, repeat=True)))
+
+            def go_on() -> None:
+                bench.driver.report()
+                pilot.command(action, repeat=True)
+
+            bench.run(0.3, go_on)
         else:
             bench.run(0.7 if action == Hover() else 5.4, lambda: bench.driver.report())
         assert abs(bench.driver.told[-1].pitch) < 0.05  # type: ignore[union-attr]

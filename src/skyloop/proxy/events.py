@@ -11,7 +11,7 @@ import threading
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from skyloop.clock import NS_PER_S, Clock, seconds
 from skyloop.errors import shortened
@@ -20,11 +20,8 @@ from skyloop.proxy.core import authority
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
 from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
 from skyloop.proxy.core.settings import Clamp
-from skyloop.transport.base import EVENTS
+from skyloop.transport.base import EVENTS, Peer
 from skyloop.zones import THINNEST_M, ZONES, Space
-
-if TYPE_CHECKING:
-    from skyloop.proxy.requests import Session
 
 #: Command delays that the distribution is taken over: about a minute of one pilot at 32 Hz.
 WINDOW: Final = 2000
@@ -315,14 +312,21 @@ def slept_event(slept_s: float) -> EventDraft:
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
-def name_of(sessions: Mapping[int, Session], app_id: int) -> str:
+class Named(Protocol):
+    """An application that is connected."""
+
+    name: str
+    peer: Peer
+
+
+def name_of(sessions: Mapping[int, Named], app_id: int) -> str:
     """Return an application's name, by its number."""
     session = sessions.get(app_id)
     return session.name if session is not None else f"application {app_id}"
 
 
 def authority_event(
-    effect: authority.Effect, sessions: Mapping[int, Session], holder: authority.QueueEntry | None, now_ns: int
+    effect: authority.Effect, sessions: Mapping[int, Named], holder: authority.QueueEntry | None, now_ns: int
 ) -> EventDraft:
     """Return the event of one change of the authority; ``holder``: who has it after all of them."""
     name, severity = name_of(sessions, effect.app_id), Severity.WARNING

@@ -35,15 +35,7 @@ from skyloop.zones import Vec3
 
 
 class ActionExecutor:
-    """Sends supported actions to the driver and does the rest with the software autopilot.
-
-    Args:
-        driver: the vehicle's driver.
-        capabilities: what it reported about the vehicle.
-        flight: what is known of the vehicle's flight.
-        autopilot: the software autopilot; None for a vehicle that it adds nothing to.
-        publisher: what the vehicle reported, and where the driver's failures are reported.
-    """
+    """Sends supported actions to the driver and does the rest with the software autopilot, if there is one."""
 
     def __init__(
         self,
@@ -117,13 +109,8 @@ class ActionExecutor:
     def execute(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
         """Carry out a supported action and return what was really applied. Raises what the driver raises.
 
-        Args:
-            action: The action.
-            now_ns: The time.
-            new: An application newly asked for it; else it repeats what was applied before.
-
-        Raises:
-            RefusedError: The vehicle is sure not to do it, as it is now.
+        ``new``: an application newly asked for it; else it repeats what was applied before. Raises
+        :class:`RefusedError` where the vehicle is sure not to do it, as it is now.
         """
         autopilot = self.autopilot
         try:
@@ -213,13 +200,7 @@ class ActionExecutor:
 
 
 class ReturnSupervisor:
-    """Flies the vehicle back to its start where the failsafe ladder says so, and knows what feedback shows of that.
-
-    Args:
-        checks: Hold the start, and the flight back that a pilot or the ladder began.
-        ladder: Whether to return.
-        executor: Carries actions out.
-    """
+    """Flies the vehicle back to its start where the failsafe ladder says so, and knows what feedback shows of that."""
 
     def __init__(self, checks: CommandChecks, ladder: FailsafeLadder, executor: ActionExecutor) -> None:
         self.start: Vec3 | None = None  #: where the vehicle took off, as feedback shows it [m]

@@ -40,7 +40,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.command import SET_POINTS
 from skyloop.messages.fields import LATEST_NS
-from skyloop.proxy.core.command_checks import TAKEOFF_NS, Intent
+from skyloop.proxy.core.command_checks import TAKEOFF_NS, Intent, explain
 from skyloop.proxy.core.failsafe import REASONS
 from skyloop.proxy.core.flight import Snapshot, Whose
 from skyloop.proxy.core.settings import Clamp, FlightSettings
@@ -127,8 +127,7 @@ class CommandHandler(FlightSupervisor):
     def order_landing(self, now_ns: int) -> bool:
         """Land because the proxy is about to end; from now on only landing and emergency stop are accepted.
 
-        Returns:
-            Whether anything of the proxy's flies, or may be about to.
+        Returns whether anything of the proxy's flies, or may be about to.
         """
         with self._lock:
             self.ladder.order_landing()
@@ -250,7 +249,10 @@ class CommandHandler(FlightSupervisor):
         if refusal is not None:
             if session.role is not Role.PILOT:
                 return self._refuse_role(session, command), now_ns
-            return self._refuse(session, command, refusal, checks.explain(refusal, command, intents, now_ns)), now_ns
+            why = explain(
+                refusal, command, intents.seq, now_ns=now_ns, max_age_ns=checks.max_age_ns, lease=self.authority.lease
+            )
+            return self._refuse(session, command, refusal, why), now_ns
         action = command.action
         kind = type(action)
         intent, new = intents.receive(command, state, now_ns)

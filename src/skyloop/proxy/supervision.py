@@ -62,14 +62,8 @@ SLEEP_NS: Final = nanoseconds(0.25)
 class FlightSupervisor:
     """Authority, failsafe and ownership of one vehicle. Public methods may be called from any thread.
 
-    Args:
-        executor: carries actions out; called under the lock only.
-        publisher: what the vehicle reported.
-        events: where events are published.
-        server: where echoes of commands are published.
-        sessions: the connections, by the application's number; read here, changed by the proxy.
-        clock: the proxy's clock [ns].
-        slept: for how long the computer has slept, in all [ns].
+    ``sessions``: the connections by the application's number, read here and changed by the proxy. ``slept``: for how
+    long the computer has slept, in all [ns].
     """
 
     def __init__(
@@ -123,8 +117,7 @@ class FlightSupervisor:
     def tick(self, now_ns: int) -> None:
         """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace.
 
-        Raises:
-            Exception: What the driver raised when it was asked who flies the vehicle, when all else is done.
+        Raises what the driver raised when it was asked who flies the vehicle, when all else is done.
         """
         with self._lock:
             if self._left:
@@ -352,11 +345,11 @@ class FlightSupervisor:
                 self._tell(session)
                 self._withdraw_takeoff(now_ns)
         drafts = self._act(now_ns, stamps=True)  # which hovers, before anybody learns of any of this
-        holder, ended, rest = self.authority.holder, list(news), []
-        for effect in effects:
-            draft = authority_event(effect, self._sessions, holder, now_ns)
-            (ended if isinstance(effect, Lost | Preempted) else rest).append(draft)
-        self._events.publish_drafts(*ended, *drafts, *rest)
+        holder = self.authority.holder
+        told = [(one, authority_event(one, self._sessions, holder, now_ns)) for one in effects]
+        ended = [draft for one, draft in told if isinstance(one, Lost | Preempted)]
+        rest = [draft for one, draft in told if not isinstance(one, Lost | Preempted)]
+        self._events.publish_drafts(*news, *ended, *drafts, *rest)
 
     def _stamp(self) -> None:
         """Let feedback show who is in command, the failsafe's step and whose the flight is."""

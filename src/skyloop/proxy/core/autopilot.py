@@ -66,13 +66,7 @@ _STATES: Final = {
 
 
 class Autopilot:
-    """Flies one vehicle in software.
-
-    Args:
-        native: The actions that the vehicle itself takes.
-        settings: Its tuning.
-        flight: What is known of the vehicle's flight; told what is done, and asked when that has ended.
-    """
+    """Flies one vehicle in software; ``flight`` is told what is done, and asked when that has ended."""
 
     def __init__(
         self, native: frozenset[str], settings: AutopilotSettings | None = None, flight: Flight | None = None

@@ -252,13 +252,8 @@ class Decision(NamedTuple):
 class CommandChecks:
     """Decides what becomes of the commands for one vehicle.
 
-    Args:
-        authority: who holds the lease; :meth:`receive` notes when its holder's last command came.
-        ladder: the failsafe ladder.
-        flight: whose it is.
-        supported: the actions that the vehicle or the software autopilot can do.
-        why_not: why others are not supported, for people; may be empty.
-        native: those that the vehicle itself takes.
+    ``supported``: the actions that the vehicle or the software autopilot can do; ``native``: those that the vehicle
+    itself takes; ``why_not``: why others are not, for people.
     """
 
     def __init__(
@@ -295,22 +290,13 @@ class CommandChecks:
             authority.last_command_ns = now_ns
         return refusal
 
-    def explain(self, refusal: Refusal, command: Command, intents: Intents, now_ns: int) -> str:
-        """Return why :meth:`receive` refused a command, for a person."""
-        lease = self._authority.lease
-        return explain(refusal, command, intents.seq, now_ns=now_ns, max_age_ns=self.max_age_ns, lease=lease)
-
     def decide(
         self, action: AnyAction, intent: Intent, seen: Snapshot, *, new: bool, automatic: bool = False
     ) -> Decision:
-        """Decide what the vehicle does of a command whose intent is under way. Not for an emergency stop.
+        """Decide what the vehicle does of a command whose intent is under way. Not for an emergency stop or idle.
 
-        Args:
-            action: any action but :class:`Idle` and :class:`EmergencyStop`.
-            intent: what it is asked for, or repeated, by.
-            seen: what is known of the vehicle.
-            new: whether the application newly asked for it; else the library repeats it, or asks for it by itself.
-            automatic: whether the library asks for it by itself.
+        ``new``: the application newly asked for it; else the library repeats it, or asks for it by itself
+        (``automatic``).
         """
         now_ns, state, feedback, link, _ = seen
         kind = type(action)

@@ -92,12 +92,7 @@ def due(
 ) -> tuple[Failsafe, str]:
     """Return the step that is due for a flight of ours, and why: the whole ladder.
 
-    Args:
-        now_ns: The time now [ns].
-        inputs: What is known of flight, pilot and vehicle.
-        settings: When each step is taken.
-        barred: Why set-points are refused now; may be empty.
-        battery_low: It is below the charge to return at, and the pilot has not taken over for that.
+    ``battery_low``: it is below the charge to return at, and the pilot has not taken over for that.
     """
     if barred:
         return Failsafe.LAND, barred

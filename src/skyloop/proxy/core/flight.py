@@ -190,11 +190,8 @@ class Flight:
     ) -> Changed | None:
         """Observe the vehicle.
 
-        Args:
-            reported: The flight state as the driver reported it last.
-            left_to: What others chose since we steered last, as the driver observes it.
-            now_ns: The time now [ns].
-            feedback: The newest sample, where the link is up and it is young; None: nothing is shown now.
+        ``left_to``: what others chose since we steered last, as the driver observes it. ``feedback``: the newest
+        sample, where the link is up and it is young; None: nothing is shown now.
         """
         if self._has_no_notion and not self._steered and feedback is not None:
             self._look(reported, left_to, feedback.altitude_m)
@@ -286,12 +283,7 @@ class Flight:
 
         What the vehicle reports counts where it reports anything. Else a descent has met the ground where the
         altimeter, near it, shows no headway. A landing without either goes on for :data:`BLIND_NS`, and nothing is
-        known then.
-
-        Args:
-            reported: The flight state as the driver reported it last.
-            now_ns: The time now [ns].
-            feedback: The newest sample, where the link is up and it is young; None: nothing is shown now.
+        known then. ``feedback``: as in :meth:`observe`.
         """
         landing = self._state is FlightState.LANDING
         if feedback is None:

@@ -74,13 +74,7 @@ class ReturnDecision(NamedTuple):
 
 
 class ReturnFlight:
-    """One flight back to the start point.
-
-    Args:
-        action: What was asked for.
-        start: Where the vehicle took off; None: not known.
-        settings: What holds where the action leaves it open.
-    """
+    """One flight back to the start point; ``settings`` hold where the action leaves something open."""
 
     def __init__(self, action: ReturnToStart, start: Vec3 | None, settings: ReturnSettings) -> None:
         self.phase = ReturnPhase.NONE
@@ -96,13 +90,7 @@ class ReturnFlight:
         self._stepped_ns = 0
 
     def step(self, airspace: Airspace, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
-        """Decide what the vehicle does now.
-
-        Args:
-            airspace: Where it may fly.
-            feedback: The newest sample; None: none came yet.
-            now_ns: The time now, on the clock of ``feedback.captured_ns`` [ns].
-        """
+        """Decide what the vehicle does now."""
         begins = self.phase is ReturnPhase.NONE
         if self.phase is not ReturnPhase.LANDING:
             airspace.observe(feedback)
