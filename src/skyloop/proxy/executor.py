@@ -25,11 +25,10 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.feedback import MAX_LINK_TEXT
-from skyloop.proxy.core.autopilot import Autopilot, software_actions
+from skyloop.proxy.core.autopilot import PATIENCE_NS, Autopilot, software_actions
 from skyloop.proxy.core.command_checks import CommandChecks
 from skyloop.proxy.core.failsafe import FailsafeLadder
 from skyloop.proxy.core.flight import STALE_NS, Changed, Flight, Snapshot
-from skyloop.proxy.core.returning import PATIENCE_NS
 from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.zones import Vec3
 

@@ -42,9 +42,9 @@ from skyloop.messages import (
 from skyloop.messages.command import ENDINGS, MAX_OUTCOME_TEXT, SET_POINTS
 from skyloop.proxy.core.airspace import Airspace, Verdict
 from skyloop.proxy.core.authority import Authority
+from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, StartPoint
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.flight import Flight, Snapshot, Whose
-from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, StartPoint
 from skyloop.proxy.core.settings import Clamp, ReturnSettings
 
 MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may lie: the error of the clocks' offset
