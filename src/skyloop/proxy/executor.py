@@ -131,12 +131,12 @@ class ActionExecutor:
         self.flight.sent(applied)
         return applied
 
-    def fly_to(self, place: Position, now_ns: int) -> bool:
-        """Fly to a place with nobody in command; returns whether it was taken. A failure is published, not raised."""
+    def attempt(self, action: AnyAction, now_ns: int, where: str) -> bool:
+        """Do what no application newly asked for; return whether it was taken. A failure is published, not raised."""
         try:
-            self.execute(place, now_ns, new=False)
+            self.execute(action, now_ns, new=False)
         except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
-            self._vehicle.driver_failed("failsafe", error)
+            self._vehicle.driver_failed(where, error)
             return False
         return True
 
@@ -255,7 +255,7 @@ class ReturnSupervisor:
         decision = self._checks.step_return(seen.feedback, now_ns)
         action, problem = decision.action, "" if decision.refusal is None else decision.why
         if isinstance(action, Position):
-            if not self._executor.fly_to(action, now_ns):
+            if not self._executor.attempt(action, now_ns, "failsafe"):
                 problem = "its driver fails to fly it there"
         elif action is None or seen.state is not FlightState.LANDING:
             self._executor.failsafe(action or Hover(), now_ns)

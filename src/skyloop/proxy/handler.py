@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
@@ -22,7 +22,6 @@ from skyloop.messages import (
     EmergencyStop,
     Failsafe,
     Fate,
-    Feedback,
     FlightState,
     Hover,
     Idle,
@@ -35,7 +34,6 @@ from skyloop.messages import (
     Role,
     Takeoff,
     Takeover,
-    Velocity,
     encode,
 )
 from skyloop.messages.command import SET_POINTS
@@ -43,14 +41,10 @@ from skyloop.messages.fields import LATEST_NS
 from skyloop.proxy.core.command_checks import TAKEOFF_NS, Intent, explain
 from skyloop.proxy.core.failsafe import REASONS
 from skyloop.proxy.core.flight import Snapshot, Whose
-from skyloop.proxy.core.settings import Clamp, FlightSettings
+from skyloop.proxy.core.settings import FlightSettings
 from skyloop.proxy.events import (
-    Counters,
-    Episodes,
     EventDraft,
-    clamped_event,
     emergency_event,
-    enforcement_event,
     name_of,
     refused_event,
     taken_event,
@@ -63,20 +57,10 @@ from skyloop.transport.base import COMMANDS
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
-_NOTICED_M_S: Final = 0.05  #: a step of the software autopilot that is shortened by less is not worth telling
 
 
 class CommandHandler(FlightSupervisor):
     """What applications ask of one vehicle. Public methods may be called from any thread."""
-
-    def __init__(self, *, counters: Counters, **parts: Any) -> None:
-        super().__init__(**parts)
-        self._counts = counters.counts
-        self._delays_ns = counters.delays_ns
-        self._enforced = True  # whether the safety box and zones could be, at the last set-point
-        self._episodes = Episodes()  # of limits that touch what the proxy does with nobody in command
-        if self._executor.autopilot is not None:
-            self._executor.autopilot.guard = self._guard_step
 
     def configure(self, settings: FlightSettings) -> None:
         """Let new values of the parameters take effect. Unchanged settings are the same object as before."""
@@ -278,7 +262,7 @@ class CommandHandler(FlightSupervisor):
         seen = Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
         decision = checks.decide(action, intent, seen, new=new, automatic=automatic)
         if decision.refusal is not None:
-            if decision.action is None or not self._stop_instead(decision.action, now_ns):
+            if decision.action is None or not self._executor.attempt(decision.action, now_ns, "apply"):
                 self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
         applied: AnyAction = _NOTHING
@@ -369,26 +353,6 @@ class CommandHandler(FlightSupervisor):
         self._counts["commands.applied"] += 1
         self._delays_ns.append(applied_ns - command.sent_ns)
         return applied_ns
-
-    def _report_limits(
-        self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
-    ) -> None:
-        """Publish what began to be in the way of a command of this application, or of what the proxy does itself."""
-        if enforced is not None and enforced is not self._enforced:
-            self._enforced = enforced
-            self._events.publish_drafts(enforcement_event(enforced))
-        episodes, name = (self._episodes, "the proxy") if session is None else (session.episodes, session.name)
-        for clamp in episodes.begun(clamps, now_ns):
-            self._events.publish_drafts(clamped_event(name, clamp))
-
-    def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
-        """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
-        allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
-        clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
-        if clamps or (enforced is not None and enforced is not self._enforced):
-            self._report_limits(self._holder, clamps, enforced, now_ns)
-        assert isinstance(allowed, Velocity)
-        return allowed
 
     def _refuse_role(self, session: Session, command: Command) -> AnyAction:
         if session.role is Role.OBSERVER:

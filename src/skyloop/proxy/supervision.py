@@ -21,11 +21,13 @@ from skyloop.messages import (
     Applied,
     Failsafe,
     Fate,
+    Feedback,
     FlightState,
     Hover,
     Land,
     Refusal,
     ReturnToStart,
+    Velocity,
     encode,
 )
 from skyloop.messages.fields import LATEST_NS
@@ -35,13 +37,18 @@ from skyloop.proxy.core.command_checks import CommandChecks, Intent
 from skyloop.proxy.core.failsafe import BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import BELIEF_NS, Snapshot, Whose
+from skyloop.proxy.core.settings import Clamp
 from skyloop.proxy.events import (
     UNHEARD,
+    Counters,
+    Episodes,
     EventDraft,
     EventPublisher,
     authority_event,
     battery_event,
+    clamped_event,
     drift_event,
+    enforcement_event,
     failsafe_event,
     given_up_event,
     name_of,
@@ -55,6 +62,7 @@ from skyloop.proxy.requests import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
+_NOTICED_M_S: Final = 0.05  #: a step of the software autopilot that is shortened by less is not worth telling
 #: So much more sleep of the computer than was known is one: shorter ones are not told from a delay.
 SLEEP_NS: Final = nanoseconds(0.25)
 
@@ -72,6 +80,7 @@ class FlightSupervisor:
         executor: ActionExecutor,
         publisher: VehiclePublisher,
         events: EventPublisher,
+        counters: Counters,
         server: TransportServer,
         sessions: Mapping[int, Session],
         clock: Clock,
@@ -94,6 +103,8 @@ class FlightSupervisor:
         self._executor = executor
         self._vehicle = publisher
         self._events = events
+        self._counts = counters.counts
+        self._delays_ns = counters.delays_ns
         self._publish = server.publish
         self._subscribers = server.subscribers
         self._sessions = sessions
@@ -108,6 +119,10 @@ class FlightSupervisor:
         #: Until when a take-off that the vehicle was told of, and does not show yet, has time to; None: there is none.
         self._rising_until_ns: int | None = None
         self._drifts = False  # what the software autopilot flies; told last
+        self._enforced = True  # whether the safety box and zones could be, at the last set-point
+        self._episodes = Episodes()  # of limits that touch what the proxy does with nobody in command
+        if executor.autopilot is not None:
+            executor.autopilot.guard = self._guard_step
         self._stamp()
 
     def begin(self, now_ns: int) -> None:
@@ -300,19 +315,10 @@ class FlightSupervisor:
         until_ns, self._rising_until_ns = self._rising_until_ns, None
         if until_ns is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
             return False
-        if self._stop_instead(_LAND, now_ns):
+        if self._executor.attempt(_LAND, now_ns, "apply"):
             self.flight.call_off(now_ns)
         elif self.flight.ours:  # once more, while that take-off may show
             self._rising_until_ns = now_ns + nanoseconds(self.ladder.settings.retry_s)
-        return True
-
-    def _stop_instead(self, action: AnyAction, now_ns: int) -> bool:
-        """Do this in place of what must not go on; return whether it is done."""
-        try:
-            self._executor.execute(action, now_ns, new=False)
-        except Exception as error:  # noqa: BLE001  it is published, beside why it must not go on
-            self._vehicle.driver_failed("apply", error)
-            return False
         return True
 
     def _tell(self, session: Session) -> None:
@@ -324,6 +330,26 @@ class FlightSupervisor:
         if self._subscribers(COMMANDS):
             echo = Applied(0, self.authority.lease, 0, now_ns, self._clock(), action, action)
             self._publish(COMMANDS, encode(echo))
+
+    def _report_limits(
+        self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
+    ) -> None:
+        """Publish what began to be in the way of a command of this application, or of what the proxy does itself."""
+        if enforced is not None and enforced is not self._enforced:
+            self._enforced = enforced
+            self._events.publish_drafts(enforcement_event(enforced))
+        episodes, name = (self._episodes, "the proxy") if session is None else (session.episodes, session.name)
+        for clamp in episodes.begun(clamps, now_ns):
+            self._events.publish_drafts(clamped_event(name, clamp))
+
+    def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
+        """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
+        allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
+        clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
+        if clamps or (enforced is not None and enforced is not self._enforced):
+            self._report_limits(self._holder, clamps, enforced, now_ns)
+        assert isinstance(allowed, Velocity)
+        return allowed
 
     # Authority ----------------------------------------------------------------------------------------------------
 
