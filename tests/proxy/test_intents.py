@@ -606,6 +606,23 @@ def test_what_became_of_an_intent_is_in_each_sample_until_a_newer_one_comes(benc
     assert (outcome.intent, outcome.fate) == (2, Fate.COMPLETED)
 
 
+def test_a_take_off_is_not_told_to_be_under_way_in_the_air_before_it_is_known_whose_it_is(bench: Bench) -> None:
+    """A pilot's sticks took it on its way up: for 20 ms it flew, by all that was told, as it was asked to."""
+    pilot = pending(bench)
+    bench.driver.report(state=S.TAKING_OFF)
+    bench.tick()
+    bench.driver.left = "POSCTL"
+    bench.driver.report(state=S.FLYING)
+    risen = pilot.last_feedback()
+    assert risen.state is S.FLYING
+    assert risen.outcome is not None
+    assert risen.outcome.app_id == 0, "nobody's, until the proxy has looked"
+    bench.tick()
+    outcome = pilot.last_feedback().outcome
+    assert outcome is not None
+    assert (outcome.app_id, outcome.intent, outcome.fate) == (pilot.app_id, pilot.intent, Fate.OTHERS)
+
+
 def test_a_stop_of_the_motors_ends_what_anybody_asked_for(bench: Bench) -> None:
     pilot, other = bench.airborne(), bench.join("other")
     pilot.command(Velocity(0.5))

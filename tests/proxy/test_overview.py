@@ -94,7 +94,7 @@ def test_a_row_has_the_pilot_the_failsafe_and_the_last_event(bench: Bench) -> No
 
 def test_a_vehicle_that_has_said_nothing_yet() -> None:
     bench = Bench()
-    row = bench.proxy._overview_row()
+    row = bench.proxy.overview._row()
     assert (row.captured_ns, row.state, row.event) == (0, FlightState.UNKNOWN, None)
     assert row.vehicle_link is LinkState.CONNECTING
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,
     Attitude,
@@ -198,6 +199,96 @@ def test_a_landing_that_is_given_up_is_not_broken_off(bench: Bench, ends: str) -
         assert set(bench.driver.told) == {Hover()}
 
 
+@pytest.mark.parametrize("asked", ["velocity", "hover"])
+def test_a_hover_that_nothing_shows_is_given_up_after_a_minute_and_what_is_found_later_is_left_alone(
+    bench: Bench, asked: str
+) -> None:
+    """A link that has no answer and a pilot who stays: hovers went to whatever flew there, for ever."""
+    pilot = bench.airborne()
+    be_patient(pilot)
+    bench.driver.answers = False
+    pilot.command(Velocity(0.5))
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    bench.tick()
+    action: AnyAction = Velocity(0.5) if asked == "velocity" else Hover()
+    pilot.command(action)
+    in_the_dark(bench, 58, pilot, action)
+    assert bench.driver.told.count(Hover()) > 50
+    assert messages(pilot, "hover_given_up") == []
+    in_the_dark(bench, 3, pilot, action)
+    (text,) = messages(pilot, "hover_given_up")
+    assert "the hover is given up" in text
+    bench.driver.told.clear()
+    in_the_dark(bench, 5, pilot, action)
+    assert bench.driver.told == []
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(1.0, lambda: pilot.command(action, repeat=True))
+    assert bench.driver.told == []
+    assert bench.proxy.handler.flight.whose is Whose.OTHERS
+    pilot.command(Hover())
+    assert bench.driver.told == [Hover()], "asked for anew, it is taken"
+
+
+def test_a_hover_that_is_asked_for_anew_in_the_dark_is_its_pilots_for_another_minute(bench: Bench) -> None:
+    pilot = bench.airborne()
+    be_patient(pilot)
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    in_the_dark(bench, 70, pilot, Idle())
+    bench.driver.told.clear()
+    pilot.command(Hover())
+    in_the_dark(bench, 58, pilot, Idle())
+    assert bench.driver.told.count(Hover()) > 50
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.FLYING)
+    bench.tick()
+    assert bench.proxy.handler.flight.ours
+    assert bench.driver.told[-1] == Hover()
+
+
+def test_a_hover_that_is_given_up_ends_in_a_landing_when_its_pilot_leaves(bench: Bench) -> None:
+    """It may hear, although it is not heard."""
+    pilot = bench.airborne()
+    be_patient(pilot)
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    in_the_dark(bench, 65, pilot, Idle())
+    bench.driver.told.clear()
+    for name in ("failsafe.hover_after_s", "failsafe.land_after_s"):
+        pilot.ask(SetParameter(name, 5.0, pilot.lease))
+    pilot.ask(ReleaseAuthority())
+    for _ in range(8):
+        bench.clock.advance(1.0)
+        bench.tick()
+    assert set(bench.driver.told) == {Land()}
+
+
+@pytest.mark.parametrize("stays", [True, False])
+def test_what_is_found_after_a_landing_was_given_up_is_left_alone(bench: Bench, stays: bool) -> None:
+    """One hover went to whatever was found by then."""
+    pilot = bench.airborne()
+    be_patient(pilot)
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    in_the_dark(bench, 2, pilot, Idle())
+    pilot.command(Land())
+    if not stays:
+        pilot.ask(ReleaseAuthority())
+    in_the_dark(bench, 60, pilot, Idle())
+    bench.driver.told.clear()
+    in_the_dark(bench, 5, pilot, Idle())
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(10.0, lambda: pilot.command(Idle(), repeat=True))
+    assert bench.driver.told == []
+    assert bench.proxy.handler.flight.whose is Whose.OTHERS
+
+
 @pytest.mark.parametrize("pilot_stays", [True, False])
 def test_a_landing_that_is_under_way_outlives_a_broken_link_for_a_minute(bench: Bench, pilot_stays: bool) -> None:
     pilot = bench.airborne()
@@ -219,8 +310,8 @@ def test_a_landing_that_is_under_way_outlives_a_broken_link_for_a_minute(bench: 
     bench.driver.report(state=FlightState.FLYING)
     bench.run(0.5)
     assert Land() not in bench.driver.told
-    (event,) = bench.published(EventKind.VEHICLE_MESSAGE)
-    assert event.data["reason"] == "landing_given_up"
+    told = [event.data["reason"] for event in bench.published(EventKind.VEHICLE_MESSAGE)]
+    assert told == ["landing_given_up", "others"]
 
 
 @pytest.mark.parametrize("native", [ALL, ALL - {"land"}], ids=["native", "software"])
@@ -651,6 +742,40 @@ def test_a_driver_whose_failsafe_raises_against_its_contract_is_tried_again(
     monkeypatch.undo()
     bench.run(0.3)
     assert bench.driver.told == [Hover()]
+
+
+@pytest.mark.parametrize("by", ["its pilot", "the failsafe"])
+@pytest.mark.parametrize("action", [Hover(), Land()])
+def test_what_is_steered_in_software_stands_still_where_the_vehicle_fails_to_hover_or_land(
+    monkeypatch: pytest.MonkeyPatch, action: Hover | Land, by: str
+) -> None:
+    """The velocity that was asked for before went on, as long as the driver failed."""
+    with Bench(actions=ALL - {"velocity", "position"}) as bench:
+        pilot = bench.airborne()
+        level = {"velocity_m_s": (0.0, 0.0, 0.0), "roll_rad": 0.0, "pitch_rad": 0.0, "yaw_rad": 0.0}
+        bench.driver.report(state=FlightState.FLYING, **level)
+        pilot.command(Velocity(1.0))
+        bench.run(0.1, lambda: bench.driver.report())
+        assert bench.driver.told[-1].pitch > 0.1  # type: ignore[union-attr]
+        apply = bench.driver._apply
+
+        def broken(told: AnyAction) -> AnyAction:
+            if isinstance(told, Hover | Land):
+                raise DriverError("no answer")
+            return apply(told)
+
+        monkeypatch.setattr(bench.driver, "_apply", broken)
+        if by == "its pilot":
+            pilot.command(action)
+
+            def go_on() -> None:
+                bench.driver.report()
+                pilot.command(action, repeat=True)
+
+            bench.run(0.3, go_on)
+        else:
+            bench.run(0.7 if action == Hover() else 5.4, lambda: bench.driver.report())
+        assert abs(bench.driver.told[-1].pitch) < 0.05  # type: ignore[union-attr]
 
 
 def test_pilots_who_hang_one_after_another_keep_it_in_the_air_no_longer_than_one_does(bench: Bench) -> None:

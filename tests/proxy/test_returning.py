@@ -29,7 +29,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.proxy.core.airspace import Airspace
-from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, StartPoint
+from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, StartPoint
 from skyloop.proxy.core.settings import AirspaceSettings, Limits, ReturnSettings
 from skyloop.zones import Box, Cylinder, Space
 from tests.support.proxy_bench import ALL, App, Bench

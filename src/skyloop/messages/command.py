@@ -237,7 +237,7 @@ ENDINGS: Final[dict[Fate, str]] = {
     Fate.REFUSED: "it was refused",
     Fate.REPLACED: "a newer command took its place",
     Fate.WITHDRAWN: "its application wants it no more: the call was cancelled, failed, or ran out of time",
-    Fate.TIMED_OUT: "the vehicle did not leave the ground within 20 s, or one that was to land was not heard for 60 s",
+    Fate.TIMED_OUT: "it did not leave the ground within 20 s, or was to hover or land and was not heard for 60 s",
     Fate.LANDED: "the vehicle landed or disarmed, whoever made it",
     Fate.EMERGENCY: "there was an emergency, or somebody stopped the motors",
     Fate.AUTHORITY: "the authority was granted anew, lost or given back",
@@ -252,7 +252,7 @@ ENDINGS: Final[dict[Fate, str]] = {
 class Outcome(msgspec.Struct, frozen=True, array_like=True):
     """What became of the newest intent of the application that commands, or commanded last."""
 
-    app_id: Count = 0  #: number of the application in this run of the proxy; 0: nobody has commanded yet
+    app_id: Count = 0  #: number of the application in this run of the proxy; 0: nothing is told
     intent: Count = 0  #: the number of the intent, as in its commands
     fate: Fate = Fate.UNDER_WAY
     reason: Refusal | None = None  #: why it, or a repeat of it, is refused

@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import threading
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
-from typing import Any, Final
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Protocol
 
 from skyloop.clock import NS_PER_S, Clock, seconds
 from skyloop.errors import shortened
@@ -20,7 +20,7 @@ from skyloop.proxy.core import authority
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
 from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
 from skyloop.proxy.core.settings import Clamp
-from skyloop.transport.base import EVENTS
+from skyloop.transport.base import EVENTS, Peer
 from skyloop.zones import THINNEST_M, ZONES, Space
 
 #: Command delays that the distribution is taken over: about a minute of one pilot at 32 Hz.
@@ -29,7 +29,7 @@ MAX_TEXT: Final = 1000  #: characters of an event's text
 REPEAT_NS: Final = NS_PER_S  #: how often an event that goes on is published again
 #: A limit not touched for so long begins a new episode when it is touched again.
 EPISODE_NS: Final = NS_PER_S
-#: Why a landing is given up.
+#: Why a hover or a landing is given up.
 UNHEARD: Final = f"the vehicle was not heard for {seconds(BELIEF_NS):g} s, and may be on another flight by now"
 _ENFORCED: Final = "enforced: its position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
@@ -91,13 +91,12 @@ class EventPublisher:
     ) -> None:
         """Publish one event now."""
         with self._lock:
-            self._number(EventDraft(kind, text, severity, app, data or {}), text)
+            self._send([EventDraft(kind, text, severity, app, data or {})])
 
     def publish_drafts(self, *drafts: EventDraft) -> None:
         """Publish these events now, in this order."""
-        for draft in drafts:
-            with self._lock:
-                self._number(draft, draft.text)
+        with self._lock:
+            self._send(drafts)
 
     def publish_repeated(self, key: Hashable, make: Callable[[], EventDraft]) -> None:
         """Publish an event that may come many times a second; ``make`` is called only when it is published."""
@@ -105,44 +104,49 @@ class EventPublisher:
             if self._repeats.first(key, make):
                 draft = make()
                 self._repeats.begin(key, make, self._clock())
-                self._number(draft, draft.text, count=1)
+                self._send([replace(draft, data={**draft.data, "count": 1})])
 
     def tick(self, now_ns: int) -> None:
         """Publish sums of repeated events, and of those that could not be handed over. Call some times a second."""
         with self._lock:
             for draft, count in self._repeats.due(now_ns):
                 text = f"{draft.text} (and {count} more like it within the last second)"
-                self._number(draft, text, count=count)
+                self._send([replace(draft, text=text, data={**draft.data, "count": count})])
             if self._missed:
                 missed, self._missed = self._missed, 0
                 text = f"{missed} events could not be handed over to applications that are too slow"
-                self._number(EventDraft(EventKind.SAMPLES_LOST, text), text, count=missed)
+                self._send([EventDraft(EventKind.SAMPLES_LOST, text, data={"count": missed})])
                 self._missed = 0  # that this one was not handed over either needs no event
 
-    def _number(self, draft: EventDraft, text: str, **count: int) -> None:
-        self._seq += 1
-        kind, severity, app = draft.kind, draft.severity, draft.app
-        data: dict[str, Value] = {**draft.data, **count}
-        for name, value in data.items():
-            if isinstance(value, str):
-                data[name] = self._scrub(value)
-        text = shortened(self._scrub(text), MAX_TEXT)
-        event = Event(kind, text, self._clock(), severity, self._seq, app, data)
-        try:
-            packet = encode(event)
-        except (ValueError, TypeError, OverflowError) as error:  # a driver's data may be anything
-            _log.error("event %s had particulars that cannot be sent: %s", kind, error)
-            packet = encode(Event(kind, text, event.at_ns, severity, self._seq, app))
-        if self.listener is not None:
-            self.listener(event)
-        if kind is not EventKind.APPLICATION_LINK:
-            self.last = event
-        missed = self._publish(EVENTS, packet)
-        self._counts["events.published"] += 1
-        self._counts[f"events.of.{kind.value}"] += 1
-        if missed:
-            self._missed += missed
-            self._counts["events.missed"] += missed
+    def _send(self, drafts: Sequence[EventDraft]) -> None:
+        """Number and publish; the lock is held."""
+        scrub, packets = self._scrub, []
+        told = [
+            (one, scrub(one.text), {key: scrub(it) if isinstance(it, str) else it for key, it in one.data.items()})
+            for one in drafts
+        ]
+        for draft, text, data in told:
+            self._seq += 1
+            kind, severity, app = draft.kind, draft.severity, draft.app
+            if len(text) > MAX_TEXT or not text.isascii():
+                text = shortened(text, MAX_TEXT)
+            event = Event(kind, text, self._clock(), severity, self._seq, app, data)
+            try:
+                packets.append(encode(event))
+            except (ValueError, TypeError, OverflowError) as error:  # a driver's data may be anything
+                _log.error("event %s had particulars that cannot be sent: %s", kind, error)
+                packets.append(encode(Event(kind, text, event.at_ns, severity, self._seq, app)))
+            if self.listener is not None:
+                self.listener(event)
+            if kind is not EventKind.APPLICATION_LINK:
+                self.last = event
+            self._counts["events.published"] += 1
+            self._counts[f"events.of.{kind.value}"] += 1
+        for packet in packets:
+            missed = self._publish(EVENTS, packet)
+            if missed:
+                self._missed += missed
+                self._counts["events.missed"] += missed
 
 
 @dataclass(slots=True)
@@ -248,10 +252,10 @@ def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
-def landing_given_up_event() -> EventDraft:
-    """A pilot's landing is given up because the vehicle was not heard."""
-    text = f"the landing is given up: {UNHEARD}: land it again when it is heard"
-    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": "landing_given_up"})
+def given_up_event(what: str) -> EventDraft:
+    """A hover, or a landing, is given up because the vehicle was not heard."""
+    text = f"the {what} is given up: {UNHEARD}: {'land' if what == 'landing' else 'command'} it again when it is heard"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": f"{what}_given_up"})
 
 
 def drift_event(drifts: bool) -> EventDraft:
@@ -308,102 +312,75 @@ def slept_event(slept_s: float) -> EventDraft:
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
-@dataclass(frozen=True, slots=True)
-class EventContext:
-    """What an event's text needs besides the change itself."""
+class Named(Protocol):
+    """An application that is connected."""
 
-    now_ns: int
-    name: Callable[[int], str]  #: name of an application, by its number
-    identity: Callable[[int], str]  #: what the transport knows about an application
-    holder: str  #: name of who holds the authority now; empty for nobody
+    name: str
+    peer: Peer
 
 
-def authority_event(effect: authority.Effect, context: EventContext) -> EventDraft:
-    """Return the event of one change of the authority."""
-    draft = _DRAFTS[type(effect)](effect, context)
-    draft.app = context.name(effect.app_id)
-    draft.data = {"app_id": effect.app_id, **draft.data}
-    return draft
+def name_of(sessions: Mapping[int, Named], app_id: int) -> str:
+    """Return an application's name, by its number."""
+    session = sessions.get(app_id)
+    return session.name if session is not None else f"application {app_id}"
 
 
-def _granted(effect: authority.Granted, context: EventContext) -> EventDraft:
-    data: dict[str, Value] = {"priority": effect.priority, "lease": effect.lease}
-    data["identity"] = context.identity(effect.app_id)
-    term = ""
-    if effect.until_ns is not None:
-        data["until_ns"] = effect.until_ns
-        term = f", for {seconds(effect.until_ns - context.now_ns):.0f} s"
-    text = f"{context.name(effect.app_id)} has the authority (priority {effect.priority}, lease {effect.lease}{term})"
-    return EventDraft(EventKind.AUTHORITY_GRANTED, text, Severity.INFO, data=data)
-
-
-def _queued(effect: authority.Queued, context: EventContext) -> EventDraft:
-    data: dict[str, Value] = {"priority": effect.priority, "position": effect.position}
-    text = f"{context.name(effect.app_id)} waits for the authority, number {effect.position} in the queue"
-    if effect.wait_ns is not None:
-        data["wait_s"] = seconds(effect.wait_ns)
-        text += f", for about {seconds(effect.wait_ns):.0f} s"
-    return EventDraft(EventKind.AUTHORITY_QUEUED, text, Severity.INFO, data=data)
-
-
-def _lost(effect: authority.Lost, context: EventContext) -> EventDraft:
-    text = f"{context.name(effect.app_id)} lost the authority: {effect.reason}"
-    if effect.reason == "silent" and not context.holder:
-        text += "; it is still listed as the holder until another application asks"
-    data: dict[str, Value] = {"lease": effect.lease, "reason": effect.reason, "by": context.holder}
-    return EventDraft(EventKind.AUTHORITY_LOST, text, data=data)
-
-
-def _preempted(effect: authority.Preempted, context: EventContext) -> EventDraft:
-    name, by = context.name(effect.app_id), context.name(effect.by_id)
-    if effect.granted:
-        text = f"{name} handed the authority over to {by} (priority {effect.by_priority})"
-    else:
-        text = f"{by} (priority {effect.by_priority}) took the authority over from {name}"
-    return EventDraft(EventKind.AUTHORITY_PREEMPTED, text, data=_by(effect, context) | {"granted": effect.granted})
-
-
-def _asked(effect: authority.Asked, context: EventContext) -> EventDraft:
-    within_s = seconds(effect.until_ns - context.now_ns)
-    name, by = context.name(effect.app_id), context.name(effect.by_id)
-    text = f"{by} (priority {effect.by_priority}) asks {name} for the authority, within {within_s:.0f} s"
-    data = _by(effect, context) | {"within_s": within_s}
-    if effect.term_ns is not None:
-        data["for_s"] = seconds(effect.term_ns)
-    return EventDraft(EventKind.AUTHORITY_ASKED, text, data=data)
-
-
-def _declined(effect: authority.Declined, context: EventContext) -> EventDraft:
-    by, why = context.name(effect.holder_id), f": {effect.reason}" if effect.reason else ""
-    text = f"{by} does not hand the authority over to {context.name(effect.app_id)} yet{why}"
-    data: dict[str, Value] = {"by": by, "by_id": effect.holder_id, "reason": effect.reason}
-    return EventDraft(EventKind.AUTHORITY_DECLINED, text, Severity.INFO, data=data)
-
-
-def _withdrawn(effect: authority.Withdrawn, context: EventContext) -> EventDraft:
-    by = context.name(effect.by_id)
-    data: dict[str, Value] = {"lease": effect.lease, "by": by, "by_id": effect.by_id}
-    text = f"{by} no longer asks {context.name(effect.app_id)} for the authority"
-    return EventDraft(EventKind.AUTHORITY_WITHDRAWN, text, Severity.INFO, data=data)
-
-
-def _expired(effect: authority.Expired, context: EventContext) -> EventDraft:
-    text = f"the time of {context.name(effect.app_id)} is over: the next application that asks gets the authority"
-    return EventDraft(EventKind.AUTHORITY_EXPIRED, text, data={"lease": effect.lease})
-
-
-def _by(effect: authority.Preempted | authority.Asked, context: EventContext) -> dict[str, Value]:
-    by = context.name(effect.by_id)
-    return {"lease": effect.lease, "by": by, "by_id": effect.by_id, "by_priority": effect.by_priority}
-
-
-_DRAFTS: Final[dict[type[authority.Effect], Callable[[Any, EventContext], EventDraft]]] = {
-    authority.Granted: _granted,
-    authority.Queued: _queued,
-    authority.Lost: _lost,
-    authority.Preempted: _preempted,
-    authority.Asked: _asked,
-    authority.Declined: _declined,
-    authority.Withdrawn: _withdrawn,
-    authority.Expired: _expired,
-}
+def authority_event(
+    effect: authority.Effect, sessions: Mapping[int, Named], holder: authority.QueueEntry | None, now_ns: int
+) -> EventDraft:
+    """Return the event of one change of the authority; ``holder``: who has it after all of them."""
+    name, severity = name_of(sessions, effect.app_id), Severity.WARNING
+    data: dict[str, Value] = {"app_id": effect.app_id}
+    if not isinstance(effect, authority.Queued | authority.Declined):
+        data["lease"] = effect.lease
+    by = ""
+    if isinstance(effect, authority.Preempted | authority.Asked | authority.Withdrawn):
+        by = name_of(sessions, effect.by_id)
+        data |= {"by": by, "by_id": effect.by_id}
+    if isinstance(effect, authority.Preempted | authority.Asked):
+        data["by_priority"] = effect.by_priority
+    match effect:
+        case authority.Granted():
+            kind, severity, term = EventKind.AUTHORITY_GRANTED, Severity.INFO, ""
+            session = sessions.get(effect.app_id)
+            data |= {"priority": effect.priority, "identity": "" if session is None else session.peer.address}
+            if effect.until_ns is not None:
+                data["until_ns"] = effect.until_ns
+                term = f", for {seconds(effect.until_ns - now_ns):.0f} s"
+            text = f"{name} has the authority (priority {effect.priority}, lease {effect.lease}{term})"
+        case authority.Queued():
+            kind, severity = EventKind.AUTHORITY_QUEUED, Severity.INFO
+            data |= {"priority": effect.priority, "position": effect.position}
+            text = f"{name} waits for the authority, number {effect.position} in the queue"
+            if effect.wait_ns is not None:
+                data["wait_s"] = seconds(effect.wait_ns)
+                text += f", for about {seconds(effect.wait_ns):.0f} s"
+        case authority.Lost():
+            kind, text = EventKind.AUTHORITY_LOST, f"{name} lost the authority: {effect.reason}"
+            data |= {"reason": effect.reason, "by": "" if holder is None else name_of(sessions, holder.app_id)}
+            if effect.reason == "silent" and holder is None:
+                text += "; it is still listed as the holder until another application asks"
+        case authority.Preempted():
+            kind = EventKind.AUTHORITY_PREEMPTED
+            data["granted"] = effect.granted
+            text = f"{by} (priority {effect.by_priority}) took the authority over from {name}"
+            if effect.granted:
+                text = f"{name} handed the authority over to {by} (priority {effect.by_priority})"
+        case authority.Asked():
+            kind, within_s = EventKind.AUTHORITY_ASKED, seconds(effect.until_ns - now_ns)
+            data["within_s"] = within_s
+            if effect.term_ns is not None:
+                data["for_s"] = seconds(effect.term_ns)
+            text = f"{by} (priority {effect.by_priority}) asks {name} for the authority, within {within_s:.0f} s"
+        case authority.Declined():
+            kind, severity, by = EventKind.AUTHORITY_DECLINED, Severity.INFO, name_of(sessions, effect.holder_id)
+            data |= {"by": by, "by_id": effect.holder_id, "reason": effect.reason}
+            why = f": {effect.reason}" if effect.reason else ""
+            text = f"{by} does not hand the authority over to {name} yet{why}"
+        case authority.Withdrawn():
+            kind, severity = EventKind.AUTHORITY_WITHDRAWN, Severity.INFO
+            text = f"{by} no longer asks {name} for the authority"
+        case authority.Expired():
+            kind = EventKind.AUTHORITY_EXPIRED
+            text = f"the time of {name} is over: the next application that asks gets the authority"
+    return EventDraft(kind, text, severity, name, data)

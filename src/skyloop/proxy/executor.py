@@ -25,25 +25,16 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.feedback import MAX_LINK_TEXT
-from skyloop.proxy.core.autopilot import Autopilot, software_actions
+from skyloop.proxy.core.autopilot import PATIENCE_NS, Autopilot, software_actions
 from skyloop.proxy.core.command_checks import CommandChecks
 from skyloop.proxy.core.failsafe import FailsafeLadder
-from skyloop.proxy.core.flight import STALE_NS, Changed, Flight
-from skyloop.proxy.core.returning import PATIENCE_NS
+from skyloop.proxy.core.flight import STALE_NS, Changed, Flight, Snapshot
 from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.zones import Vec3
 
 
 class ActionExecutor:
-    """Sends supported actions to the driver and does the rest with the software autopilot.
-
-    Args:
-        driver: the vehicle's driver.
-        capabilities: what it reported about the vehicle.
-        flight: what is known of the vehicle's flight.
-        autopilot: the software autopilot; None for a vehicle that it adds nothing to.
-        publisher: what the vehicle reported, and where the driver's failures are reported.
-    """
+    """Sends supported actions to the driver and does the rest with the software autopilot, if there is one."""
 
     def __init__(
         self,
@@ -79,14 +70,25 @@ class ActionExecutor:
         """Whether the vehicle flies, or may: one that never reports its state does from its first command on."""
         return self.flight.flies(self.state)
 
+    @property
+    def drifts(self) -> bool:
+        """Whether what the software autopilot flies is not braked, as its velocity is not known."""
+        return self.autopilot is not None and self.autopilot.drifts
+
+    def seen(self, now_ns: int) -> Snapshot:
+        """What is known of the vehicle now."""
+        vehicle = self._vehicle
+        state = self.flight.state(vehicle.reported_state)
+        return Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
+
     def observe(self, now_ns: int) -> Changed | None:
         """Look at the vehicle; return what has changed about whose flight it is."""
-        vehicle = self._vehicle
         try:
-            self._left_to = shortened(self._driver.left_to(), MAX_LINK_TEXT // 2)
+            left_to = self._driver.left_to()
+            self._left_to = shortened(left_to, MAX_LINK_TEXT // 2) if left_to else ""
         except Exception as error:  # noqa: BLE001  the failsafe comes first, whatever the driver's code does
             self.unsaid = error
-        return self.flight.observe(vehicle.reported_state, self._left_to, now_ns, self._shown(now_ns))
+        return self.flight.observe(self._vehicle.reported_state, self._left_to, now_ns, self._shown(now_ns))
 
     def _shown(self, now_ns: int) -> Feedback | None:
         """The newest sample, where it shows how the vehicle is now."""
@@ -106,47 +108,50 @@ class ActionExecutor:
     def execute(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
         """Carry out a supported action and return what was really applied. Raises what the driver raises.
 
-        Args:
-            action: The action.
-            now_ns: The time.
-            new: An application newly asked for it; else it repeats what was applied before.
-
-        Raises:
-            RefusedError: The vehicle is sure not to do it, as it is now.
+        ``new``: an application newly asked for it; else it repeats what was applied before. Raises
+        :class:`RefusedError` where the vehicle is sure not to do it, as it is now.
         """
-        if type(action) in self.native and not (self.guarded and type(action) is Position and self.autopilot):
-            applied = self._driver.apply(action, new=new)
-            if self.autopilot is not None:
-                self.autopilot.stop(action.name)
-        else:
-            try:
-                self._driver.check(action)
-            except DriverError as error:
-                raise RefusedError(str(error), code=Refusal.WRONG_STATE) from error
-            self._start(action, now_ns)
-            applied = action
+        autopilot = self.autopilot
+        try:
+            if type(action) in self.native and not (self.guarded and type(action) is Position and autopilot):
+                applied = self._driver.apply(action, new=new)
+                if autopilot is not None:
+                    autopilot.stop(action.name)
+            else:
+                try:
+                    self._driver.check(action)
+                except DriverError as error:
+                    raise RefusedError(str(error), code=Refusal.WRONG_STATE) from error
+                self._start(action, now_ns)
+                applied = action
+        except Exception:
+            if autopilot is not None and isinstance(action, Hover | Land):
+                autopilot.brake()
+            raise
         self.flight.sent(applied)
         return applied
 
-    def fly_to(self, place: Position, now_ns: int) -> bool:
-        """Fly to a place with nobody in command; returns whether it was taken. A failure is published, not raised."""
+    def attempt(self, action: AnyAction, now_ns: int, where: str) -> bool:
+        """Do what no application newly asked for; return whether it was taken. A failure is published, not raised."""
         try:
-            self.execute(place, now_ns, new=False)
+            self.execute(action, now_ns, new=False)
         except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
-            self._vehicle.driver_failed("failsafe", error)
+            self._vehicle.driver_failed(where, error)
             return False
         return True
 
     def failsafe(self, action: Hover | Land, now_ns: int) -> bool:
         """Hover or land with nobody in command; returns whether it was taken. A failure is published, not raised."""
         if type(action) in self.native:
+            taken = False
             try:
                 taken = self._driver.failsafe(action)
             except Exception as error:  # noqa: BLE001  it is reported, and tried again
                 self._vehicle.driver_failed("failsafe", error)
-                return False
             if taken and self.autopilot is not None:
                 self.autopilot.stop(action.name)
+            elif self.autopilot is not None:
+                self.autopilot.brake()
         elif type(action) in self.supported:
             self._start(action, now_ns)
             taken = True
@@ -194,24 +199,14 @@ class ActionExecutor:
 
 
 class ReturnSupervisor:
-    """Flies the vehicle back to its start where the failsafe ladder says so, and knows what feedback shows of that.
+    """Flies the vehicle back to its start where the failsafe ladder says so, and knows what feedback shows of that."""
 
-    Args:
-        checks: Hold the start, and the flight back that a pilot or the ladder began.
-        ladder: Whether to return.
-        executor: Carries actions out.
-        publisher: What the vehicle reported.
-    """
-
-    def __init__(
-        self, checks: CommandChecks, ladder: FailsafeLadder, executor: ActionExecutor, publisher: VehiclePublisher
-    ) -> None:
+    def __init__(self, checks: CommandChecks, ladder: FailsafeLadder, executor: ActionExecutor) -> None:
         self.start: Vec3 | None = None  #: where the vehicle took off, as feedback shows it [m]
         self.phase = ReturnPhase.NONE  #: how far it is on its way back, as feedback shows it
         self._checks = checks
         self._ladder = ladder
         self._executor = executor
-        self._vehicle = publisher
         self._problem = ""  # why the ladder's flight back can't go on
         self._good_ns = 0  # when that went well last
 
@@ -220,30 +215,27 @@ class ReturnSupervisor:
         self._checks.begin_return(action)
         self._problem, self._good_ns = "", now_ns
 
-    def update(self, now_ns: int, *, ours: bool) -> bool:
+    def update(self, seen: Snapshot, *, ours: bool) -> bool:
         """Observe the start, and fly back if the ladder does; return whether feedback has something else to show.
 
-        Args:
-            now_ns: The time now [ns].
-            ours: Whether the flight is the proxy's; what others fly is not on its way back for us.
+        ``ours``: whether the flight is the proxy's; what others fly is not on its way back for us.
         """
-        checks, executor = self._checks, self._executor
-        checks.start.observe(executor.state, self._vehicle.feedback_now, now_ns)
+        checks = self._checks
+        checks.start.observe(seen.state, seen.feedback, seen.now_ns)
         if self._ladder.returning and checks.back is not None:
-            self._fly(now_ns)
+            self._fly(seen)
         if not ours:
             checks.back = None
         return self.observe()
 
     def observe(self) -> bool:
         """Observe how far the way back is; return whether feedback has something else to show."""
-        before = self.start, self.phase
-        back = self._checks.back if self._checks.back is not None and self._executor.airborne else None
+        before, back = (self.start, self.phase), self._checks.back
         self.start = self._checks.start.position
-        self.phase = ReturnPhase.NONE if back is None else back.phase
+        self.phase = ReturnPhase.NONE if back is None or not self._executor.airborne else back.phase
         return (self.start, self.phase) != before
 
-    def why_not(self, now_ns: int) -> str:
+    def why_not(self, seen: Snapshot) -> str:
         """Return why the ladder can't return to the start; empty if it can, or is not to."""
         settings = self._ladder.settings
         if self._ladder.returning:
@@ -252,19 +244,20 @@ class ReturnSupervisor:
             return ""
         if ReturnToStart not in self._executor.supported:
             return "neither the vehicle nor the software autopilot can do it"
-        return self._checks.why_no_return(self._vehicle.feedback_now, now_ns)
+        return self._checks.why_no_return(seen.feedback, seen.now_ns)
 
-    def _fly(self, now_ns: int) -> None:
+    def _fly(self, seen: Snapshot) -> None:
         """Take the next step of the ladder's flight; what is against it is left to the ladder."""
-        if not self._vehicle.link_up:
+        now_ns = seen.now_ns
+        if not seen.link_up:
             self._good_ns = now_ns  # nothing can be said about it, and nothing be done
             return
-        decision = self._checks.step_return(self._vehicle.feedback_now, now_ns)
+        decision = self._checks.step_return(seen.feedback, now_ns)
         action, problem = decision.action, "" if decision.refusal is None else decision.why
         if isinstance(action, Position):
-            if not self._executor.fly_to(action, now_ns):
+            if not self._executor.attempt(action, now_ns, "failsafe"):
                 problem = "its driver fails to fly it there"
-        elif action is None or self._executor.state is not FlightState.LANDING:
+        elif action is None or seen.state is not FlightState.LANDING:
             self._executor.failsafe(action or Hover(), now_ns)
         if not problem:
             self._good_ns = now_ns

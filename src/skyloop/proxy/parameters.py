@@ -69,6 +69,11 @@ def _own(name: str, value: float, unit: str, minimum: float, maximum: float, des
     return Parameter(name, ParameterType.FLOAT, value, unit, minimum, maximum, value, description=description)
 
 
+def _other(name: str, value: bool | str, description: str, *, read_only: bool = False) -> Parameter:
+    kind = ParameterType.BOOL if isinstance(value, bool) else ParameterType.TEXT
+    return Parameter(name, kind, value, default=value, read_only=read_only, description=description)
+
+
 #: The proxy's own parameters. ``docs/proxy.md`` shows them as a table.
 OWN: Final[tuple[Parameter, ...]] = (
     _own("alarms.battery_critical", 0.15, "", 0.0, 1.0, "Charge below which the cockpit's alarm is critical; 0: never"),
@@ -105,12 +110,10 @@ OWN: Final[tuple[Parameter, ...]] = (
         10.0,
         "Interval at which a failsafe step is retried until the vehicle executes it",
     ),
-    Parameter(
+    _other(
         "failsafe.return",
-        ParameterType.BOOL,
         False,
-        default=False,
-        description="A vehicle without a pilot returns to its start and lands there, instead of where it is",
+        "A vehicle without a pilot returns to its start and lands there, instead of where it is",
     ),
     _own("limits.altitude", 5.0, "m", 0.3, 500.0, "Maximum height above ground: climbing ends there"),
     _own("limits.climb", 1.0, "m/s", 0.05, 10.0, "Maximum vertical speed"),
@@ -118,9 +121,7 @@ OWN: Final[tuple[Parameter, ...]] = (
     _own("limits.tilt", 0.35, "rad", 0.02, 1.0, "Maximum tilt of an attitude set-point, roll and pitch together"),
     _own("limits.yaw_rate", 1.75, "rad/s", 0.05, 10.0, "Maximum yaw rate"),
     _own("return.height", 2.0, "m", 0.0, 500.0, "Height above the start, at least, on the way back there"),
-    Parameter(
-        "return.land", ParameterType.BOOL, True, default=True, description="Land at the end of a return, or hover there"
-    ),
+    _other("return.land", True, "Land at the end of a return, or hover there"),
     _own("return.speed", 1.0, "m/s", 0.1, 30.0, "Maximum speed of a return, within the limits"),
     *(
         _own(f"{BOX}.{axis}_{end}", value, "m", -FAR_M, FAR_M, f"{side} wall of the safety box; {value:g}: none")
@@ -129,15 +130,8 @@ OWN: Final[tuple[Parameter, ...]] = (
     ),
     _own("safety.deceleration", 1.0, "m/s²", 0.1, 10.0, "Deceleration with which the vehicle reliably stops at a wall"),
     _own("safety.reaction_s", 0.3, "s", 0.0, 3.0, "Delay before the vehicle begins to stop"),
-    Parameter(
-        ROOM,
-        ParameterType.TEXT,
-        "",
-        default="",
-        read_only=True,
-        description="Walls of the room as a box, where the vehicle knows them: a simulated one does",
-    ),
-    Parameter(ZONES, ParameterType.TEXT, "", default="", description="No-fly zones: boxes and cylinders"),
+    _other(ROOM, "", "Walls of the room as a box, where the vehicle knows them: a simulated one does", read_only=True),
+    _other(ZONES, "", "No-fly zones: boxes and cylinders"),
 )
 
 
@@ -303,20 +297,19 @@ class Parameters:
     def flight_settings(self) -> FlightSettings:
         """Return what the values in force ask of the flight.
 
-        Raises:
-            ParameterError: The driver has no-fly zones that can't be read.
+        Raises :class:`ParameterError` where the driver has no-fly zones that can't be read.
         """
         with self._lock:
             self._settings = self._settings.updated(self._in_force, self._changed)
             self._changed = set()
             return self._settings
 
-    def set(self, name: str, value: Value) -> Parameter:
-        """Write one parameter and return it as it is now.
+    def set(self, name: str, value: Value, known: Parameter | None = None) -> Parameter:
+        """Write one parameter and return it as it is now; ``known``: as :meth:`get` returned it just now.
 
         Raises :class:`UnknownNameError`, :class:`ParameterError`, and whatever the driver raises.
         """
-        parameter = self.get(name)
+        parameter = known or self.get(name)
         value = check(parameter, value)
         with self._lock:
             is_driver = name in self._driver
@@ -348,14 +341,8 @@ class Parameters:
 class ParameterRequests:
     """Answers what applications ask about parameters, and lets their values take effect. May wait for the vehicle.
 
-    Args:
-        parameters: The store.
-        handler: Knows who holds the authority, and gets new settings.
-        publisher: Reports a driver that fails.
-        events: Where changes are published.
-        clock: The proxy's clock [ns].
-        free: Parameters that any pilot may write without the authority. They change by themselves: each is read anew,
-            and a change is no event.
+    ``free``: parameters that any pilot may write without the authority. They change by themselves: each is read anew,
+    and a change is no event.
     """
 
     def __init__(
@@ -403,22 +390,23 @@ class ParameterRequests:
 
     def set(self, session: Session, request: SetParameter, now_ns: int) -> AnyReply:
         """Write one for the holder of the authority. Raises what :meth:`Parameters.set` raises."""
-        waited_ns, momentary = self._clock() - now_ns, self._parameters.get(request.name).momentary
-        if momentary and waited_ns > MOMENT_NS:
-            why = f"{request.name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
+        name, value = request.name, request.value
+        waited_ns, known = self._clock() - now_ns, self._parameters.get(name)
+        if known.momentary and waited_ns > MOMENT_NS:
+            why = f"{name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
             return Refused(Refusal.STALE, why)
-        if request.name in self._free and session.role is Role.PILOT:
-            return ParameterValue(self._parameters.set(request.name, request.value))
+        if name in self._free and session.role is Role.PILOT:
+            return ParameterValue(self._parameters.set(name, value, known))
         if not self._handler.holds(session, request.lease):
             code = Refusal.FOREIGN_LEASE if request.lease else Refusal.NO_AUTHORITY
             return Refused(code, "writing a parameter needs the authority: request it, and name its lease")
-        if momentary and (problem := self._handler.problem_with_moment()):
-            return Refused(Refusal.WRONG_STATE, f"{request.name} is not done now: {problem}")
-        if request.name == "limits.altitude" and isinstance(request.value, int | float):
-            problem = self._handler.problem_with_ceiling(float(request.value))
+        if known.momentary and (problem := self._handler.problem_with_moment()):
+            return Refused(Refusal.WRONG_STATE, f"{name} is not done now: {problem}")
+        if name == "limits.altitude" and isinstance(value, int | float):
+            problem = self._handler.problem_with_ceiling(float(value))
             if problem:
-                return Refused(Refusal.OUT_OF_RANGE, f"{request.name} can't be {request.value:g} m now: {problem}")
-        parameter = self._parameters.set(request.name, request.value)
+                return Refused(Refusal.OUT_OF_RANGE, f"{name} can't be {value:g} m now: {problem}")
+        parameter = self._parameters.set(name, value, known)
         self._handler.configure(self._parameters.flight_settings())
         unit = f" {parameter.unit}" if parameter.unit else ""
         text = f"{session.name} set {parameter.name} to {parameter.value!r}{unit}"

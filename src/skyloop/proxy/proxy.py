@@ -28,7 +28,6 @@ from skyloop.messages import (
     AnyReply,
     Command,
     EventKind,
-    Feedback,
     GetParameter,
     GetStatistics,
     Hello,
@@ -50,12 +49,10 @@ from skyloop.messages import (
     Statistics,
     StreamReport,
     Value,
-    VehicleOverview,
     VehiclePose,
     Welcome,
     decode,
 )
-from skyloop.messages.feedback import MAX_ADDRESS, MAX_EVENT_TEXT
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
 from skyloop.proxy.core.flight import Flight
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
@@ -131,7 +128,8 @@ class Proxy:
             clock=clock,
             capabilities=self.capabilities,
             state_of=flight.state,
-            on_link_up=self._refresh_parameters,
+            # Its parameters are read again, now that the vehicle has come.
+            on_link_up=lambda: self._requests.call_later(self._parameter_requests.read_driver),
             scrub=driver.uri.scrub,
         )
         self.handler = CommandHandler(
@@ -155,7 +153,7 @@ class Proxy:
             self._counters,
             immediate={
                 Hello: self._greet,
-                Ping: self._answer_ping,
+                Ping: lambda _session, ping, _now_ns: Pong(ping.sent_ns, clock()),
                 RequestAuthority: self.handler.request_authority,
                 AnswerTakeover: self.handler.answer_takeover,
                 ReleaseAuthority: self.handler.release_authority,
@@ -165,12 +163,15 @@ class Proxy:
                 GetParameter: self._parameter_requests.get,
                 ListParameters: self._parameter_requests.page,
                 SetParameter: self._parameter_requests.set,
-                GetStatistics: self._answer_statistics,
+                GetStatistics: lambda *_: Statistics(self.statistics()),
             },
             on_failure=self.publisher.driver_failed,
             jobs=jobs,
         )
-        self.overview = OverviewPublisher(server_end, self._overview_row)
+        self.overview = OverviewPublisher(
+            server_end,
+            lambda: self.publisher.overview(self.name, uri, self.events.last, applications=self.applications),
+        )
         self._ticker = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True) if ticker else None
         self._stopping = threading.Event()
         self._life_lock = threading.Lock()
@@ -361,15 +362,15 @@ class Proxy:
         elif isinstance(sample, Request):
             self._requests.handle(session, sample, now_ns)
         elif isinstance(sample, Annotation):
-            self._refuse_malformed(session, self._relay.annotation(session, sample, packet), now_ns)
+            self._malformed(session, self._relay.annotation(session, sample, packet), now_ns)
         elif isinstance(sample, LogEntry):
-            self._refuse_malformed(session, self._relay.log(session, packet), now_ns)
+            self._malformed(session, self._relay.log(session, packet), now_ns)
         elif isinstance(sample, ProcessorResult):
-            self._refuse_malformed(session, self.workers.relay(session, sample, now_ns), now_ns)
+            self._malformed(session, self.workers.relay(session, sample, now_ns), now_ns)
         elif isinstance(sample, VehiclePose):
             self._relay.pose(session, sample)
         elif isinstance(sample, StreamReport):
-            self._refuse_malformed(session, self.publisher.streams.report(sample), now_ns)
+            self._malformed(session, self.publisher.streams.report(sample), now_ns)
         else:
             self._malformed(session, f"{kind.__name__} is for the proxy to send", now_ns)
 
@@ -416,12 +417,10 @@ class Proxy:
         self.workers.application_left(session)
         del self._sessions[peer.id]
 
-    def _refuse_malformed(self, session: Session, reason: str, now_ns: int) -> None:
-        """Count a sample as malformed if there is a reason to."""
-        if reason:
-            self._malformed(session, reason, now_ns)
-
     def _malformed(self, session: Session, reason: str, now_ns: int) -> None:
+        """Count a packet as malformed if there is a reason to, and end a connection that sends too many."""
+        if not reason:
+            return
         self._counts["packets.malformed"] += 1
         self.events.publish_repeated(
             (session.app_id, "malformed"),
@@ -468,7 +467,10 @@ class Proxy:
                 session.ended = True
                 self._counts["connections.silent"] += 1
                 why = f"no Hello came within {seconds(HELLO_NS):g} s"
-                self.events.publish_repeated(("silent",), partial(_silent, session, why))
+                text = f"a connection of {session.peer.address} was ended: {why}"
+                data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": why, "app_id": session.app_id}
+                draft = partial(EventDraft, EventKind.APPLICATION_LINK, text, data=data)
+                self.events.publish_repeated(("silent",), draft)
                 self.server.disconnect(session.peer, f"{why}: connect again")
 
     def _run(self) -> None:
@@ -495,12 +497,6 @@ class Proxy:
         self.events.publish(EventKind.APPLICATION_LINK, text, app=hello.name, data=data)
         return msgspec.structs.replace(self._welcome, app_id=session.app_id, now_ns=now_ns)
 
-    def _answer_ping(self, _session: Session, ping: Ping, _now_ns: int) -> AnyReply:
-        return Pong(ping.sent_ns, self.clock())
-
-    def _answer_statistics(self, _session: Session, _request: GetStatistics, _now_ns: int) -> AnyReply:
-        return Statistics(self.statistics())
-
     def statistics(self) -> dict[str, float]:
         """Return all counters by dotted name, as applications get them by ``GetStatistics``. Any thread."""
         return self._counters.snapshot(applications=self.applications, **self.server.counters)
@@ -510,44 +506,6 @@ class Proxy:
         """How many applications are connected. Any thread."""
         return sum(session.role is not None for session in list(self._sessions.values()))
 
-    def _overview_row(self) -> VehicleOverview:
-        known = self.publisher.feedback_now or Feedback(captured_ns=0, vehicle_link=self.publisher.link_state)
-        event = self.events.last
-        if event is not None:
-            event = msgspec.structs.replace(event, text=event.text[:MAX_EVENT_TEXT], data={})
-        return VehicleOverview(
-            name=self.name,
-            uri=self._welcome.uri[:MAX_ADDRESS],
-            vehicle=self.capabilities.vehicle[:64],
-            can_fly=bool(self.capabilities.actions),
-            captured_ns=known.captured_ns,
-            state=known.state,
-            battery=known.battery,
-            position_m=known.position_m,
-            altitude_m=known.altitude_m,
-            yaw_rad=known.yaw_rad,
-            vehicle_link=self.publisher.link_state,
-            link_reason=self.publisher.link_reason,
-            link_remedy=self.publisher.link_remedy,
-            owner=known.owner,
-            owner_priority=known.owner_priority,
-            failsafe=known.failsafe,
-            others=known.others,
-            return_phase=known.return_phase,
-            applications=self.applications,
-            event=event,
-        )
-
-    def _refresh_parameters(self) -> None:
-        """Read the driver's parameters again, now that its vehicle has come. On the driver's thread."""
-        self._requests.call_later(self._parameter_requests.read_driver)
-
 
 def _never() -> int:
     return 0
-
-
-def _silent(session: Session, why: str) -> EventDraft:
-    text = f"a connection of {session.peer.address} was ended: {why}"
-    data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": why, "app_id": session.app_id}
-    return EventDraft(EventKind.APPLICATION_LINK, text, data=data)

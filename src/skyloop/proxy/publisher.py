@@ -19,6 +19,7 @@ from skyloop.messages import (
     Capabilities,
     EncodedFrame,
     Encoding,
+    Event,
     EventKind,
     Fate,
     Feedback,
@@ -29,10 +30,11 @@ from skyloop.messages import (
     Refusal,
     Severity,
     Value,
+    VehicleOverview,
     VideoRequest,
     encode,
 )
-from skyloop.messages.feedback import MAX_LINK_TEXT
+from skyloop.messages.feedback import MAX_ADDRESS, MAX_EVENT_TEXT, MAX_LINK_TEXT
 from skyloop.messages.frame import H264, MAX_ENCODED
 from skyloop.proxy.core.command_checks import NO_INTENT, Intent
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
@@ -61,15 +63,9 @@ class VehiclePublisher:
     It takes no lock that is held while the driver is called, so that a driver may call it from any thread and from
     inside its own calls.
 
-    Args:
-        server: where samples and frames are published.
-        events: where events are published.
-        counters: the proxy's counters.
-        clock: the proxy's clock [ns].
-        capabilities: what the driver reported about the vehicle: its cameras.
-        state_of: the flight state, given the one that the driver reported; the software autopilot may know better.
-        on_link_up: called on the driver's thread when the vehicle's link has come up.
-        scrub: takes the secrets of the vehicle's address out of a text.
+    ``state_of``: the flight state, given the one that the driver reported, as the software autopilot may know better.
+    ``on_link_up``: called on the driver's thread when the vehicle's link has come up. ``scrub``: takes the secrets of
+    the vehicle's address out of a text.
     """
 
     def __init__(
@@ -99,6 +95,7 @@ class VehiclePublisher:
         self._owner: dict[str, Any] = {}
         self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
         self._told: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # by the newest sample
+        self._capabilities = capabilities
         self._publish = server.publish
         self._publish_frame = server.publish_frame
         self._subscribers = server.subscribers
@@ -149,15 +146,9 @@ class VehiclePublisher:
         self._published_ns = -KEEP_ALIVE_NS
 
     def tell(self, intent: Intent, app_id: int, name: str) -> None:
-        """Show what became of an intent in feedback from now on; where it ended, at the next tick at the latest.
-
-        Args:
-            intent: The newest of the application that commands; read with each sample.
-            app_id: The application's number.
-            name: The application's name.
-        """
+        """Show what became of an intent in feedback from now on; where it ended, at the next tick at the latest."""
         self._newest = intent, app_id, name
-        if intent.over and (intent.fate, intent.reason) != self._told:
+        if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._told:
             self._published_ns = -KEEP_ALIVE_NS
 
     @property
@@ -184,7 +175,7 @@ class VehiclePublisher:
         self.reported_state = raw.state
         state = self.state_of(raw.state)
         intent, app_id, name = self._newest
-        outcome = intent.outcome(app_id, name)
+        outcome = intent.outcome(app_id, name, state)
         self._told = outcome.fate, outcome.reason
         sample = _replace(
             raw,
@@ -223,6 +214,32 @@ class VehiclePublisher:
             EventKind.STATE_CHANGED, text, severity, data={"before": before.value, "after": after.value}
         )
 
+    def overview(self, name: str, uri: str, event: Event | None, *, applications: int) -> VehicleOverview:
+        """Return the vehicle's row in the overview; ``event``: the newest."""
+        known = self.feedback_now or Feedback(captured_ns=0)
+        return VehicleOverview(
+            name=name,
+            uri=uri[:MAX_ADDRESS],
+            vehicle=self._capabilities.vehicle[:64],
+            can_fly=bool(self._capabilities.actions),
+            captured_ns=known.captured_ns,
+            state=known.state,
+            battery=known.battery,
+            position_m=known.position_m,
+            altitude_m=known.altitude_m,
+            yaw_rad=known.yaw_rad,
+            vehicle_link=self.link_state,
+            link_reason=self.link_reason,
+            link_remedy=self.link_remedy,
+            owner=known.owner,
+            owner_priority=known.owner_priority,
+            failsafe=known.failsafe,
+            others=known.others,
+            return_phase=known.return_phase,
+            applications=applications,
+            event=None if event is None else _replace(event, text=event.text[:MAX_EVENT_TEXT], data={}),
+        )
+
     # Frames ----------------------------------------------------------------------------------------------------
 
     def frame(
@@ -249,11 +266,10 @@ class VehiclePublisher:
             header = FrameHeader(
                 camera, seq, captured_ns, self._clock(), width, height, encoding, pixels.nbytes, intrinsics
             )
-            self._hand_on(header, pixels)
+            self._hand_on(camera, header, pixels)
         self._counts[f"frames.{camera}.received"] += 1
 
-    def _hand_on(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        camera = header.camera
+    def _hand_on(self, camera: str, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
         try:
             missed = self._publish_frame(header, pixels)
         except (ValueError, TypeError) as error:

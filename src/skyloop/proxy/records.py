@@ -213,10 +213,7 @@ def record_path(name: str) -> Path:
 class FlightRecord:
     """The file of one proxy, written on a thread of its own from :meth:`start` to :meth:`close`.
 
-    Args:
-        path: the file.
-        vehicle: the vehicle's address: a note about another vehicle is not believed.
-        wall: the wall clock [s].
+    ``vehicle``: its address, as a note about another vehicle is not believed; ``wall``: the wall clock [s].
     """
 
     def __init__(self, path: Path, vehicle: str, wall: Callable[[], float] = time.time) -> None:

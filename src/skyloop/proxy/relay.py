@@ -163,7 +163,8 @@ class ProcessorWorkers:
     def application_left(self, session: Session) -> None:
         """The application's connection ended: its share goes to the others."""
         with self._lock:
-            self._sessions.pop(session.app_id, None)
+            if self._sessions.pop(session.app_id, None) is None:
+                return
             left = self._roster.remove(session.app_id)
             self._send_shares()
         for asked in left:

@@ -13,6 +13,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from functools import partial
 from queue import SimpleQueue
 from typing import Any, Final, Protocol
 
@@ -102,14 +103,9 @@ class Answers:
         self._forgotten = 0  # the highest number whose answer was kept and dropped again
 
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
-        """Note that a request is being answered, unless it must not be.
+        """Note that a request is being answered, unless it must not be; at most ``most`` are at a time.
 
-        Args:
-            number: The request's.
-            most: As many may be answered at a time.
-
-        Returns:
-            Whether it was carried out, or is being, and must not be again; and whether as many as may be are.
+        Returns whether it was carried out, or is being, and must not be again; and whether as many as may be are.
         """
         repeated = number in self._pending or number in self.kept or number <= self._forgotten
         full = not repeated and len(self._pending) >= most
@@ -177,14 +173,9 @@ Answer = Callable[[Session, Any, int], AnyReply]
 class RequestDispatcher:
     """Answers requests, on the receiving thread or on that of its jobs, from :meth:`start` to :meth:`stop`.
 
-    Args:
-        server: where answers are sent.
-        counters: the proxy's counters.
-        immediate: what answers on the receiving thread, by the type of the request's body.
-        deferred: what answers on the thread of requests; may raise anything, which becomes a refusal.
-        on_failure: called with the request's name and the error when ``deferred`` raises what is no refusal; returns
-            the text for who asked.
-        jobs: does what may wait for the driver; None: a thread of its own.
+    ``immediate`` and ``deferred``: what answers on the one and the other, by the type of the request's body. The latter
+    may raise anything, which becomes a refusal: ``on_failure`` is called with the request's name and an error that is
+    none, and returns the text for who asked.
     """
 
     def __init__(
@@ -248,7 +239,7 @@ class RequestDispatcher:
         if answer is not None:
             self._finish(session, request, answer(session, request.body, now_ns))
         else:
-            self._jobs.put(lambda: self._answer_later(session, request, now_ns))
+            self._jobs.put(partial(self._answer_later, session, request, now_ns))
 
     def _answer_later(self, session: Session, request: Request, now_ns: int) -> None:
         kind = type(request.body)

@@ -56,16 +56,7 @@ class _Picture:
 
 
 class StreamForm:
-    """One form of one camera's H.264.
-
-    Args:
-        topic: That it is published on.
-        request: What was asked for.
-        camera: The camera.
-        publish: Publishes a picture; called on the form's thread.
-        fail: Called with the reason when nothing can be encoded.
-        clock: The proxy's clock [ns].
-    """
+    """One form of one camera's H.264; ``publish`` is called on its thread, ``fail`` with why nothing can be encoded."""
 
     def __init__(
         self,
@@ -133,12 +124,7 @@ class StreamForm:
                 self._rate.forget()
 
     def wants(self, header: FrameHeader, subscribers: int) -> bool:
-        """Return whether a frame is to be encoded. On the thread that publishes it; call it once for each.
-
-        Args:
-            header: The frame's.
-            subscribers: How many the form has now.
-        """
+        """Return whether a frame is to be encoded. On the thread that publishes it; call it once for each."""
         with self._changed:
             self._wants_key = self._wants_key or subscribers > self._subscribers
             self._subscribers = subscribers
@@ -152,12 +138,7 @@ class StreamForm:
             return self._limiter.in_time(header.captured_ns)
 
     def put(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Have a frame encoded, in place of one that still waits.
-
-        Args:
-            header: The frame's.
-            pixels: Its bytes, which stay as they are.
-        """
+        """Have a frame encoded, in place of one that still waits; its bytes stay as they are."""
         with self._changed:
             if self._ended:
                 return
@@ -177,12 +158,7 @@ class StreamForm:
                 self._rate.acknowledged(report.seq, now_ns)
 
     def own(self, picture: EncodedFrame, subscribers: int) -> EncodedFrame | None:
-        """Take a picture that the vehicle encoded; return it as it is to be published, None if it is not.
-
-        Args:
-            picture: Whole.
-            subscribers: How many the form has now.
-        """
+        """Take a whole picture that the vehicle encoded; return it as it is to be published, None if it is not."""
         rate, now_ns = self._rate, self._clock()
         with self._changed:
             self._measure(len(picture.data), now_ns)
@@ -297,14 +273,7 @@ class StreamForm:
 
 
 class Streams(Forms[StreamForm]):
-    """All forms of a vehicle's cameras.
-
-    Args:
-        server: Where they are published.
-        counters: The proxy's.
-        clock: The proxy's clock [ns].
-        fail: Called with what went wrong, for people.
-    """
+    """All forms of a vehicle's cameras."""
 
     def __init__(self, server: TransportServer, counters: Counters, clock: Clock, fail: Callable[[str], None]) -> None:
         super().__init__(MAX_FORMS, server.subscribers, clock)

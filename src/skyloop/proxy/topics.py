@@ -85,13 +85,7 @@ F = TypeVar("F", bound=Form)
 
 
 class Forms(Generic[F]):
-    """The forms that have, or may soon have, subscribers. Any thread.
-
-    Args:
-        most: How many there are at a time.
-        subscribers: Returns how many a topic has.
-        clock: The proxy's clock [ns].
-    """
+    """The forms that have, or may soon have, subscribers, at most so many at a time. Any thread."""
 
     def __init__(self, most: int, subscribers: Callable[[str], int], clock: Clock) -> None:
         self.known: tuple[F, ...] = ()
@@ -105,15 +99,7 @@ class Forms(Generic[F]):
         return next((form for form in self.known if form.topic == topic), None)
 
     def claim(self, topic: str, make: Callable[[], F]) -> bool:
-        """Give a form a place, or keep the one that it has.
-
-        Args:
-            topic: The form's.
-            make: Makes it if it has none.
-
-        Returns:
-            False if all places are taken.
-        """
+        """Give a form a place, or keep the one that it has; return False if all places are taken."""
         now_ns = self._clock()
         with self._lock:
             form = self.find(topic)
@@ -146,11 +132,7 @@ class FeedbackVariants(Forms[_Variant]):
         self._counts = counters.counts
 
     def problem(self, topic: str) -> str:
-        """Return why a form can't be subscribed to; empty if it can, and then it has a place here. Any thread.
-
-        Args:
-            topic: Of feedback, with options.
-        """
+        """Return why a form can't be subscribed to; empty if it can, and then it has a place here. Any thread."""
         try:
             request = FeedbackRequest.parse(topic)
         except UsageError as error:
@@ -165,9 +147,7 @@ class FeedbackVariants(Forms[_Variant]):
     def publish(self, sample: Feedback, now_ns: int) -> None:
         """Publish a sample in each form in which it is due. One thread at a time.
 
-        Args:
-            sample: As it is published to those who get all.
-            now_ns: The present time; not that of capture, which stands still while the vehicle is silent.
+        ``now_ns`` is not the time of capture, which stands still while the vehicle is silent.
         """
         for variant in self.known:
             if not self._subscribers(variant.topic) or not variant.rate.in_time(now_ns):
@@ -199,11 +179,7 @@ class OverviewRegistry:
         self._packets: list[bytes] = []
 
     def add(self, row: Callable[[], VehicleOverview]) -> None:
-        """Add a vehicle.
-
-        Args:
-            row: Returns its row; called on any proxy's ticker.
-        """
+        """Add a vehicle; ``row`` returns its row, and is called on any proxy's ticker."""
         with self._lock:
             self._sources[row] = None
             self._made_ns = None

@@ -174,7 +174,7 @@ def test_what_a_library_says_of_the_address_is_told_without_the_secrets(tmp_path
     welcome = app.hello("watcher")
     proxy.publisher.driver_failed("apply", ConnectionError(CAMERA))
     answers = [proxy.publisher.driver_refused("apply", error(CAMERA)) for error in (DriverError, ConnectionError)]
-    told = f"{welcome!r} {app.ask(GetParameter('x'))!r} {answers} {proxy._overview_row()!r} {sent}"
+    told = f"{welcome!r} {app.ask(GetParameter('x'))!r} {answers} {proxy.overview._row()!r} {sent}"
     told += f"{proxy.publisher.link_reason} {proxy.publisher.link_remedy}"
     proxy.end()
     app.end.close()

@@ -42,9 +42,9 @@ from skyloop.messages import (
 from skyloop.messages.command import ENDINGS, MAX_OUTCOME_TEXT, SET_POINTS
 from skyloop.proxy.core.airspace import Airspace, Verdict
 from skyloop.proxy.core.authority import Authority
+from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, StartPoint
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
-from skyloop.proxy.core.flight import Flight, Whose
-from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, StartPoint
+from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 from skyloop.proxy.core.settings import Clamp, ReturnSettings
 
 MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may lie: the error of the clocks' offset
@@ -129,9 +129,14 @@ class Intent:
         if kind is ResetEmergency and self.begun and state is not FlightState.EMERGENCY:
             self.end(Fate.COMPLETED)
 
-    def outcome(self, app_id: int, name: str) -> Outcome:
-        """What feedback tells of it; ``name``: of the application."""
+    def outcome(self, app_id: int, name: str, state: FlightState) -> Outcome:
+        """What feedback tells of it; ``name``: of the application, ``state``: the vehicle's in that feedback.
+
+        Nothing of a take-off that has just come to be in the air: others may have taken the vehicle on its way up.
+        """
         fate = self.fate  # first, as another thread may end it now
+        if fate is Fate.UNDER_WAY and state in _UP and self.begun and type(self.action) is Takeoff:
+            return Outcome()
         if not self.text:
             return Outcome(app_id, max(0, self.number), fate)
         text = shortened(f"{name}: {self.action.name} refused: {self.text}", MAX_OUTCOME_TEXT)
@@ -247,13 +252,8 @@ class Decision(NamedTuple):
 class CommandChecks:
     """Decides what becomes of the commands for one vehicle.
 
-    Args:
-        authority: who holds the lease; :meth:`receive` notes when its holder's last command came.
-        ladder: the failsafe ladder.
-        flight: whose it is.
-        supported: the actions that the vehicle or the software autopilot can do.
-        why_not: why others are not supported, for people; may be empty.
-        native: those that the vehicle itself takes.
+    ``supported``: the actions that the vehicle or the software autopilot can do; ``native``: those that the vehicle
+    itself takes; ``why_not``: why others are not, for people.
     """
 
     def __init__(
@@ -290,35 +290,15 @@ class CommandChecks:
             authority.last_command_ns = now_ns
         return refusal
 
-    def explain(self, refusal: Refusal, command: Command, intents: Intents, now_ns: int) -> str:
-        """Return why :meth:`receive` refused a command, for a person."""
-        lease = self._authority.lease
-        return explain(refusal, command, intents.seq, now_ns=now_ns, max_age_ns=self.max_age_ns, lease=lease)
-
     def decide(
-        self,
-        action: AnyAction,
-        intent: Intent,
-        state: FlightState,
-        link: LinkState,
-        feedback: Feedback | None,
-        now_ns: int,
-        *,
-        new: bool,
-        automatic: bool = False,
+        self, action: AnyAction, intent: Intent, seen: Snapshot, *, new: bool, automatic: bool = False
     ) -> Decision:
-        """Decide what the vehicle does of a command whose intent is under way. Not for an emergency stop.
+        """Decide what the vehicle does of a command whose intent is under way. Not for an emergency stop or idle.
 
-        Args:
-            action: any action but :class:`Idle` and :class:`EmergencyStop`.
-            intent: what it is asked for, or repeated, by.
-            state: the flight state now.
-            link: the state of the link to the vehicle.
-            feedback: the newest sample, for altitude and position; None: none came yet.
-            now_ns: the time now, on the proxy's clock [ns].
-            new: whether the application newly asked for it; else the library repeats it, or asks for it by itself.
-            automatic: whether the library asks for it by itself.
+        ``new``: the application newly asked for it; else the library repeats it, or asks for it by itself
+        (``automatic``).
         """
+        now_ns, state, feedback, link, _ = seen
         kind = type(action)
         policy = STATE_POLICIES[kind][state]
         if new and kind is ReturnToStart:
@@ -327,7 +307,7 @@ class CommandChecks:
             policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
             policy = StatePolicy.APPLY  # that it lands, or stands, was before: it may have heard something else since
-        problem = self._problem(action, policy, state, link, new=new, automatic=automatic)
+        problem = self._problem(action, policy, seen, new=new, automatic=automatic)
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
@@ -379,16 +359,10 @@ class CommandChecks:
         return decision.why if decision.action is None and decision.refusal is not None else ""
 
     def _problem(
-        self,
-        action: AnyAction,
-        policy: StatePolicy,
-        state: FlightState,
-        link: LinkState,
-        *,
-        new: bool,
-        automatic: bool,
+        self, action: AnyAction, policy: StatePolicy, seen: Snapshot, *, new: bool, automatic: bool
     ) -> tuple[Refusal, str] | None:
         """What forbids a command of the holder, whatever the policy of the flight state is."""
+        state, link = seen.state, seen.link
         kind = type(action)
         unheard = link is LinkState.LOST and kind in self._unheard and not automatic
         if link is not LinkState.UP and link is not LinkState.DEGRADED and not unheard:
@@ -405,7 +379,8 @@ class CommandChecks:
                 return Refusal.WRONG_STATE, f"{others}, and {what} does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
-        if self._ladder.lands_for_battery and (kind in SET_POINTS or (automatic and kind is not Land)):
+        by_itself = automatic and kind is not Land
+        if self._ladder.step is Failsafe.LAND and self._ladder.lands_for_battery and (by_itself or kind in SET_POINTS):
             what = "returns to its start" if self._ladder.returning else "lands"
             return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
         if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:

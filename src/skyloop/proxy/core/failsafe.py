@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import NS_PER_S
 from skyloop.messages import Failsafe, FlightState, Hover, Land, ReturnToStart
 from skyloop.proxy.core.settings import FailsafeSettings
 
@@ -92,12 +92,7 @@ def due(
 ) -> tuple[Failsafe, str]:
     """Return the step that is due for a flight of ours, and why: the whole ladder.
 
-    Args:
-        now_ns: The time now [ns].
-        inputs: What is known of flight, pilot and vehicle.
-        settings: When each step is taken.
-        barred: Why set-points are refused now; may be empty.
-        battery_low: It is below the charge to return at, and the pilot has not taken over for that.
+    ``battery_low``: it is below the charge to return at, and the pilot has not taken over for that.
     """
     if barred:
         return Failsafe.LAND, barred
@@ -105,11 +100,11 @@ def due(
         return Failsafe.LAND, "battery_return"
     silent_ns = now_ns - inputs.last_command_ns
     silence = "silent" if inputs.pilot == "held" else inputs.pilot
-    if silent_ns >= nanoseconds(settings.land_after_s):
+    if silent_ns >= settings.land_after_s * NS_PER_S:
         return Failsafe.LAND, silence
     if inputs.state is FlightState.LANDING:  # better to end a landing than to hang over the place
         return Failsafe.NONE, ""
-    if silent_ns >= nanoseconds(settings.hover_after_s) or inputs.pilot == "gone":
+    if silent_ns >= settings.hover_after_s * NS_PER_S or inputs.pilot == "gone":
         return Failsafe.HOVER, silence
     if not inputs.link_up:
         return Failsafe.HOVER, "vehicle_link"
@@ -129,7 +124,7 @@ class FailsafeLadder:
         self.battery_low = False  #: it is below the charge to return at, and was not charged since
         self._overruled = False  # the pilot has taken over a return for that, and flies on
         self._wanted: FailsafeTask | None = None
-        self._given_up = False  # a landing, of what may land all the same while it is not heard
+        self.given_up = False  #: a hover or a pilot's landing, of what may do it all the same while it is not heard
         self.wanted_ns = 0  #: when what it wants was begun
         self._taken = False
         self._next_try_ns = 0
@@ -137,7 +132,7 @@ class FailsafeLadder:
     def update(self, now_ns: int, inputs: FailsafeInputs) -> list[Effect]:
         """Take the steps that are due. Call at a steady pace, and at once after anything that matters."""
         effects = self._battery(inputs)
-        self._given_up &= inputs.airborne and not inputs.link_up
+        self.given_up &= inputs.airborne and not inputs.link_up
         if not inputs.airborne:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, inputs.state.value)
@@ -146,7 +141,7 @@ class FailsafeLadder:
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
         told = inputs  # the driver may not show a landing yet that goes on without its pilot
-        if isinstance(self._wanted, Land) or self._given_up:  # no hover breaks one off that is given up
+        if isinstance(self._wanted, Land) or self.given_up:  # nothing but a landing comes after that
             told = replace(inputs, state=FlightState.LANDING)
         step, reason = due(now_ns, told, self.settings, barred=self.barred, battery_low=low)
         if _RANK[step] > _RANK[self.step]:
@@ -165,13 +160,13 @@ class FailsafeLadder:
         if self.barred:
             return []
         self._overruled |= self.lands_for_battery
-        self._wanted, self._given_up = None, False
+        self._wanted, self.given_up = None, False
         return self._move(Failsafe.NONE, "fresh command")
 
     @property
     def idle(self) -> bool:
         """Whether no step is in force and nothing is to be done."""
-        return self._wanted is None and self.step is Failsafe.NONE and not self._given_up
+        return self._wanted is None and self.step is Failsafe.NONE and not self.given_up
 
     @property
     def returning(self) -> bool:
@@ -203,10 +198,14 @@ class FailsafeLadder:
         if not self.lands:
             self._want(Land(), now_ns)
 
-    def give_up_landing(self) -> None:
-        """Go on no longer with a pilot's landing, and do nothing else until the vehicle is heard or commanded."""
-        if self.step is Failsafe.NONE:
-            self._wanted, self._given_up = None, True
+    @property
+    def acts(self) -> bool:
+        """Whether it makes the vehicle hover or land."""
+        return self._wanted is not None
+
+    def give_up(self) -> None:
+        """Ask for no hover or pilot's landing any more; only the silence of a pilot lands what is not heard."""
+        self._wanted, self.given_up = None, True
 
     def order_landing(self) -> None:
         """Land because the proxy is about to end; from now on only landing and emergency stop are accepted."""
@@ -268,5 +267,5 @@ class FailsafeLadder:
             return []
         if isinstance(wanted, ReturnToStart) and state is FlightState.TAKING_OFF:
             return []
-        self._next_try_ns = now_ns + nanoseconds(self.settings.retry_s)
+        self._next_try_ns = now_ns + int(self.settings.retry_s * NS_PER_S)
         return [FailsafeAction(wanted)]

@@ -8,9 +8,8 @@ alone. The rules in words are in ``docs/proxy.md``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Final
+from typing import Final, NamedTuple
 
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.messages import (
@@ -20,6 +19,7 @@ from skyloop.messages import (
     Feedback,
     FlightState,
     Hover,
+    LinkState,
     Position,
     Takeoff,
     Velocity,
@@ -41,6 +41,7 @@ STALL_HEADWAY: Final = 0.02  #: [m]
 BLIND_NS: Final = 15 * NS_PER_S  #: of a landing that nothing shows, nobody can say by then what became of it
 
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
+_AIRBORNE: Final = frozenset(state for state in FlightState if state.airborne)
 _MANOEUVRES: Final = (FlightState.TAKING_OFF, FlightState.LANDING)
 _FLYING: Final = (Takeoff, Hover, Attitude, Velocity, Position)
 
@@ -53,12 +54,21 @@ class Whose(Enum):
     OTHERS = auto()  #: somebody else does: a remote control, a ground station, another program
 
 
-@dataclass(frozen=True, slots=True)
-class Changed:
+class Changed(NamedTuple):
     """The flight is somebody else's now. ``why``: to be published, empty where it is already."""
 
     whose: Whose
     why: str = ""
+
+
+class Snapshot(NamedTuple):
+    """What is known of the vehicle where something is decided: read once, and passed on."""
+
+    now_ns: int
+    state: FlightState
+    feedback: Feedback | None  #: the newest sample; None: none came yet
+    link: LinkState
+    link_up: bool
 
 
 class Flight:
@@ -105,7 +115,7 @@ class Flight:
             if self._has_no_notion or state in _MANOEUVRES:
                 return state
             return state if reported is FlightState.FLYING and state is FlightState.HOVERING else reported
-        if not self._has_no_notion or (reported.airborne and not state.airborne):
+        if not self._has_no_notion or (reported in _AIRBORNE and state not in _AIRBORNE):
             return reported
         return state
 
@@ -114,7 +124,7 @@ class Flight:
 
         A vehicle of which nothing is known flies if it was seen to, or from the first command to do so.
         """
-        return state.airborne or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
+        return state in _AIRBORNE or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
 
     def may_begin(self, now_ns: int) -> bool:
         """Return whether a take-off was asked for that does not show yet: what stands may be about to fly."""
@@ -180,11 +190,8 @@ class Flight:
     ) -> Changed | None:
         """Observe the vehicle.
 
-        Args:
-            reported: The flight state as the driver reported it last.
-            left_to: What others chose since we steered last, as the driver observes it.
-            now_ns: The time now [ns].
-            feedback: The newest sample, where the link is up and it is young; None: nothing is shown now.
+        ``left_to``: what others chose since we steered last, as the driver observes it. ``feedback``: the newest
+        sample, where the link is up and it is young; None: nothing is shown now.
         """
         if self._has_no_notion and not self._steered and feedback is not None:
             self._look(reported, left_to, feedback.altitude_m)
@@ -196,7 +203,7 @@ class Flight:
             self._stands(now_ns)
         else:
             self._grounded_ns = None
-            if state.airborne:
+            if state in _AIRBORNE:
                 self._seen_up = True
             if flies:
                 self._claimed_until_ns = None  # the take-off shows
@@ -276,12 +283,7 @@ class Flight:
 
         What the vehicle reports counts where it reports anything. Else a descent has met the ground where the
         altimeter, near it, shows no headway. A landing without either goes on for :data:`BLIND_NS`, and nothing is
-        known then.
-
-        Args:
-            reported: The flight state as the driver reported it last.
-            now_ns: The time now [ns].
-            feedback: The newest sample, where the link is up and it is young; None: nothing is shown now.
+        known then. ``feedback``: as in :meth:`observe`.
         """
         landing = self._state is FlightState.LANDING
         if feedback is None:

@@ -132,12 +132,8 @@ class FlightSettings:
     def updated(self, value: Mapping[str, Any], changed: Collection[str]) -> FlightSettings:
         """Return the settings with new values; parts that no changed parameter concerns stay the same object.
 
-        Args:
-            value: The values in force, by the parameter's name.
-            changed: How the names of those that changed begin: ``limits`` for ``limits.tilt``.
-
-        Raises:
-            ParameterError: The no-fly zones can't be read.
+        ``value``: the values in force by name; ``changed``: how the names of those that changed begin, as ``limits``.
+        Raises :class:`ParameterError` where the no-fly zones can't be read.
         """
         new: dict[str, Any] = {}
         limits, space = self.airspace.limits, self.airspace.space

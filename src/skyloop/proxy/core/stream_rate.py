@@ -51,12 +51,7 @@ class _Sent:
 
 
 class StreamRate:
-    """The rate of one stream to one subscriber. Not thread-safe.
-
-    Args:
-        most_kbit_s: The highest rate [kbit/s].
-        now_ns: The present time.
-    """
+    """The rate of one stream to one subscriber, ``most_kbit_s`` at most. Not thread-safe."""
 
     def __init__(self, most_kbit_s: int, now_ns: int) -> None:
         self.kbit_s = float(min(START_KBIT_S, most_kbit_s))  #: the present rate
@@ -103,13 +98,7 @@ class StreamRate:
         return self._bytes * 8e-3 <= self.kbit_s * time_s
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:
-        """Note a picture.
-
-        Args:
-            seq: Its number, higher than those before.
-            size: Its bytes.
-            now_ns: When it was handed to the transport.
-        """
+        """Note that a picture was handed to the transport; ``seq`` is higher than those before."""
         self._under_way.append(_Sent(seq, size, now_ns))
         self._bytes += size
         self._quiet_ns = self._quiet_ns or now_ns
@@ -117,12 +106,7 @@ class StreamRate:
         self._owed = False
 
     def acknowledged(self, seq: int, now_ns: int) -> None:
-        """Note that the subscriber has a picture.
-
-        Args:
-            seq: Its number.
-            now_ns: When its acknowledgement came.
-        """
+        """Note that the subscriber has a picture."""
         if self._quiet_ns and now_ns - self._quiet_ns >= nanoseconds(SILENT_S):  # more of what was sent comes now
             self._returned_ns, self._owed = now_ns, True
         newest = None
@@ -199,15 +183,7 @@ ENOUGH_BITS: Final = 0.05  #: of the rate, for a pixel that is sent: with less, 
 
 
 def picture_form(kbit_s: float, pixels_1_s: float) -> tuple[float, float]:
-    """Choose the size of the pictures and how many are sent, for a rate.
-
-    Args:
-        kbit_s: The rate [kbit/s].
-        pixels_1_s: Pixels that the camera gives in a second.
-
-    Returns:
-        The factor for width and height, and the share of the pictures.
-    """
+    """Choose for a rate the factor of width and height, and the share of the pictures that is sent."""
     for scale, share in _LADDER:
         if kbit_s * 1000.0 >= ENOUGH_BITS * pixels_1_s * scale**2 * share:
             return scale, share

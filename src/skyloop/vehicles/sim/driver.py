@@ -206,10 +206,10 @@ class SimDriver(Driver):
         if self._firmware is not None and name not in table.names(self._present()):
             return self._firmware.driver.set_parameter(name, value)
         with self._changing:
-            before, standard = self._present(), self._standard()
-            after = table.with_value(before, standard, name, value)
+            before = self._present()
+            after, written = table.with_value(before, name, value)
             self._write(before, after)
-            return next(p.value for p in table.describe(after, standard) if p.name == name)
+            return written
 
     def _present(self) -> table.ParameterValues:
         wind = self._wind or (self.host.wind if self.host is not None else self._usual_wind())

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
@@ -44,20 +45,19 @@ class ParameterValues:
     link: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class _Settable:
+class _Settable(NamedTuple):
     parameter: Parameter
-    write: Callable[[ParameterValues, Value], ParameterValues]
+    write: Callable[[ParameterValues, Any], ParameterValues]  #: given a value as :func:`_checked` returns it
 
 
 def describe(state: ParameterValues, standard: ParameterValues) -> list[Parameter]:
     """Return all parameters with their present values; ``standard`` holds the defaults."""
-    return [entry.parameter for entry in _table(state, standard).values()]
+    return [entry.parameter for entries in _GROUPS.values() for entry in entries(state, standard)]
 
 
 def names(state: ParameterValues) -> frozenset[str]:
     """Return the names of all parameters."""
-    return frozenset(_table(state, state))
+    return frozenset(parameter.name for parameter in describe(state, state))
 
 
 def room(room: Room) -> Parameter:
@@ -74,54 +74,72 @@ def geometry(world: World) -> Parameter:
     return Parameter(WORLD, ParameterType.TEXT, text, read_only=True, description="what stands in the world, as JSON")
 
 
-def with_value(state: ParameterValues, standard: ParameterValues, name: str, value: Value) -> ParameterValues:
-    """Return the values after writing one.
+def with_value(state: ParameterValues, name: str, value: Value) -> tuple[ParameterValues, Value]:
+    """Return the values after writing one, and this one as it was written.
 
     Raises:
         UnknownNameError: There is no such parameter.
         ParameterError: It does not take this value.
     """
-    table = _table(state, standard)
-    if name not in table:
-        raise UnknownNameError("parameter of the simulated drone", name, table)
-    _check(table[name].parameter, value)
-    return table[name].write(state, value)
+    for entry in _GROUPS.get(name.partition(".")[0], _no_entries)(state, state):
+        if entry.parameter.name == name:
+            written = _checked(entry.parameter, value)
+            return entry.write(state, written), written
+    raise UnknownNameError("parameter of the simulated drone", name, names(state))
 
 
-def _table(state: ParameterValues, standard: ParameterValues) -> dict[str, _Settable]:
-    entries = [*_limit_entries(state, standard), *_camera_entries(state, standard), *_world_entries(state, standard)]
-    return {entry.parameter.name: entry for entry in entries}
+def _no_entries(_state: ParameterValues, _standard: ParameterValues) -> list[_Settable]:
+    return []
 
 
 def _limit_entries(state: ParameterValues, standard: ParameterValues) -> list[_Settable]:
-    limits = state.limits
+    limits, usual = state.limits, standard.limits
     if limits is None:
         return []
+    return [
+        _Settable(
+            Parameter(
+                name,
+                ParameterType.FLOAT,
+                getattr(limits, field),
+                unit,
+                *LIMIT_RANGES[field],
+                default=getattr(usual, field),
+                description=description,
+            ),
+            partial(_with_limit, field),
+        )
+        for name, field, unit, description in _LIMITS
+    ]
 
-    def entry(name: str, field: str, unit: str, description: str) -> _Settable:
-        now, usual = getattr(limits, field), getattr(standard.limits, field)
 
-        def write(before: ParameterValues, value: Value) -> ParameterValues:
-            return replace(before, limits=replace(limits, **{field: float(value)}))  # type: ignore[arg-type]
-
-        return _Settable(_number(name, now, usual, unit, LIMIT_RANGES[field], description), write)
-
-    return [entry(*row) for row in _LIMITS]
+def _with_limit(field: str, before: ParameterValues, value: Any) -> ParameterValues:
+    assert before.limits is not None
+    return replace(before, limits=replace(before.limits, **{field: value}))
 
 
 def _camera_entries(state: ParameterValues, standard: ParameterValues) -> list[_Settable]:
-    def entry(at: int, last: str, field: str, unit: str, span: tuple[float, float], description: str) -> _Settable:
-        model, usual = state.cameras[at], getattr(standard.cameras[at], field)
+    return [
+        _Settable(
+            Parameter(
+                f"camera.{model.name}.{last}",
+                ParameterType.FLOAT,
+                getattr(model, field),
+                unit,
+                *span,
+                default=getattr(standard.cameras[at], field),
+                description=description,
+            ),
+            partial(_with_camera, at, field),
+        )
+        for at, model in enumerate(state.cameras)
+        for last, field, unit, span, description in _CAMERA
+    ]
 
-        def write(before: ParameterValues, value: Value) -> ParameterValues:
-            change: dict[str, Any] = {field: _float(value)}
-            changed = replace(before.cameras[at], **change)
-            return replace(before, cameras=(*before.cameras[:at], changed, *before.cameras[at + 1 :]))
 
-        name = f"camera.{model.name}.{last}"
-        return _Settable(_number(name, getattr(model, field), usual, unit, span, description), write)
-
-    return [entry(at, *row) for at in range(len(state.cameras)) for row in _CAMERA]
+def _with_camera(at: int, field: str, before: ParameterValues, value: Any) -> ParameterValues:
+    changed = replace(before.cameras[at], **{field: value})
+    return replace(before, cameras=(*before.cameras[:at], changed, *before.cameras[at + 1 :]))
 
 
 def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_Settable]:
@@ -135,9 +153,25 @@ def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_S
         default=standard.wind.mean_m_s,
         description="mean wind: where it blows to, east, north and up",
     )
-    usual = standard.wind.gust_m_s
-    gust = _number("sim.gust", state.wind.gust_m_s, usual, "m/s", (0.0, 10.0), "standard deviation of gusts")
-    battery = _number("sim.battery", state.battery, standard.battery, "", (0.0, 1.0), "charge left, 0 to 1")
+    gust = Parameter(
+        name="sim.gust",
+        type=ParameterType.FLOAT,
+        value=state.wind.gust_m_s,
+        unit="m/s",
+        minimum=0.0,
+        maximum=10.0,
+        default=standard.wind.gust_m_s,
+        description="standard deviation of gusts",
+    )
+    battery = Parameter(
+        name="sim.battery",
+        type=ParameterType.FLOAT,
+        value=state.battery,
+        minimum=0.0,
+        maximum=1.0,
+        default=standard.battery,
+        description="charge left, 0 to 1",
+    )
     link = Parameter(
         name="sim.link",
         type=ParameterType.BOOL,
@@ -146,41 +180,30 @@ def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_S
         description="whether the drone's radio works: without it nothing is received, and commands are lost",
     )
     return [
-        _Settable(wind, lambda before, value: replace(before, wind=replace(before.wind, mean_m_s=_vector(value)))),
-        _Settable(gust, lambda before, value: replace(before, wind=replace(before.wind, gust_m_s=_float(value)))),
-        _Settable(battery, lambda before, value: replace(before, battery=_float(value))),
-        _Settable(link, lambda before, value: replace(before, link=bool(value))),
+        _Settable(wind, lambda before, value: replace(before, wind=replace(before.wind, mean_m_s=value))),
+        _Settable(gust, lambda before, value: replace(before, wind=replace(before.wind, gust_m_s=value))),
+        _Settable(battery, lambda before, value: replace(before, battery=value)),
+        _Settable(link, lambda before, value: replace(before, link=value)),
     ]
 
 
-def _float(value: Value) -> float:
-    assert isinstance(value, (int, float))  # as checked before
-    return float(value)
+#: What gives the parameters of each group, by the first part of their names.
+_GROUPS: Final = {"limits": _limit_entries, "camera": _camera_entries, "sim": _world_entries}
 
 
-def _vector(value: Value) -> tuple[float, float, float]:
-    assert isinstance(value, tuple)
-    x, y, z = value
-    return (float(x), float(y), float(z))
-
-
-def _number(
-    name: str, value: float, default: float, unit: str, span: tuple[float, float], description: str
-) -> Parameter:
-    return Parameter(name, ParameterType.FLOAT, value, unit, span[0], span[1], default, description=description)
-
-
-def _check(parameter: Parameter, value: Value) -> None:
+def _checked(parameter: Parameter, value: Value) -> Value:
+    """Return a value as it is written: a bool, a float, or a tuple of three."""
     kind, name = parameter.type, parameter.name
     if kind is ParameterType.BOOL:
         if not isinstance(value, bool):
             raise ParameterError(f"{name} is a bool, not {value!r}", code=Refusal.WRONG_TYPE)
-        return
+        return value
     numbers = value if isinstance(value, tuple) else (value,)
     count = len(value) if isinstance(value, tuple) else 0
     if count != (3 if kind is ParameterType.VECTOR else 0):
         wanted = "three numbers" if kind is ParameterType.VECTOR else "a number"
         raise ParameterError(f"{name} is {wanted}, not {value!r}", code=Refusal.WRONG_TYPE)
+    written: list[float] = []
     for number in numbers:
         if isinstance(number, bool) or not isinstance(number, (int, float)):
             raise ParameterError(f"{name} is made of numbers, not {value!r}", code=Refusal.WRONG_TYPE)
@@ -189,3 +212,5 @@ def _check(parameter: Parameter, value: Value) -> None:
                 f"{name} is from {parameter.minimum:g} to {parameter.maximum:g}, not {number!r}",
                 code=Refusal.OUT_OF_RANGE,
             )
+        written.append(float(number))
+    return tuple(written) if isinstance(value, tuple) else written[0]

@@ -1,0 +1,449 @@
+"""What time, links and the authority ask of a flight, and the one lock around every decision about it.
+
+Every decision is made under this lock, for as long as it and the driver's call last. The transport's threads bring
+commands and requests for the authority (:mod:`skyloop.proxy.handler`), the ticker brings the time. The decisions
+themselves are pure, in :mod:`skyloop.proxy.core`.
+
+Lock order: this lock first, then the publisher's, then the events'. Nothing that is called under those two calls back
+here; a driver publishes what it receives from any thread without this lock.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+from skyloop.clock import Clock, nanoseconds, seconds
+from skyloop.messages import (
+    Action,
+    AnyAction,
+    Applied,
+    Failsafe,
+    Fate,
+    Feedback,
+    FlightState,
+    Hover,
+    Land,
+    Refusal,
+    ReturnToStart,
+    Velocity,
+    encode,
+)
+from skyloop.messages.fields import LATEST_NS
+from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
+from skyloop.proxy.core.authority import Effect as AuthorityEffect
+from skyloop.proxy.core.command_checks import CommandChecks, Intent
+from skyloop.proxy.core.failsafe import BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
+from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
+from skyloop.proxy.core.flight import BELIEF_NS, Snapshot, Whose
+from skyloop.proxy.core.settings import Clamp
+from skyloop.proxy.events import (
+    UNHEARD,
+    Counters,
+    Episodes,
+    EventDraft,
+    EventPublisher,
+    authority_event,
+    battery_event,
+    clamped_event,
+    drift_event,
+    enforcement_event,
+    failsafe_event,
+    given_up_event,
+    name_of,
+    ownership_event,
+    position_jumped_event,
+    slept_event,
+)
+from skyloop.proxy.executor import ActionExecutor, ReturnSupervisor
+from skyloop.proxy.publisher import VehiclePublisher
+from skyloop.proxy.requests import Session
+from skyloop.transport.base import COMMANDS, TransportServer
+
+_LAND: Final = Land()
+_NOTICED_M_S: Final = 0.05  #: a step of the software autopilot that is shortened by less is not worth telling
+#: So much more sleep of the computer than was known is one: shorter ones are not told from a delay.
+SLEEP_NS: Final = nanoseconds(0.25)
+
+
+class FlightSupervisor:
+    """Authority, failsafe and ownership of one vehicle. Public methods may be called from any thread.
+
+    ``sessions``: the connections by the application's number, read here and changed by the proxy. ``slept``: for how
+    long the computer has slept, in all [ns].
+    """
+
+    def __init__(
+        self,
+        *,
+        executor: ActionExecutor,
+        publisher: VehiclePublisher,
+        events: EventPublisher,
+        counters: Counters,
+        server: TransportServer,
+        sessions: Mapping[int, Session],
+        clock: Clock,
+        slept: Clock,
+    ) -> None:
+        self.authority = Authority()
+        self.ladder = FailsafeLadder()
+        self.flight = executor.flight
+        self.checks = CommandChecks(
+            self.authority,
+            self.ladder,
+            self.flight,
+            supported=executor.supported,
+            why_not=executor.why_not,
+            native=executor.native,
+        )
+        self.on_ownership: Callable[[bool], None] | None = None  #: called with whether the flight is ours, locked
+        self._back = ReturnSupervisor(self.checks, self.ladder, executor)
+        self._lock = threading.RLock()
+        self._executor = executor
+        self._vehicle = publisher
+        self._events = events
+        self._counts = counters.counts
+        self._delays_ns = counters.delays_ns
+        self._publish = server.publish
+        self._subscribers = server.subscribers
+        self._sessions = sessions
+        self._clock = clock
+        self._left = False  # the proxy ends: nothing flies by a decision of it any more
+        self._pilot = "none"  # why nobody holds the authority, or "held"
+        self._breaks_seen = 0  # of the vehicle's link, when last looked at
+        self._heard_ns = -LATEST_NS  # when the vehicle was heard last, as far as a tick noticed
+        self._slept = slept
+        self._slept_seen = slept()  # when last looked at, or noticed
+        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
+        #: Until when a take-off that the vehicle was told of, and does not show yet, has time to; None: there is none.
+        self._rising_until_ns: int | None = None
+        self._drifts = False  # what the software autopilot flies; told last
+        self._enforced = True  # whether the safety box and zones could be, at the last set-point
+        self._episodes = Episodes()  # of limits that touch what the proxy does with nobody in command
+        if executor.autopilot is not None:
+            executor.autopilot.guard = self._guard_step
+        self._stamp()
+
+    def begin(self, now_ns: int) -> None:
+        """Begin the run, before the server starts. A flight of an earlier run waits for its pilot."""
+        self.authority.last_command_ns = now_ns
+
+    def tick(self, now_ns: int) -> None:
+        """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace.
+
+        Raises what the driver raised when it was asked who flies the vehicle, when all else is done.
+        """
+        with self._lock:
+            if self._left:
+                return
+            executor = self._executor
+            self._observe_sleep(now_ns)
+            self._observe_link(now_ns)
+            self._observe_silence(now_ns)
+            self._observe_position(now_ns)
+            effects = self.authority.update(now_ns)
+            if effects:
+                self._apply_authority(effects, now_ns)
+            self._update_failsafe(now_ns)
+            session = self._holder
+            if session is not None:
+                self._observe_intent(session, now_ns)
+            self._observe_takeoff(now_ns)
+            if self._back.update(executor.seen(now_ns), ours=self.flight.ours):
+                self._stamp()
+            steered = executor.step(now_ns)
+            if steered is not None:
+                self._echo_own(steered, now_ns)
+                drifts = executor.drifts
+                if drifts is not self._drifts:
+                    self._drifts = drifts
+                    self._events.publish_repeated((0, "drift", drifts), lambda: drift_event(drifts))
+            why, executor.gave_up = executor.gave_up, ""
+            if why and session is not None:
+                session.intents.newest.end(Fate.REFUSED, why, Refusal.WRONG_STATE)
+                self._tell(session)
+            error, executor.unsaid = executor.unsaid, None
+            if error is not None:
+                raise error
+
+    # All below is called under the lock: the vehicle's link, and whose the flight is ------------------------------
+
+    def _observe_link(self, now_ns: int) -> None:
+        """Act on what happened to the vehicle's link since it was last observed.
+
+        Intents end when it breaks and when it is back, so that nothing asked for in between is done later. Hover is
+        given both times: a driver must not go on with an old set-point. A pilot's landing lasts, as nothing is safer.
+        """
+        breaks = self._vehicle.link_breaks
+        if breaks == self._breaks_seen:
+            return
+        self._breaks_seen = breaks
+        landing = self._asked(Land)
+        if landing is None or (landing.automatic and not landing.begun):
+            self._start_over(Fate.LINK, now_ns)
+            return
+        if landing.begun or self._vehicle.link_up:
+            self.ladder.land_on(now_ns)
+        else:
+            self.ladder.hand_over(now_ns)
+        self._update_failsafe(now_ns)
+
+    def _observe_silence(self, now_ns: int) -> None:
+        """Give up a hover or landing when the vehicle has not been heard for long: by then it may be on another flight.
+
+        A landing that the ladder ordered leaves what is found in the air to others at once: nobody is there to say
+        whose it is. After all else that is given up it does so when the vehicle is heard, as its pilot may be there.
+        """
+        if self._vehicle.link_up:
+            self._heard_ns = now_ns
+            return
+        ladder, asked = self.ladder, self._asked(Hover, Land)
+        if asked is None and not ladder.acts:
+            return
+        asked_ns = ladder.wanted_ns if asked is None else asked.asked_ns  # its pilot may have left
+        if now_ns - max(asked_ns, self._heard_ns) < BELIEF_NS:
+            return
+        what = "landing" if ladder.lands or self._asked(Land) is not None else "hover"
+        if asked is not None:
+            self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: ask for it again", Refusal.VEHICLE_LINK_LOST)
+        if ladder.step is not Failsafe.LAND:
+            ladder.give_up()
+        elif not self.flight.forget():
+            return
+        self._events.publish_drafts(given_up_event(what))
+        self._update_failsafe(now_ns)
+
+    def _observe_sleep(self, now_ns: int) -> None:
+        """Act on a sleep of the computer: all that is known is older than its clock says."""
+        slept_ns = self._slept() - self._slept_seen
+        if slept_ns < SLEEP_NS:
+            return
+        self._slept_seen += slept_ns
+        self._slept_ns, self._awake_ns = slept_ns, now_ns
+        self.authority.slept(slept_ns)
+        self.flight.slept(slept_ns)
+        self._events.publish_drafts(slept_event(seconds(slept_ns)))
+        self._start_over(Fate.SLEPT, now_ns)
+
+    def _observe_position(self, now_ns: int) -> None:
+        """Note where the vehicle is, and hover where that jumped: what was asked for meant another place."""
+        airspace = self.checks.airspace
+        airspace.observe(self._vehicle.feedback_now)
+        if not airspace.jumped_m:
+            return
+        if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
+            lands = self._asked(Land) is not None or self.ladder.lands_on  # wherever it is
+            event = position_jumped_event(airspace.jumped_m, lands=lands)
+            self._events.publish_repeated((0, "jumped"), lambda: event)
+            if not lands:
+                self._start_over(Fate.JUMPED, now_ns)
+        airspace.jumped_m = 0.0
+
+    def _start_over(self, fate: Fate, now_ns: int) -> None:
+        """Hover, and let nothing that was asked for until now be done later."""
+        self._end_intents(fate, now_ns)
+        self.ladder.hand_over(now_ns)
+        self._update_failsafe(now_ns)
+
+    def _look(self, now_ns: int) -> Snapshot:
+        """Look at the vehicle, and act on what has changed about whose flight it is."""
+        executor, flight = self._executor, self.flight
+        changed = executor.observe(now_ns)
+        if self.on_ownership is not None and not flight.awaited:  # else the note of it stays as it is
+            self.on_ownership(flight.ours)
+        if changed is not None:
+            self._stamp()
+            if changed.whose is Whose.OTHERS:
+                executor.stop_autopilot()
+                why = f"{flight.others}: hover, take off or land first to take it over"
+                self._end_intents(Fate.OTHERS, now_ns, why, Refusal.WRONG_STATE)
+            elif changed.why:  # found on a flight that is ours: its pilot may come back, as if it had just commanded
+                self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
+            if changed.why and executor.supported:  # a recording that is played flies by itself, and nobody wonders
+                self._events.publish_drafts(ownership_event(changed))
+        return executor.seen(now_ns)
+
+    # Intents ------------------------------------------------------------------------------------------------------
+
+    @property
+    def _holder(self) -> Session | None:
+        """The connection of who holds the authority."""
+        holder = self.authority.holder
+        return None if holder is None else self._sessions.get(holder.app_id)
+
+    def _asked(self, *kinds: type[Action]) -> Intent | None:
+        """What the holder asks for, where that is of one of these kinds and under way."""
+        session = self._holder
+        newest = None if session is None else session.intents.newest
+        return newest if newest is not None and type(newest.action) in kinds and not newest.over else None
+
+    def _end_intents(self, fate: Fate, now_ns: int, why: str = "", reason: Refusal | None = None) -> None:
+        """End what the holder asked for until now."""
+        session = self._holder
+        if session is not None:
+            session.intents.end(fate, why, reason)
+            self._tell(session)
+        self._withdraw_takeoff(now_ns)
+
+    def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
+        """End, or complete, what a holder asked for by what the vehicle does; return the flight state."""
+        state, intent = self._executor.state, session.intents.newest
+        if not intent.over:
+            if state is not intent.state:
+                self._look(now_ns)  # a landing may be others': then that is what ended it
+            feedback = self._vehicle.feedback_now
+            intent.observe(state, now_ns, None if feedback is None else feedback.captured_ns)
+            if intent.over:
+                self._tell(session)
+                if intent.fate is not Fate.COMPLETED:
+                    self._withdraw_takeoff(now_ns)
+        if self._rising_until_ns is None:
+            return state
+        self._observe_takeoff(now_ns)
+        return self._executor.state
+
+    def _observe_takeoff(self, now_ns: int) -> None:
+        """Withdraw a take-off that has had its time, although a set-point may have taken its place meanwhile."""
+        if self._rising_until_ns is not None and not self._executor.stands:
+            self._rising_until_ns = None  # it has left the ground
+        elif self._rising_until_ns is not None and now_ns >= self._rising_until_ns:
+            self._withdraw_takeoff(now_ns)
+
+    def _withdraw_takeoff(self, now_ns: int) -> bool:
+        """Make the vehicle forget a take-off that it has not begun to show; return whether there was one."""
+        until_ns, self._rising_until_ns = self._rising_until_ns, None
+        if until_ns is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
+            return False
+        if self._executor.attempt(_LAND, now_ns, "apply"):
+            self.flight.call_off(now_ns)
+        elif self.flight.ours:  # once more, while that take-off may show
+            self._rising_until_ns = now_ns + nanoseconds(self.ladder.settings.retry_s)
+        return True
+
+    def _tell(self, session: Session) -> None:
+        """Let feedback tell what became of an application's newest intent: soon where it ended."""
+        self._vehicle.tell(session.intents.newest, session.app_id, session.name)
+
+    def _echo_own(self, action: AnyAction, now_ns: int) -> None:
+        """Publish what the proxy itself made the vehicle do."""
+        if self._subscribers(COMMANDS):
+            echo = Applied(0, self.authority.lease, 0, now_ns, self._clock(), action, action)
+            self._publish(COMMANDS, encode(echo))
+
+    def _report_limits(
+        self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
+    ) -> None:
+        """Publish what began to be in the way of a command of this application, or of what the proxy does itself."""
+        if enforced is not None and enforced is not self._enforced:
+            self._enforced = enforced
+            self._events.publish_drafts(enforcement_event(enforced))
+        episodes, name = (self._episodes, "the proxy") if session is None else (session.episodes, session.name)
+        for clamp in episodes.begun(clamps, now_ns):
+            self._events.publish_drafts(clamped_event(name, clamp))
+
+    def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
+        """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
+        allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
+        clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
+        if clamps or (enforced is not None and enforced is not self._enforced):
+            self._report_limits(self._holder, clamps, enforced, now_ns)
+        assert isinstance(allowed, Velocity)
+        return allowed
+
+    # Authority ----------------------------------------------------------------------------------------------------
+
+    def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
+        """Make the vehicle hover where the authority changes hands, then publish ``news`` and the changes."""
+        for effect in effects:
+            if not isinstance(effect, Lost | Preempted | Granted):
+                continue
+            session = self._sessions.get(effect.app_id)
+            if isinstance(effect, Lost):
+                self._pilot = effect.reason
+                if session is not None and session.intents.lands and self.flight.ours:
+                    self.ladder.land_on(now_ns)
+            elif isinstance(effect, Granted):
+                self._pilot = "held"
+                self.ladder.hand_over(now_ns)
+            if session is not None:
+                session.intents.end(Fate.AUTHORITY)
+                self._tell(session)
+                self._withdraw_takeoff(now_ns)
+        drafts = self._act(now_ns, stamps=True)  # which hovers, before anybody learns of any of this
+        holder = self.authority.holder
+        told = [(one, authority_event(one, self._sessions, holder, now_ns)) for one in effects]
+        ended = [draft for one, draft in told if isinstance(one, Lost | Preempted)]
+        rest = [draft for one, draft in told if not isinstance(one, Lost | Preempted)]
+        self._events.publish_drafts(*news, *ended, *drafts, *rest)
+
+    def _stamp(self) -> None:
+        """Let feedback show who is in command, the failsafe's step and whose the flight is."""
+        authority, flight = self.authority, self.flight
+        owner = authority.holder or authority.silent
+        self._vehicle.stamp(
+            {
+                "owner": name_of(self._sessions, owner.app_id) if owner is not None else None,
+                "owner_id": owner.app_id if owner is not None else 0,
+                "owner_priority": owner.priority if owner is not None else None,
+                "lease": authority.lease,
+                "failsafe": self.ladder.step,
+                "others": flight.others if flight.whose is Whose.OTHERS else None,
+                "start_position_m": self._back.start,
+                "return_phase": self._back.phase,
+            }
+        )
+
+    # Failsafe -----------------------------------------------------------------------------------------------------
+
+    def _update_failsafe(self, now_ns: int) -> None:
+        """Let the ladder decide and act, and publish what it did."""
+        drafts = self._act(now_ns)
+        if drafts:
+            self._events.publish_drafts(*drafts)
+
+    def _act(self, now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
+        """Let the ladder decide and act; return what is to be published. ``stamps``: who is in command has changed."""
+        if self._left:
+            return []
+        ladder, flight = self.ladder, self.flight
+        if self._vehicle.link_up and ladder.given_up:
+            flight.forget()
+        seen = self._look(now_ns)
+        if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:
+            ladder.land_on(now_ns)  # no hover takes its pilot's landing back
+        inputs = FailsafeInputs(
+            state=seen.state,
+            airborne=flight.flies(seen.state),
+            last_command_ns=self.authority.last_command_ns,
+            pilot=self._pilot,
+            link_up=seen.link_up,
+            battery=None if seen.feedback is None else seen.feedback.battery,
+            ours=flight.whose is Whose.OURS,
+            return_problem=self._back.why_not(seen),
+            shown=seen.link_up or Land not in self._executor.native,
+        )
+        effects = ladder.update(now_ns, inputs)
+        return self._apply_failsafe(effects, now_ns, stamps=stamps) if effects or stamps else []
+
+    def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
+        """Do what the ladder decided; return what is to be published then, as each event takes its time."""
+        if stamps or any(isinstance(effect, StepChange) for effect in effects):
+            self._stamp()
+        for effect in effects:
+            if isinstance(effect, StepChange):
+                if effect.step is not Failsafe.NONE:
+                    self._end_intents(Fate.FAILSAFE, self._clock())
+            elif isinstance(effect, BatteryLow):
+                continue
+            elif isinstance(effect.action, ReturnToStart):
+                self._back.begin(effect.action, now_ns)
+                self.ladder.attempted(True)
+            else:
+                self.checks.back = None
+                taken = self._executor.failsafe(effect.action, now_ns)
+                self.ladder.attempted(taken)
+                if taken:
+                    self._echo_own(effect.action, now_ns)
+        drafts = [failsafe_event(one) for one in effects if isinstance(one, StepChange)]
+        return drafts + [battery_event(one) for one in effects if isinstance(one, BatteryLow)]
