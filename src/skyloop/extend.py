@@ -76,7 +76,8 @@ class Commands(Protocol):
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer a request to hand over the authority; see :meth:`skyloop.client.commands.CommandSender.answer`."""
 
-    # The presence of the person who flies: while it is required and they are absent, only an emergency stop is sent.
+    # The presence of the person who flies: while it is required and they are absent, nothing is repeated and nothing
+    # new is flown; what ends a flight is sent once, and an emergency stop as ever.
     def flown_by_person(self) -> None: ...  #: their presence is required from now on
     def present_until(self, until_ns: int) -> None: ...  #: on this process's clock [ns]; never shortens it
     def is_present(self, now_ns: int) -> bool: ...  #: also True where no presence is required

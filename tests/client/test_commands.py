@@ -355,6 +355,103 @@ def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, dron
     assert len({command.intent for command in proxy.commands if command.action == Land()}) == 1
 
 
+@pytest.mark.parametrize("ending", [Land(), EmergencyStop(), Hover(), Idle()])
+def test_a_take_off_that_the_application_itself_ends_raises_at_once(
+    proxy: ScriptedProxy, drone: Drone, ending: AnyAction
+) -> None:
+    """It waited for its whole time-out, though another thread had landed the vehicle or stopped its motors."""
+
+    def change_of_mind() -> None:
+        proxy.until_commanded(Takeoff())
+        drone.command(ending)
+        at = len(proxy.commands)
+        proxy.more["outcome"] = Outcome(drone.app_id, proxy.until_commanded(ending, at).intent, Fate.COMPLETED)
+
+    changing = background(change_of_mind)
+    begun_s = time.monotonic()
+    with pytest.raises(RefusedError, match="takeoff was ended on the way: another command took its place") as raised:
+        drone.takeoff(timeout_s=3 * WAIT_S)
+    changing.join(WAIT_S)
+    assert raised.value.code == "replaced"
+    assert time.monotonic() - begun_s < 2 * WAIT_S
+    assert drone._core.commands.newest in (ending, Idle()), "what was asked for since is left alone"
+
+
+@pytest.mark.parametrize("behind", [Hover(), Idle(), Velocity(forward=0.1)])
+def test_what_is_asked_for_behind_a_take_off_that_has_begun_does_not_end_it(
+    proxy: ScriptedProxy, drone: Drone, behind: AnyAction
+) -> None:
+    def vehicle() -> None:
+        proxy.until_commanded(Takeoff())
+        proxy.state = FlightState.TAKING_OFF
+        drone.wait("taking_off", WAIT_S)
+        drone.command(behind)
+        at = len(proxy.commands)
+        proxy.more["outcome"] = Outcome(drone.app_id, proxy.until_commanded(behind, at).intent)
+        drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
+        proxy.state = FlightState.HOVERING
+
+    rising = background(vehicle)
+    drone.takeoff(timeout_s=WAIT_S)
+    rising.join(WAIT_S)
+
+
+@pytest.mark.parametrize("since", [Hover(), Idle(), Velocity(forward=0.1), Land()])
+def test_a_take_off_is_not_asked_for_anew_over_what_was_asked_for_a_moment_before(
+    proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch, since: AnyAction
+) -> None:
+    """Between the look at what became of it and the repeat another thread asked for something else: it took off."""
+    commands, looks = drone._core.commands, 0
+    outcome = commands.outcome
+
+    def seen(intent: int) -> Outcome | None:
+        nonlocal looks
+        found = outcome(intent)
+        if found is not None and found.reason is Refusal.DRIVER_FAILED:
+            looks += 1
+            if looks == 2:  # the one that asks again
+                time.sleep(0.6)
+                drone.command(since)
+        return found
+
+    def vehicle() -> None:
+        refuse(proxy, proxy.until_commanded(Takeoff()), Refusal.DRIVER_FAILED, "me: not yet")
+
+    monkeypatch.setattr(commands, "outcome", seen)
+    refusing = background(vehicle)
+    with pytest.raises((NoAnswerError, RefusedError)):
+        drone.takeoff(timeout_s=2.0)
+    refusing.join(WAIT_S)
+    assert looks >= 2
+    assert len({command.intent for command in proxy.commands if command.action == Takeoff()}) == 1
+
+
+def test_who_flies_by_a_page_that_is_not_known_to_be_there_is_not_sent_flying(
+    proxy: ScriptedProxy, drone: Drone
+) -> None:
+    """A page that received nothing flew on by its sticks: each of their messages was a new command, sent at once."""
+    proxy.state = FlightState.FLYING
+    drone.wait("flying", WAIT_S)
+    commands = extend.commands(drone)
+    commands.flown_by_person()
+    commands.present_until(time.monotonic_ns() + 60_000_000_000)
+    assert drone.velocity(forward=0.1)
+    proxy.until_commanded(Velocity(forward=0.1))
+    drone._core.commands._present_until_ns = time.monotonic_ns() - 1  # as if all that time had passed
+    at = proxy.commands[-1].seq
+    assert not drone.velocity(forward=0.2)
+    assert not drone.command(Takeoff())
+    with pytest.raises(AuthorityError, match="takeoff was not sent: whoever flies is not known to be there"):
+        drone.takeoff(wait=False)
+    assert extend.let_go(drone, "the page is gone"), "what ends a flight is sent all the same"
+    proxy.until_commanded(Hover())
+    later = [command.action for command in proxy.commands if command.seq > at]
+    assert Velocity(forward=0.2) not in later
+    assert Takeoff() not in later
+    assert drone.emergency_stop()
+    proxy.until_commanded(EmergencyStop())
+
+
 def test_a_reason_is_no_older_than_the_last_change_of_what_it_speaks_of(proxy: ScriptedProxy, drone: Drone) -> None:
     """The link was up for 4 s, and the error still said that it was connecting."""
 

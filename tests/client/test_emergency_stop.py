@@ -185,6 +185,22 @@ def test_a_reset_is_sent_once_the_stop_has_shown_if_that_is_soon(after_s: float,
     assert schedule.next(clock()) == then
 
 
+@pytest.mark.parametrize("there_is_room", [True, False])
+def test_it_is_repeated_at_once_however_seldom_other_commands_are(there_is_room: bool) -> None:
+    """At 1 Hz one lost packet, or one moment without room, left the motors running for 1.25 s more."""
+    clock, schedule = ManualClock(), CommandSchedule(rate_hz=1.0)
+    schedule.ask(EmergencyStop(), clock())
+    sent = []
+    for _ in range(500):
+        if (action := schedule.next(clock())) is not None:
+            sent.append(action)
+            if not there_is_room:
+                schedule.not_sent(action, clock())
+        clock.advance(0.001)
+    assert sent == [EmergencyStop()] * 10
+    assert schedule.due_ns - clock() <= 50_000_000
+
+
 def test_it_is_given_up_when_the_driver_gives_it_up() -> None:
     clock, schedule = ManualClock(), CommandSchedule()
     schedule.ask(EmergencyStop(), clock())

@@ -303,6 +303,27 @@ def test_sys_exit_in_a_callback_ends_the_flight(proxy: ScriptedProxy, drone: Dro
     assert told[0] == "feedback raised SystemExit: enough"
 
 
+@pytest.mark.parametrize("inline", [False, True])
+def test_sys_exit_in_a_callback_lands_also_where_there_is_no_thread_to_wait_for_it(
+    proxy: ScriptedProxy, drone: Drone, inline: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Commands were refused from then on, and nothing ended the flight."""
+    begin = threading.Thread.start
+
+    def start(thread: threading.Thread) -> None:
+        if thread.name == "skyloop-end":
+            raise RuntimeError("can't start new thread")
+        begin(thread)
+
+    def end(_: Feedback) -> None:
+        raise SystemExit("enough")
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    drone.velocity(forward=0.5)
+    drone.on_feedback(end, inline=inline)
+    assert proxy.until_commanded(Land()).automatic
+
+
 def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
     proxy: ScriptedProxy, drone: Drone
 ) -> None:

@@ -22,14 +22,18 @@ from skyloop.errors import (
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,
+    EmergencyStop,
     Fate,
     Feedback,
     FlightState,
+    Hover,
+    Idle,
     Land,
     LinkState,
     Outcome,
     Position,
     Refusal,
+    ResetEmergency,
     ReturnPhase,
     ReturnToStart,
     Takeoff,
@@ -341,7 +345,7 @@ class ActionWait:
         if type(self._action) is Land:
             return self._why_no_landing(outcome)
         if outcome.fate in OUTDONE:
-            return RefusedError(f"{name} was ended on the way: another command took its place", code="replaced")
+            return _replaced(self._action)
         if outcome.fate in OVERRULED:
             if not self._commands.may_ask:
                 return None
@@ -362,6 +366,8 @@ class ActionWait:
                 self._again()
             return None
         if outcome.fate in OUTDONE:
+            if self._called_off():
+                return _replaced(self._action)
             return None  # what has begun ends by itself
         if outcome.fate in OVERRULED:
             newest = self._state.newest
@@ -371,6 +377,16 @@ class ActionWait:
             text = f"takeoff was ended on the way, as {ENDINGS[outcome.fate]}: take off again"
             return RefusedError(text, code=Refusal.NOT_FRESH)
         return _refused(outcome)
+
+    def _called_off(self) -> bool:
+        """Whether the application asked for something since that ends a take-off, or did before it had begun."""
+        commands, newest = self._commands, self._state.newest
+        if commands.latest(Land, EmergencyStop, ResetEmergency) > self._intent:
+            return True
+        # A hover and idle end one that does not show yet: where the proxy had them and it still stands, it is over.
+        stayed, told = commands.latest(Hover, Idle), commands.told
+        stands = newest is not None and newest.state is FlightState.LANDED
+        return stands and self._intent < stayed and told is not None and told.intent >= stayed
 
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
         """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
@@ -385,7 +401,7 @@ class ActionWait:
 
     def _again(self, *, automatic: bool = True) -> None:
         self._asked_ns = self._state.scheduler.clock()
-        self._intent = self._commands.ask(self._action, automatic=automatic or self._automatic)
+        self._intent = self._commands.ask(self._action, automatic=automatic or self._automatic, again=self._intent)
 
     @property
     def _others_now(self) -> str | None:
@@ -410,6 +426,10 @@ class ActionWait:
     @property
     def _vehicle_link(self) -> LinkState | None:
         return None if self._state.newest is None else self._state.newest.vehicle_link
+
+
+def _replaced(action: AnyAction) -> RefusedError:
+    return RefusedError(f"{action.name} was ended on the way: another command took its place", code="replaced")
 
 
 def _refused(outcome: Outcome) -> RefusedError:

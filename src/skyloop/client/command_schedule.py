@@ -58,6 +58,7 @@ _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     ResetEmergency: nanoseconds(2.0),
 }
 _UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that could not be sent for so long is not sent later
+_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: a stop is repeated so often, however seldom other commands are
 
 
 class Unsent(NamedTuple):
@@ -100,6 +101,7 @@ class CommandSchedule:
         self.automatic = False  #: the newest set-point is the library's own, not the application's
         self.over: Outcome | None = None  #: what ended it, once it is over
         self.owed: Unsent | None = None  #: what was asked for once, and not sent
+        self.latest: dict[type[AnyAction], int] = {}  #: number of the newest intent of each kind
         self._asked_ns = 0
         # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
         # period longer, and only commands of the application delay the next one.
@@ -127,6 +129,7 @@ class CommandSchedule:
         stops = type(action) is Hover and type(self.action) is not Hover
         self.action, self.over = action, None
         self.intent += 1
+        self.latest[type(action)] = self.intent
         self.automatic = automatic
         self._asked_ns = now_ns
         if stops or type(action) in _DONE_IN:  # rare and important: at once
@@ -175,13 +178,14 @@ class CommandSchedule:
             self.action, self.owed = _IDLE, None
         if not self._is_sent:
             self._sent_intent, self._new_sent_ns = self.intent, now_ns
-            self._due_ns = now_ns + self._first_ns
+            self._due_ns = now_ns + (min(self._first_ns, _STOP_PERIOD_NS) if self.stopping else self._first_ns)
             return self.action
         # The next deadline follows from the last one, not from the present time, so that the rate is kept; a deadline
         # missed by more than a period is skipped.
-        self._due_ns += self._period_ns
+        period_ns = min(self._period_ns, _STOP_PERIOD_NS) if self.stopping else self._period_ns
+        self._due_ns += period_ns
         if self._due_ns <= now_ns:
-            self._due_ns = now_ns + self._period_ns
+            self._due_ns = now_ns + period_ns
         return self.action
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
@@ -193,9 +197,14 @@ class CommandSchedule:
             self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
-        """Return :attr:`owed` if it is to be sent before ``action``, which neither repeats nor revokes it."""
+        """Return :attr:`owed` if it is to be sent before ``action``, which neither repeats nor revokes it.
+
+        What the library asks for by itself revokes all but a landing.
+        """
         owed = self.owed
         if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > self._keep_ns:
+            return None
+        if self.automatic and type(owed.action) is not Land:
             return None
         return owed if _is_periodic(action) else None
 

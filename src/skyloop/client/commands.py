@@ -148,6 +148,10 @@ class CommandSender:
         """Time on this process's clock from which a new set-point is sent at once [ns]."""
         return self._schedule.open_ns
 
+    def latest(self, *kinds: type[AnyAction]) -> int:
+        """Return the number of the newest intent of these kinds; 0 if there was none."""
+        return max(self._schedule.latest.get(kind, 0) for kind in kinds)
+
     @property
     def newest(self) -> AnyAction:
         """What is repeated now; idle where nothing is."""
@@ -186,8 +190,9 @@ class CommandSender:
     def present_until(self, until_ns: int) -> None:
         """Extend the time until which the person who flies is known to be present; never shortens it.
 
-        After that time nothing is repeated and no authority is requested, so that the proxy takes the pilot for silent;
-        only an emergency stop is still sent. The sending thread checks this itself, however busy other threads are.
+        After that time nothing is repeated, nothing new is flown and no authority is requested, so that the proxy takes
+        the pilot for silent; what ends a flight is still sent, once, and an emergency stop as ever. The sending thread
+        checks this itself, however busy other threads are.
 
         Args:
             until_ns: On this process's clock.
@@ -230,13 +235,19 @@ class CommandSender:
             self._check(action)
         return self.send(action, now=now, automatic=automatic)
 
-    def ask(self, action: AnyAction, *, automatic: bool = False) -> int:
+    def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
         """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
 
         :meth:`outcome` tells what became of it.
+
+        Args:
+            action: The action.
+            automatic: As for :meth:`command`.
+            again: Number of the intent that this repeats under a new one, unless something else was asked for since:
+                then nothing is, and the number stays.
         """
         self._check(action)
-        return self._put(action, automatic=automatic)[0]
+        return self._put(action, automatic=automatic, again=again)[0]
 
     def send(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
         """Make ``action`` the newest set-point as :meth:`command` does, whatever the vehicle can do.
@@ -252,7 +263,9 @@ class CommandSender:
         self._first_set_point = self._first_set_point or intent
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
 
-    def _put(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> tuple[int, bool]:
+    def _put(
+        self, action: AnyAction, *, now: bool = False, automatic: bool = False, again: int | None = None
+    ) -> tuple[int, bool]:
         """Make ``action`` the newest set-point, and send it if it can be.
 
         Returns:
@@ -270,6 +283,8 @@ class CommandSender:
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
             if wanted and isinstance(action, _FLYING) and cancelled.get()():
                 raise GivenUpError  # before it was sent: what was asked for since then stays
+            if again is not None and again != self._schedule.intent:
+                return again, False
             if automatic and type(action) is not Land and type(self._schedule.action) in LANDING:
                 return self._schedule.intent, False
             authority = self._authority
@@ -288,7 +303,7 @@ class CommandSender:
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return self._schedule.intent, False
             intent = self._schedule.ask(action, now_ns, automatic=automatic)
-            if not may_send or not connected:
+            if not may_send or not connected or (isinstance(action, _FLYING) and not self.is_present(now_ns)):
                 if now:
                     if type(action) is not Land:  # what was refused now must not be carried out later
                         self._schedule.clear(Fate.WITHDRAWN)
@@ -575,6 +590,8 @@ class CommandSender:
     def _not_now(self, action: AnyAction) -> LinkError | AuthorityError:
         later = "; it is sent if that changes within half a second" if type(action) is Land else ""
         not_sent = f"{action.name} was not sent"
+        if self._authority.held and self._connection.connected:
+            return AuthorityError(f"{not_sent}: whoever flies is not known to be there", code="no_authority")
         if self._connection.connected:
             text = f"{not_sent}: the proxy has not confirmed the authority yet{later}"
             return AuthorityError(text, code="no_authority")

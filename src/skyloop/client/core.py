@@ -553,8 +553,10 @@ class DroneCore:
         self.state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
         if isinstance(error, SystemExit) and not self.ending:
             self.commands.bar()
-            # No daemon: the interpreter waits for the landing.
-            threading.Thread(target=self.end_flight, name="skyloop-end").start()
+            try:  # no daemon: the interpreter waits for the landing
+                threading.Thread(target=self.end_flight, name="skyloop-end").start()
+            except RuntimeError:  # there is none to be had, and this one may not wait
+                self.let_go(f"{where} ended the program", land=True)
 
 
 def _returns(feedback: Feedback) -> bool:
