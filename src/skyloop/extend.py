@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Unpack
 
 if TYPE_CHECKING:
     from skyloop.client import ChannelStats, Drone, Listener
-    from skyloop.client.core import DroneOptions, InboxOptions
+    from skyloop.client.piloting import DroneOptions, InboxOptions
     from skyloop.client.publishing import Membership
     from skyloop.client.telemetry import Mailboxes
     from skyloop.client.video import StreamChannel, StreamOptions, VideoChannel
@@ -121,12 +121,12 @@ def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **o
         dial: Makes a connection to the proxy each time one is needed.
         app: Name of this application, 1 to 64 characters.
         timeout_s: Time for the proxy to answer and to send feedback [s].
-        **options: As for :class:`skyloop.client.core.DroneCore`.
+        **options: As for :class:`skyloop.client.piloting.DroneCore`.
 
     Raises:
-        SkyloopError: As :meth:`skyloop.client.core.DroneCore.open`.
+        SkyloopError: As :meth:`skyloop.client.piloting.DroneCore.open`.
     """
-    from skyloop.client.core import DroneCore
+    from skyloop.client.piloting import DroneCore
 
     core = DroneCore(dial, app=app, **options)
     core.open(timeout_s=timeout_s, acquire=False)

@@ -13,8 +13,8 @@ import pytest
 import typer
 
 from skyloop.cli import ending
-from skyloop.client.core import DroneCore
 from skyloop.client.drone import Drone, open_drone
+from skyloop.client.piloting import DroneCore
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError
 from skyloop.messages import EmergencyStop, FlightState, Hover, RequestAuthority, ReturnToStart
 from skyloop.transport.base import Peer

@@ -14,8 +14,8 @@ import pytest
 
 from skyloop import extend
 from skyloop.client import Authority, AuthorityStatus, Drone, command_schedule
-from skyloop.client.core import DroneCore
 from skyloop.client.drone import open_drone
+from skyloop.client.piloting import DroneCore
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
     AnswerTakeover,

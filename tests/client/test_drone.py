@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, Frame, LinkStatus, Listener
-from skyloop.client.core import DroneCore
+from skyloop.client.piloting import DroneCore
 from skyloop.client.video import IDLE_KEPT
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import (
@@ -495,7 +495,7 @@ def test_closing_waits_for_all_listeners_together_and_wakes_who_asks_for_the_aut
     proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """2 s for each listener in turn; and 8 s, with another error, for a request of the authority."""
-    monkeypatch.setattr("skyloop.client.core.JOIN_S", 0.4)
+    monkeypatch.setattr("skyloop.client.piloting.JOIN_S", 0.4)
     go_on, asked = threading.Event(), threading.Event()
     errors: list[Exception] = []
     core = DroneCore(proxy.server.dial, app="closing")

@@ -6,7 +6,7 @@ from skyloop import client
 from skyloop.aio.bridge import Callback as Callback, Opening, T
 from skyloop.client.authority import Authority, AuthorityStatus, TakeoverAnswer, TakeoverRequest, TakeoverWay
 from skyloop.client.connect import ConnectOptions, NetworkChoice
-from skyloop.client.core import Access, OnExit
+from skyloop.client.piloting import Access, OnExit
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.client.preflight import PreflightFinding

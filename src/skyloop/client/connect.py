@@ -19,8 +19,8 @@ from skyloop.address import shown_address
 from skyloop.child_process import GRACE_S, ChildProcess
 from skyloop.client.authority import Authority, check_seconds
 from skyloop.client.connection import Scheduler
-from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
+from skyloop.client.piloting import Access, DroneCore, OnExit
 from skyloop.errors import Hint, LinkError, MissingExtraError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.files import wait_readable
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name

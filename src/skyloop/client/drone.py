@@ -35,9 +35,9 @@ from skyloop.client.authority import (
     authority_request,
 )
 from skyloop.client.channels import Channel, Listener, Mailbox, checked_age
-from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.monitoring import ChannelStats, Distribution
+from skyloop.client.piloting import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.preflight import PreflightFinding, inspect
 from skyloop.client.publishing import checked_time
 from skyloop.client.results import Result, ResultListener, ResultMailbox, is_old, silence
