@@ -114,7 +114,7 @@ def test_what_a_stop_keeps_back_is_told(proxy: ScriptedProxy, drone: Drone) -> N
     assert set(proxy.actions()) <= {EmergencyStop(), Idle()}
     proxy.state = FlightState.EMERGENCY
     drone.wait("emergency", WAIT_S)
-    proxy.until(lambda: not drone._core.commands.stopping)
+    proxy.until(lambda: not drone._commands.stopping)
     assert drone.hover()
 
 

@@ -29,7 +29,13 @@ class Flown:
         scheduler = Scheduler()
         scheduler.clock = lambda: self.now_ns
         connection: Any = SimpleNamespace(
-            connected=True, offset_ns=0, transmit=self._transmit, poke=lambda: None, ask=self._ask
+            connected=True,
+            offset_ns=0,
+            transmit=self._transmit,
+            poke=lambda: None,
+            ask=self._ask,
+            why_closed="",
+            check_open=lambda: None,
         )
         self.pilot = CommandSender(
             Role.PILOT,

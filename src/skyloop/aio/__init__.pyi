@@ -6,9 +6,10 @@ from skyloop import client
 from skyloop.aio.bridge import Callback as Callback, Opening, T
 from skyloop.client.authority import Authority, AuthorityStatus, TakeoverAnswer, TakeoverRequest, TakeoverWay
 from skyloop.client.connect import ConnectOptions, NetworkChoice
-from skyloop.client.piloting import Access, OnExit
+from skyloop.client.drone import Access
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.monitoring import ChannelStats, Distribution
+from skyloop.client.piloting import OnExit
 from skyloop.client.preflight import PreflightFinding
 from skyloop.client.results import Result
 from skyloop.client.swarm import Missing, OnError, Target, Tick

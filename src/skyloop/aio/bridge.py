@@ -301,13 +301,13 @@ class Drone:
     async def frames(
         self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> AsyncIterator[client.Frame]:
-        core, notifier, clock = self.sync._core, LoopNotifier(), asyncio.get_running_loop().time
-        channel, mailbox = core.follow(lambda: core.channel(camera, **how)), Mailbox[Arrival](notifier=notifier)
-        with core.closing(mailbox), channel.into(mailbox):
+        state, notifier, clock = self.sync._state, LoopNotifier(), asyncio.get_running_loop().time
+        channel, mailbox = state.follow(lambda: state.video.channel(camera, **how)), Mailbox[Arrival](notifier=notifier)
+        with state.closing(mailbox), channel.into(mailbox):
             deadline = clock() + timeout_s
             while not self.sync.closed:
                 if not await notifier.within(deadline - clock()):
-                    raise core.no_frame(channel.current.camera.name, timeout_s)
+                    raise state.no_frame(channel.current.camera.name, timeout_s)
                 frame = await _decoded(channel.current, mailbox.take(), how.get("max_age_s"))
                 if frame is not None:
                     yield frame
@@ -317,9 +317,9 @@ class Drone:
     async def results(
         self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0
     ) -> AsyncIterator[client.Result]:
-        core, notifier, clock = self.sync._core, LoopNotifier(), asyncio.get_running_loop().time
+        state, notifier, clock = self.sync._state, LoopNotifier(), asyncio.get_running_loop().time
         mailbox = ResultMailbox(checked_age(max_age_s), notifier)
-        with core.closing(mailbox), core.result_channel(processor).into(mailbox):
+        with state.closing(mailbox), state.results.channel(processor).into(mailbox):
             deadline = clock() + timeout_s
             while not self.sync.closed:
                 if not await notifier.within(deadline - clock()):

@@ -107,7 +107,7 @@ class CommandSender:
                 one, the supervisor's, or an application's.
             granted: Called with the number of each new lease, on the same threads.
         """
-        self._role = role
+        self.role = role
         self._authority = authority
         self._schedule = schedule
         self._connection = connection
@@ -121,7 +121,6 @@ class CommandSender:
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
         self.barred = False  #: the end of the flight has begun: only the library's own commands and a stop pass
-        self.why_closed = ""  #: why nothing can be commanded any more; empty while something can
         self._impossible: dict[type, str] = {}  # why, of what neither vehicle nor proxy can do
         self.told: Outcome | None = None  #: the newest that the proxy told of this application's intents
         self._first_set_point = 0  # number of the first in the present row of set-points; 0: the newest is none
@@ -166,11 +165,6 @@ class CommandSender:
         """Let no more commands of the application pass but an emergency stop: when this returns, none is on its way."""
         with self._lock:
             self.barred = True
-
-    def close(self, why: str) -> None:
-        """Command nothing any more, and wake who waits for the authority: nobody gets it."""
-        self.why_closed = why
-        self.notifier.notify()
 
     @property
     def stopping(self) -> bool:
@@ -224,14 +218,14 @@ class CommandSender:
                 the end of the flight has begun, too.
 
         Raises:
-            ClosedError: After :meth:`close`, and from :meth:`bar` on.
+            ClosedError: Once the drone is closed, and from :meth:`bar` on.
             UnsupportedError: If neither the vehicle nor its proxy can do it.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
                 with ``now`` also while the authority is still awaited.
             RefusedError: If an emergency stop keeps back what is to be done once, or what is to be sent ``now``.
             LinkError: With ``now`` while the link is down.
         """
-        if self.why_closed or type(action) in self._impossible:
+        if self._connection.why_closed or type(action) in self._impossible:
             self._check(action)
         return self.send(action, now=now, automatic=automatic)
 
@@ -295,7 +289,7 @@ class CommandSender:
                 and not (authority.wanted and (authority.status.state == "none" or not authority.settled))
             ):
                 raise self._not_ours(action)
-            if stop and self._role is Role.OBSERVER:
+            if stop and self.role is Role.OBSERVER:
                 raise self._not_ours(action)
             if not self._schedule.may_ask(action):
                 if now or not isinstance(action, _STREAMED):
@@ -344,7 +338,7 @@ class CommandSender:
             NoAnswerError: If the proxy does not answer the request, or the link is lost and not back in time.
             ClosedError: If the drone is closed meanwhile.
         """
-        if self._role is Role.OBSERVER:
+        if self.role is Role.OBSERVER:
             raise AuthorityError("this application observes", code="observer").with_hint(Hint.FLY)
         authority = self._authority
         with self._lock:
@@ -356,7 +350,7 @@ class CommandSender:
         if answered:
             self._wait(lambda: authority.held or not authority.wanted, max(0.0, wait_s))
             self._wait(lambda: authority.settled, OWN_S)
-        if self.why_closed:
+        if self._connection.why_closed:
             raise ClosedError("this drone was closed while it asked for the authority")
         if not answered:
             self.release(wait=False)
@@ -372,7 +366,7 @@ class CommandSender:
         raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy").with_hint(Hint.OBSERVE)
 
     def _wait(self, ready: Callable[[], bool], timeout_s: float) -> bool:
-        return self.notifier.wait_for(lambda: self.why_closed != "" or ready(), timeout_s)
+        return self.notifier.wait_for(lambda: self._connection.why_closed != "" or ready(), timeout_s)
 
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer an application that asks for the authority; an answer that is too late changes nothing.
@@ -564,14 +558,13 @@ class CommandSender:
 
     def _check(self, action: AnyAction) -> None:
         """Raise if nothing can be commanded any more, or not this."""
-        if self.why_closed:
-            raise ClosedError(self.why_closed)
+        self._connection.check_open()
         if why := self._impossible.get(type(action)):
             raise UnsupportedError(f"{action.name} is not possible: {why}")
 
     def _not_ours(self, action: AnyAction) -> AuthorityError:
         status = self.status
-        if self._role is Role.OBSERVER:
+        if self.role is Role.OBSERVER:
             return AuthorityError(f"{action.name}: this application observes", code="observer").with_hint(Hint.FLY)
         if status.state == "preempted":
             return AuthorityError(

@@ -19,8 +19,8 @@ from skyloop.address import shown_address
 from skyloop.child_process import GRACE_S, ChildProcess
 from skyloop.client.authority import Authority, check_seconds
 from skyloop.client.connection import Scheduler
-from skyloop.client.drone import Drone
-from skyloop.client.piloting import Access, DroneCore, OnExit
+from skyloop.client.drone import Access, Drone
+from skyloop.client.piloting import OnExit
 from skyloop.errors import Hint, LinkError, MissingExtraError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.files import wait_readable
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
@@ -155,7 +155,7 @@ def connect(
     """
     if not isinstance(authority, Authority | None):
         raise UsageError(f"authority is {authority!r:.80} and must be a skyloop.Authority, as Authority(priority=4)")
-    core, deadline = prepare(
+    drone, deadline = prepare(
         target,
         access=access,
         name=name,
@@ -165,8 +165,8 @@ def connect(
         on_exit=on_exit,
         network=network,
     )
-    core.open(timeout_s=deadline - time.monotonic(), authority=authority)
-    return Drone(core)
+    drone._connect(timeout_s=deadline - time.monotonic(), authority=authority)
+    return drone
 
 
 def prepare(
@@ -179,7 +179,7 @@ def prepare(
     stall_s: float = 1.0,
     on_exit: OnExit = "land",
     network: NetworkChoice = None,
-) -> tuple[DroneCore, float]:
+) -> tuple[Drone, float]:
     """Return a drone that is not connected yet, and until when that may take, on ``time.monotonic``.
 
     A private proxy is started. Arguments and errors are those of :func:`connect`.
@@ -198,7 +198,7 @@ def prepare(
         others_find_it = network is None or network is False
         dial, end, reach, scheduler = dial_by_name(target, network), None, target if others_find_it else None, None
     try:
-        core = DroneCore(
+        drone = Drone(
             dial,
             app=app,
             access=access,
@@ -213,7 +213,7 @@ def prepare(
         if end is not None:
             end()
         raise
-    return core, deadline
+    return drone, deadline
 
 
 def _connector(uri: str) -> Connector:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from skyloop.client.channels import Notifier
 from skyloop.client.monitoring import Thresholds
 from skyloop.client.session import ConnectionHandler, ProxySession
 from skyloop.clock import Clock, nanoseconds
-from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError
+from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError, UsageError
 from skyloop.messages import (
     AnyReply,
     AnyRequest,
@@ -61,6 +62,7 @@ class ProxyConnection:
         self.transmit: Callable[[bytes], bool] = _nowhere
         self.state = LinkState.CONNECTING
         self.reason = ""
+        self.why_closed = ""  #: why nothing can be asked for any more; empty while something can
         self.poked = False  #: the supervisor is to attend to it now
         self.closing = False
         self.woken = Notifier()  #: wakes the supervisor
@@ -116,6 +118,16 @@ class ProxyConnection:
         """Largest error of :attr:`offset_ns` [ns]; 0 where both ends read one clock."""
         session = self._session
         return 0 if session is None else session.uncertainty_ns
+
+    def check_open(self) -> None:
+        """Raise :class:`ClosedError` once the drone was closed, or belongs to the parent process."""
+        if self.why_closed:
+            raise ClosedError(self.why_closed)
+
+    def check_may_wait(self) -> None:
+        """Raise :class:`UsageError` on the receiving thread."""
+        if self.receiving:
+            raise UsageError("an inline listener can't wait for what it would itself have to receive")
 
     def poke(self) -> None:
         """Wake the supervisor, so that it attends to the connection now."""
@@ -213,6 +225,9 @@ class ProxyConnection:
 
     def forked(self) -> None:
         """Send nothing, wait for nothing: the session belongs to the parent process."""
+        self.why_closed = (
+            f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect here as well"
+        )
         self.closing = True
         self._session, self.transmit = None, _nowhere
         self.state, self.reason = LinkState.CLOSED, "the connection belongs to the parent process"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skyloop.client.channels import checked_name
 from skyloop.client.connection import ProxyConnection
 from skyloop.client.frame import Frame
 from skyloop.errors import LinkError, NameTakenError, RefusedError, SkyloopError, UsageError
@@ -28,7 +29,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.fields import LATEST_NS
-from skyloop.messages.relayed import MAX_LOG_TEXT, MAX_VALUES, pack
+from skyloop.messages.relayed import MAX_CODE, MAX_LOG_TEXT, MAX_VALUES, pack
 
 if TYPE_CHECKING:
     from skyloop.client.telemetry import ClientState
@@ -154,7 +155,10 @@ class Membership:
             find: Returns the name of the camera, also once the proxy was started again with other ones.
             shared: Each frame goes to one of the workers; if False, each worker gets all.
         """
-        self.processor = processor
+        connection.check_may_wait()
+        if not isinstance(code, str) or len(code) > MAX_CODE:
+            raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
+        self.processor = checked_name(processor)
         self.camera = find()
         self._find = find
         self.code = code
@@ -194,6 +198,7 @@ class Membership:
             self._leave()
             raise
         self._thread.start()
+        self._state.to_close.append(self)
 
     def renew(self) -> None:
         """Tell the proxy now, for example because :attr:`ready` has changed. Any thread."""

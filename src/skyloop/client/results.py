@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 
-from skyloop.client.channels import Channel, Listener, Mailbox, Notifier
+from skyloop.client.channels import Channel, Listener, Mailbox, Notifier, checked_name
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.frame import FeedbackHistory
 from skyloop.client.monitoring import ChannelCounter, ChannelStats
@@ -278,7 +278,16 @@ class ResultChannels:
         self._sent: Counter[str] = Counter()
 
     def channel(self, processor: str) -> ResultChannel:
-        """Return the channel of this processor, made on the first call."""
+        """Return the channel of a processor's results, whether or not such a processor runs.
+
+        Raises:
+            UsageError: If ``processor`` can't be a name.
+            ClosedError: If the drone was closed.
+        """
+        self._connection.check_open()
+        return self._made(checked_name(processor))
+
+    def _made(self, processor: str) -> ResultChannel:
         with self._lock:
             found = self._channels.get(processor)
             if found is None:
@@ -307,7 +316,7 @@ class ResultChannels:
         channel = self._channels.get(header.processor)
         if channel is None:
             self._make_room()
-            channel = self.channel(header.processor)
+            channel = self._made(header.processor)
         if channel.receive(result):
             channel.counter.add(now_ns + offset_ns - header.made_ns, header.captured_ns - offset_ns, now_ns)
             self.everything.publish(result)

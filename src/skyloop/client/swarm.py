@@ -456,7 +456,7 @@ class Swarm:
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
-            action, commands = actions[name], ready[name]._core.commands
+            action, commands = actions[name], ready[name]._commands
             if type(action) is Hover:  # of all, which is no decision to take one from a safety pilot
                 handed = commands.command(action, automatic=type(commands.newest) is not Land)
             else:
@@ -607,8 +607,8 @@ class Swarm:
                 due_s = max(due_s + period_s, time.monotonic())
         finally:  # at a break or an exception in the loop as soon as it drops this generator, which is at once
             for drone in self:
-                if isinstance(drone._core.commands.newest, Velocity | Attitude):
-                    drone._core.let_go("the loop that flew it has ended")
+                if isinstance(drone._commands.newest, Velocity | Attitude):
+                    drone._piloting.let_go("the loop that flew it has ended")
 
     @property
     def spread(self) -> Distribution | None:
@@ -636,17 +636,17 @@ class Swarm:
         if self.on_error == "continue":
             self._aside.update(errors)
             for name in errors:
-                self._drones[name]._core.let_go(f"{what} failed")
+                self._drones[name]._piloting.let_go(f"{what} failed")
             if self.active:
                 return
             errors = dict(self._aside)
         others = {name: drone for name, drone in self._drones.items() if name not in errors}
         if self.on_error == "stop":
             for drone in others.values():
-                drone._core.let_go(f"{what} of another drone failed")
+                drone._piloting.let_go(f"{what} of another drone failed")
         elif self.on_error == "land":
             reason = f"{what} of another drone failed"
-            errors = {**errors, **_problems(others, lambda drone: drone._core.bring_down(reason))}
+            errors = {**errors, **_problems(others, lambda drone: drone._piloting.bring_down(reason))}
         raise SwarmError(what, errors, len(self))
 
     # The end ---------------------------------------------------------------------------------------------------
@@ -664,7 +664,7 @@ class Swarm:
         self._closed = True
         for drone in self._drones.values():
             if not drone.closed:
-                drone._core.commands.bar()  # all before the first lands
+                drone._commands.bar()  # all before the first lands
         return end_flights(self._drones)
 
     def close(self) -> None:
@@ -739,7 +739,7 @@ def _place(name: str, numbers: Sequence[float], speed: float | None) -> Position
 
 def _wait_open(drones: Mapping[str, Drone]) -> None:
     """Wait, a few milliseconds at most, until every drone sends a new set-point at once, so that none leaves later."""
-    open_ns = max((drone._core.commands.open_ns for drone in drones.values()), default=0)
+    open_ns = max((drone._commands.open_ns for drone in drones.values()), default=0)
     time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
 
 
@@ -767,7 +767,7 @@ def end_flights(drones: Mapping[str, Drone]) -> dict[str, Exception]:
 
     Ctrl-C meanwhile waits no longer for landings: each is asked for all the same, and goes on without this program.
     """
-    return _problems(drones, lambda drone: drone._core.end_flight())
+    return _problems(drones, lambda drone: drone._piloting.end_flight())
 
 
 def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError | None]) -> dict[str, Exception]:

@@ -9,17 +9,17 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Protocol, Self, TypedDict, TypeVar
 
-from skyloop.client.channels import Channel, FollowingChannel, Mailbox
+from skyloop.client.channels import C, Channel, FollowingChannel, Listener, Mailbox, Notifier, checked_age
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.frame import Arrival, FeedbackHistory, Frame
 from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.client.parameters import Restorer
-from skyloop.client.results import Result, ResultChannels, ResultMailbox
-from skyloop.client.video import VideoChannel, VideoChannels, forget_idle
-from skyloop.errors import UnknownNameError
+from skyloop.client.results import ResultChannels, ResultMailbox
+from skyloop.client.video import VideoChannels, forget_idle
+from skyloop.errors import NoAnswerError, UnknownNameError
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -57,6 +57,23 @@ class LinkStatus:
     remedy: str = ""  #: what a person can do about the vehicle's link while it is not up
 
 
+class InboxOptions(TypedDict, total=False):
+    """What one thread waits for."""
+
+    feedback: bool  #: whether feedback is wanted; True if left out
+    frames: bool  #: whether frames are wanted; True if left out
+    camera: str | None  #: name of the camera; None: the vehicle's first
+    results: bool  #: whether results of processors are wanted
+    processors: Iterable[str] | None  #: names of the processors whose results are wanted; None: all
+    max_age_s: float | None  #: oldest age of a result that is accepted [s]; None: any
+
+
+class Closable(Protocol):
+    """What ends with the drone."""
+
+    def close(self) -> None: ...
+
+
 class Mailboxes:
     """Mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
 
@@ -65,41 +82,42 @@ class Mailboxes:
 
     def __init__(
         self,
-        scheduler: Scheduler,
-        connection: ProxyConnection,
+        state: ClientState,
         *,
-        feedback: Channel[Feedback] | None,
-        frames: FollowingChannel[Arrival, VideoChannel] | None,
-        results: Sequence[Channel[Result]],
-        max_age_s: float | None,
+        feedback: bool = True,
+        frames: bool = True,
+        camera: str | None = None,
+        results: bool = False,
+        processors: Iterable[str] | None = None,
+        max_age_s: float | None = None,
     ) -> None:
-        """Make empty mailboxes.
+        """Make empty mailboxes of what is wanted; see :class:`InboxOptions`.
 
-        Args:
-            scheduler: Source of the time and of waiting.
-            connection: What the samples come through.
-            feedback: Channel of feedback, if it is wanted.
-            frames: Channel of frames, if they are wanted.
-            results: Channels of the results that are wanted.
-            max_age_s: Oldest age of a result that is accepted [s]; None: any.
+        Raises:
+            UsageError: If ``max_age_s`` or the name of a processor is unusable.
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If frames are wanted and the vehicle has no camera.
         """
-        self.clock = scheduler.clock  #: on which a controller's time runs
-        self.notifier = scheduler.sample_notifier(connection)
+        known = state.results
+        named = [known.everything] if processors is None else [known.channel(one) for one in processors]
+        self.clock = state.scheduler.clock  #: on which a controller's time runs
+        self.notifier = state.sample_notifier()
         self.feedback: Mailbox[Feedback] = Mailbox(1, self.notifier)
         self.frames: Mailbox[Arrival] = Mailbox(1, self.notifier)
-        self.results = ResultMailbox(max_age_s, self.notifier)
-        self._feedback_channel = feedback
-        self._video = frames
-        self._result_channels = results
+        self.results = ResultMailbox(checked_age(max_age_s), self.notifier)
+        self._video = state.follow(lambda: state.video.channel(camera)) if frames else None
+        self._feedback_channel = state.on_feedback if feedback else None
+        self._result_channels = named if results else []
         self._filling = ExitStack()
 
     def __enter__(self) -> Self:
+        fill = self._filling.enter_context
         if self._feedback_channel is not None:
-            self._filling.enter_context(self._feedback_channel.into(self.feedback))
+            fill(self._feedback_channel.into(self.feedback))
         if self._video is not None:
-            self._filling.enter_context(self._video.into(self.frames))
+            fill(self._video.into(self.frames))
         for channel in self._result_channels:
-            self._filling.enter_context(channel.into(self.results))
+            fill(channel.into(self.results))
         return self
 
     def __exit__(
@@ -192,10 +210,13 @@ class ClientState:
     """The newest state of a connected vehicle, and the channels that publish changes of it."""
 
     def __init__(
-        self, name: str, connection: ProxyConnection, scheduler: Scheduler, *, whole_feedback: bool = True
+        self, app: str, connection: ProxyConnection, scheduler: Scheduler, *, whole_feedback: bool = True
     ) -> None:
-        """Make the state of a drone that has not connected yet; ``name`` is the application's."""
+        """Make the state of a drone that has not connected yet; ``app`` is the application's name."""
+        self.app = app
         self.scheduler = scheduler
+        self.listeners: list[Listener[Any]] = []  #: the application's callbacks that were not cancelled
+        self.to_close: list[Closable] = []  #: what ends with the drone
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
         self.received_ns = 0  #: when the newest feedback came, on our clock
@@ -220,10 +241,44 @@ class ClientState:
         self.on_share: Channel[ProcessorShare] = Channel()
         self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; supervisor's thread
         self.results = ResultChannels(connection, scheduler, self.history)
-        self._name = name
         self._clock = scheduler.clock
         self._connection = connection
         self._making = threading.RLock()  # a channel: two threads that ask for the same one get the same
+
+    @property
+    def name(self) -> str:
+        """Name of the proxy; empty before the first connection."""
+        return "" if self.welcome is None else self.welcome.proxy
+
+    def sample_notifier(self) -> Notifier:
+        """Return a notifier for a thread that waits for nothing but samples of this connection."""
+        return self.scheduler.sample_notifier(self._connection)
+
+    def follow(self, find: Callable[[], C]) -> FollowingChannel[Any, C]:
+        """Return the channel that ``find`` returns, also once the proxy was started again with other cameras."""
+        return FollowingChannel(find, self.on_welcome)
+
+    @contextmanager
+    def closing(self, mailbox: Closable) -> Iterator[None]:
+        """Close ``mailbox``, which wakes its consumer, if the drone is closed within the block."""
+        self.to_close.append(mailbox)
+        try:
+            yield
+        finally:
+            self.to_close.remove(mailbox)
+
+    def forget(self, listener: Listener[Any]) -> None:
+        """Forget a listener, which was cancelled."""
+        if listener in self.listeners:
+            self.listeners.remove(listener)
+
+    def no_frame(self, camera: str, timeout_s: float) -> NoAnswerError:
+        """Return the error for a frame that did not come, with what is known of the reason."""
+        link = self.status
+        words = [f"no frame of {camera} came within {timeout_s:g} s"]
+        if link.vehicle is not LinkState.UP:
+            words += [f"the vehicle's link is {link.vehicle.value}", link.reason, link.remedy]
+        return NoAnswerError(": ".join(filter(None, words)))
 
     def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
         """Return the channel of feedback as requested, made on the first call."""
@@ -246,7 +301,7 @@ class ClientState:
             severity: How serious it is.
             **data: Details, by name.
         """
-        event = Event(kind, text, self._clock() + self._connection.offset_ns, severity, app=self._name, data=dict(data))
+        event = Event(kind, text, self._clock() + self._connection.offset_ns, severity, app=self.app, data=dict(data))
         self.recent.append(event)
         self.on_event.publish(event)
         self.notifier.notify()

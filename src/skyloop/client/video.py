@@ -349,7 +349,9 @@ class VideoChannels:
             UnsupportedError: If the vehicle has no camera.
             UsageError: If an option is out of range, or ``quality`` is given for other frames than JPEG.
             MissingExtraError: If H.264 is asked for and PyAV is not installed.
+            ClosedError: If the drone was closed.
         """
+        self._connection.check_open()
         checked_age(max_age_s)
         channels = self.channels
         if not channels:
