@@ -32,11 +32,7 @@ OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
 
 
 def checked(action: AnyAction) -> AnyAction:
-    """Return ``action`` if it can be commanded.
-
-    Raises:
-        UsageError: If it is no action, or has a number that is not finite or makes no sense.
-    """
+    """Return ``action`` if it can be commanded, else raise :class:`UsageError`."""
     if type(action) not in _ACTIONS:
         raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
     try:
@@ -53,17 +49,10 @@ def checked(action: AnyAction) -> AnyAction:
 
 
 def position_action(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
-    """Return the action that flies to a place.
+    """Return the action that flies to a place: x east, y north, z up [m], yaw from x [rad], greatest speed [m/s].
 
-    Args:
-        x: East [m].
-        y: North [m].
-        z: Up [m].
-        yaw: Counter-clockwise from x [rad]; None: keep the present one.
-        speed: Greatest one [m/s]; None: as fast as the limits allow.
-
-    Raises:
-        UsageError: If something is no number, not finite, or makes no sense.
+    None keeps the present yaw, and is as fast as the limits allow. Raises :class:`UsageError` for what is no number,
+    not finite, or makes no sense.
     """
     place = Position(
         number("x", x),
@@ -77,14 +66,9 @@ def position_action(x: object, y: object, z: object, yaw: object = None, speed: 
 
 
 def return_action(height_m: object, land: object) -> ReturnToStart:
-    """Return the action that flies back to the start.
+    """Return the action that flies back to the start; None: as the proxy's parameters say.
 
-    Args:
-        height_m: Above the start, at least, on the way [m]; None: the proxy's parameter.
-        land: Whether to land there; None: the proxy's parameter.
-
-    Raises:
-        UsageError: If something is no number or no bool, or makes no sense.
+    Raises :class:`UsageError` if something is no number or no bool, or makes no sense.
     """
     if not (land is None or isinstance(land, bool)):
         raise UsageError(f"land is {land!r:.60} and must be True, False or None (as return.land says)")
@@ -99,12 +83,11 @@ def in_world_axes(
     newest: Feedback | None,
     age_s: float,
 ) -> tuple[object, object, object]:
-    """Return x, y, z of a place that is given in either way.
+    """Return x, y, z [m] of a place that is given in either way; the values of the other one are None.
 
     Args:
-        local: x, y, z in world axes [m], or three times None.
-        earth: Latitude and longitude [°] and altitude above mean sea level [m], or three times None; None for the
-            altitude alone: the present height.
+        local: x, y, z in world axes [m].
+        earth: Latitude and longitude [°], altitude above mean sea level [m] or None: the present height.
         newest: The newest feedback.
         age_s: Its age [s].
 
@@ -136,15 +119,7 @@ def in_world_axes(
 
 
 def above_zero(name: str, value: object) -> float:
-    """Return ``value`` as a finite float above zero.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: What was given.
-
-    Raises:
-        UsageError: If it is no such number.
-    """
+    """Return the value of an argument as a finite float above zero, else raise :class:`UsageError`."""
     found = number(name, value)
     if not found > 0.0:
         raise UsageError(f"{name} is {found:g} and must be more than 0")
@@ -152,15 +127,7 @@ def above_zero(name: str, value: object) -> float:
 
 
 def number(name: str, value: object) -> float:
-    """Return ``value`` as a finite float.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: What was given.
-
-    Raises:
-        UsageError: If it is no real number, or not finite.
-    """
+    """Return the value of an argument as a finite float, else raise :class:`UsageError`."""
     if type(value) is not float and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
         raise UsageError(f"{name} is {value!r:.60} and must be a number")
     try:
@@ -175,11 +142,7 @@ def number(name: str, value: object) -> float:
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
     """Return whether a vehicle is in the air at a place, and nearly at rest.
 
-    Args:
-        target: The place.
-        feedback: The vehicle's; without a velocity it counts as at rest.
-        tolerance_m: How far from it is near enough [m].
-        tolerance_rad: The same of its yaw, if it has one [rad].
+    The yaw matters where the place has one; a vehicle that tells no velocity counts as at rest.
     """
     if feedback.position_m is None or math.dist(feedback.position_m, target.place) > tolerance_m:
         return False

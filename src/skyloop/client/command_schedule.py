@@ -113,14 +113,9 @@ class CommandSchedule:
         self._reset_asked_ns: int | None = None  # while a stop was under way
 
     def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
-        """Make ``action`` the set-point of the application; return the number of this intent.
+        """Make ``action`` the set-point, which :meth:`may_ask` allows; return the number of this intent.
 
-        Ask :meth:`may_ask` before.
-
-        Args:
-            action: The action.
-            now_ns: On this process's clock.
-            automatic: The application did not ask for it itself.
+        ``automatic``: the application did not ask for it itself.
         """
         resets = isinstance(action, ResetEmergency)
         self._reset_asked_ns = now_ns if resets and self.stopping else None
@@ -213,13 +208,7 @@ class CommandSchedule:
         return self.action is _HOVER and before is not _HOVER
 
     def observe(self, feedback: Feedback, now_ns: int, app_id: int = 0) -> None:
-        """End what is over: by what the proxy tells of this intent, or because a failsafe overruled a set-point.
-
-        Args:
-            feedback: The newest.
-            now_ns: On this process's clock.
-            app_id: Number of this application in this run of the proxy.
-        """
+        """End what is over: by what the proxy tells of this intent, or because a failsafe overruled a set-point."""
         kind, outcome = type(self.action), feedback.outcome
         done_in = _DONE_IN.get(kind)
         if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent):

@@ -96,16 +96,9 @@ class CommandSender:
     ) -> None:
         """Prepare to send; nothing is sent before :meth:`connected`.
 
-        Args:
-            role: Pilot or observer.
-            authority: State of the authority.
-            schedule: Decides which command is sent when.
-            connection: Sends packets and requests.
-            scheduler: Source of the time and of waiting.
-            emit: Gets the events that are made here.
-            changed: Called when the status of the authority has changed, on the thread that found out: the receiving
-                one, the supervisor's, or an application's.
-            granted: Called with the number of each new lease, on the same threads.
+        ``emit`` gets the events that are made here. ``changed`` is called when the status of the authority has changed,
+        and ``granted`` with the number of each new lease, on the thread that found out: the receiving one, the
+        supervisor's, or an application's.
         """
         self.role = role
         self._authority = authority
@@ -187,9 +180,6 @@ class CommandSender:
         After that time nothing is repeated, nothing new is flown and no authority is requested, so that the proxy takes
         the pilot for silent; what ends a flight is still sent, once, and an emergency stop as ever. The sending thread
         checks this itself, however busy other threads are.
-
-        Args:
-            until_ns: On this process's clock.
         """
         with self._lock:
             known_ns = self._present_until_ns
@@ -232,23 +222,14 @@ class CommandSender:
     def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
         """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
 
-        :meth:`outcome` tells what became of it.
-
-        Args:
-            action: The action.
-            automatic: As for :meth:`command`.
-            again: Number of the intent that this repeats under a new one, unless something else was asked for since:
-                then nothing is, and the number stays.
+        :meth:`outcome` tells what became of it. ``again`` is the intent that it repeats under a new number; if
+        something else was asked for since, nothing is sent and the number stays.
         """
         self._check(action)
         return self._put(action, automatic=automatic, again=again)[0]
 
     def send(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
-        """Make ``action`` the newest set-point as :meth:`command` does, whatever the vehicle can do.
-
-        Returns:
-            Whether it was sent; False also while set-points are refused.
-        """
+        """Make ``action`` the newest set-point as :meth:`command` does, whatever the vehicle can do."""
         intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
             self._first_set_point = 0
@@ -260,14 +241,10 @@ class CommandSender:
     def _put(
         self, action: AnyAction, *, now: bool = False, automatic: bool = False, again: int | None = None
     ) -> tuple[int, bool]:
-        """Make ``action`` the newest set-point, and send it if it can be.
+        """Make ``action`` the newest set-point, and send it if it can be; return the intent and whether it was sent.
 
-        Returns:
-            The number of the intent; and False if it can't be sent now, because the link is down or the authority is
-            still awaited, or because an emergency stop of this application has not shown yet.
-
-        Raises:
-            GivenUpError: If the caller waits no longer; see :data:`cancelled`.
+        It can't be while the link is down, the authority is awaited, an emergency stop has not shown, or nobody is
+        there. Raises :class:`GivenUpError` if the caller waits no longer; see :data:`cancelled`.
         """
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
@@ -326,12 +303,7 @@ class CommandSender:
             self._schedule.clear(Fate.WITHDRAWN)
 
     def request(self, request: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
-        """Request the authority and wait for it; see :meth:`skyloop.client.drone.Drone.request_authority`.
-
-        Args:
-            request: The request.
-            wait_s: How long to wait in the queue [s].
-            stay: Stay in the queue after ``wait_s`` instead of raising.
+        """Request the authority and wait for it; see :meth:`skyloop.Drone.request_authority`.
 
         Raises:
             AuthorityError: If it is not held after ``wait_s``, if it is refused, or if this application only observes.
@@ -371,16 +343,8 @@ class CommandSender:
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer an application that asks for the authority; an answer that is too late changes nothing.
 
-        Args:
-            lease: The lease that is asked for.
-            app_id: Number of the application that asks.
-            grant: Whether to hand it over.
-            reason: Why not, for people; cut to the length that a message can hold.
-            wait: Wait until the proxy has it.
-
-        Raises:
-            RefusedError: With ``wait``, if the authority is not held any more.
-            LinkError: With ``wait``, if the proxy does not answer.
+        With ``wait`` the proxy has it when this returns, or it raises :class:`RefusedError`, if the authority is not
+        held any more, or :class:`LinkError`.
         """
         answer = AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON])
         if not wait:
@@ -391,11 +355,7 @@ class CommandSender:
     def release(self, *, wait: bool = True) -> None:
         """Release the authority, or leave the queue. Does nothing if it is neither held nor wanted.
 
-        Args:
-            wait: Wait for the proxy's answer.
-
-        Raises:
-            NoAnswerError: If the proxy does not answer.
+        With ``wait`` it raises :class:`NoAnswerError` if the proxy does not answer.
         """
         with self._lock:
             known = self._authority.wanted or self.status.state != "none"
@@ -412,13 +372,7 @@ class CommandSender:
     # For the connection ----------------------------------------------------------------------------------------
 
     def connected(self, app_id: int, run_id: int = 0, capabilities: Capabilities | None = None) -> None:
-        """Reset on a new connection: :meth:`tick` requests the authority again if it is wanted.
-
-        Args:
-            app_id: Number of this application there.
-            run_id: Number of the proxy's run.
-            capabilities: Of the vehicle; None: not known.
-        """
+        """Reset on a new connection: :meth:`tick` requests the authority again if it is wanted."""
         self._impossible = {} if capabilities is None else impossible(capabilities)
         with self._lock:
             self._authority.connected(app_id, run_id)
@@ -453,14 +407,7 @@ class CommandSender:
             self._moved(before, now_ns)
 
     def tick(self, now_ns: int) -> int:
-        """Send what is due.
-
-        Args:
-            now_ns: On this process's clock.
-
-        Returns:
-            When to call again at the latest [ns].
-        """
+        """Send what is due; return when to call again at the latest, on this process's clock [ns]."""
         last_request, stalled, due_ns = None, False, now_ns + _LATER_NS
         unshown = False
         with self._lock:

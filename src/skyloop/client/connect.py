@@ -242,11 +242,7 @@ class Connector(Protocol):
         """What another process connects to for the same vehicle; None if it can't."""
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer that at first waits until the proxy serves.
-
-        Args:
-            deadline_s: Until when it waits at most, on ``time.monotonic``.
-        """
+        """Return a dialer that at first waits until the proxy serves, until ``deadline_s`` on ``time.monotonic``."""
 
     def close(self) -> None:
         """End whatever was started. Idempotent."""
@@ -260,12 +256,7 @@ class PrivateProxy:
     """
 
     def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
-        """Start the child.
-
-        Args:
-            uri: Address of the vehicle.
-            command: Command line before the address.
-        """
+        """Start the child; ``command`` is its command line before the address."""
         scheme = re.sub(r"[^a-z0-9]", "", uri.partition("://")[0].lower()) or "vehicle"
         self.name = f"{scheme[:16]}-{os.getpid()}-{next(_numbers)}"
         self.reach = self.name
@@ -276,13 +267,10 @@ class PrivateProxy:
         self.pid = self._process.pid  #: process id of the child
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer that at first waits until the proxy serves.
+        """Return a dialer that at first waits until the proxy serves, until ``deadline_s`` on ``time.monotonic``.
 
         It raises :class:`NoAnswerError` if that takes too long, :class:`UsageError` if the address makes no sense, and
         :class:`LinkError` if the child has ended, with the end of what it wrote to standard error.
-
-        Args:
-            deadline_s: Until when it waits at most, on ``time.monotonic``.
         """
         inner = _local(self.name)
 
@@ -333,11 +321,7 @@ class PrivateProxy:
 
 
 def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> NetworkSettings | None:
-    """Return how to search the network; None if it is not to be searched.
-
-    Args:
-        network: As for :func:`connect`.
-        keys: Folder of an identity, for the command line; None: from ``network``.
+    """Return how to search the network; None if it is not to be searched. ``keys`` are the command line's.
 
     Raises:
         UsageError: If an address or the folder is not valid.
@@ -363,14 +347,8 @@ def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
     """Return the dialer of the proxy with this name.
 
     Each time it prefers a proxy on this host, where Linux' local transport is available. It raises
-    :class:`UnknownNameError`, which says where it searched, and :class:`LinkError`.
-
-    Args:
-        name: Name of the proxy.
-        network: As for :func:`connect`.
-
-    Raises:
-        UsageError: If ``name`` can't be a name.
+    :class:`UnknownNameError`, which says where it searched, and :class:`LinkError`. Raises :class:`UsageError` if
+    ``name`` can't be a name.
     """
     check_name(name)
     settings = network_settings(network)
@@ -414,11 +392,7 @@ def _hinting(near: Dialer) -> Dialer:
 
 
 def running_names(network: NetworkChoice = None) -> list[str]:
-    """Return the names of running proxies, sorted: on this host, and on the network if it is asked for.
-
-    Args:
-        network: As for :func:`connect`.
-    """
+    """Return the names of running proxies, sorted: on this host, and on the network if it is asked for."""
     from skyloop.transport.local import list_names
 
     near = {proxy.name for proxy in list_names()}

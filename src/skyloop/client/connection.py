@@ -135,20 +135,12 @@ class ProxyConnection:
         self.woken.notify()
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:
-        """Receive on the calling thread, where there is a session whose transport can.
-
-        See :meth:`skyloop.transport.base.TransportClient.lead`.
-        """
+        """Receive on the calling thread; see :meth:`skyloop.transport.base.TransportClient.lead`."""
         session = self._session
         return session is not None and session.lead(ready, wake, timeout_s)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
-        """Subscribe to a topic or unsubscribe, in this session and all that follow.
-
-        Args:
-            topic: Name of the topic.
-            on: False unsubscribes.
-        """
+        """Subscribe to a topic or unsubscribe, in this session and all that follow."""
         with self._lock:
             if on == (topic in self._topics):
                 return
@@ -169,10 +161,7 @@ class ProxyConnection:
     def ask(self, body: AnyRequest, done: Callable[[AnyReply | LinkError], None], timeout_s: float = 2.0) -> None:
         """Send a request without waiting.
 
-        Args:
-            body: The request.
-            done: Called once with the answer or an error, on another thread or this one; must be quick.
-            timeout_s: After which ``done`` gets a :class:`NoAnswerError` [s].
+        ``done`` is called once with the answer, or an error after ``timeout_s``, on any thread; it must be quick.
         """
         session = self._session
         if session is None:
@@ -275,14 +264,7 @@ class ConnectionSupervisor:
     ) -> None:
         """Prepare to connect; :meth:`start` does it.
 
-        Args:
-            connection: Gets each session.
-            handler: Gets what arrives.
-            dial: Makes a connection.
-            hello: First request on each connection.
-            policy: When to reconnect and when a link counts as lost.
-            clock: This process's clock.
-            begin: Sees to it that :meth:`attend` is called from the first session on; None: a thread does.
+        ``begin`` sees to it that :meth:`attend` is called from the first session on; None: a thread does.
         """
         self.connection = connection
         self._handler = handler
@@ -295,10 +277,7 @@ class ConnectionSupervisor:
         self._thread = threading.Thread(target=self._run, name="skyloop-link", daemon=True)
 
     def start(self, timeout_s: float = 5.0) -> None:
-        """Connect for the first time, and keep connected from then on.
-
-        Args:
-            timeout_s: For how long to try again if the proxy does not answer Hello [s].
+        """Connect for the first time, within ``timeout_s``, and keep connected from then on.
 
         Raises:
             NoAnswerError: If the proxy does not answer Hello.
@@ -335,11 +314,7 @@ class ConnectionSupervisor:
         self._thread.start()
 
     def attend(self) -> float:
-        """Do what is due now.
-
-        Returns:
-            For how long there is nothing to do [s], unless the connection is poked.
-        """
+        """Do what is due now; return for how long there is nothing to do [s], unless the connection is poked."""
         self.connection.poked = False
         try:
             return self._step()

@@ -171,13 +171,8 @@ class Piloting:
         """End the flight: land what this application flies, or hover (see ``on_exit``), then close.
 
         From its first line on commands of the application's other threads raise :class:`ClosedError`; only an emergency
-        stop still passes. Waits until the vehicle has landed. A second call waits for the first. Idempotent.
-
-        Args:
-            report: Called with each step, for people.
-
-        Returns:
-            What went wrong; None if nothing did.
+        stop still passes. Waits until the vehicle has landed. A second call waits for the first. Idempotent. ``report``
+        is called with each step, for people. Returns what went wrong; None if nothing did.
         """
         if self.closed:  # also in a fork, where somebody may have held the locks
             return None

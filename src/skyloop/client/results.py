@@ -33,14 +33,9 @@ class Result:
     def __init__(
         self, header: ProcessorResult, received_ns: int, offset_ns: int, history: FeedbackHistory, clock: Clock
     ) -> None:
-        """Keep what was received; the value is decoded when it is first read.
+        """Keep what was received at ``received_ns``, on ``clock``, which is ``offset_ns`` behind the proxy's.
 
-        Args:
-            header: The packet.
-            received_ns: When it came, on this host's clock.
-            offset_ns: The proxy's clock minus ``clock``.
-            history: Looked up for the state at the capture.
-            clock: This host's clock.
+        ``history`` is looked up for the state at the capture. The value is decoded when it is first read.
         """
         self.header = header  #: the packet as received
         self.received_ns = received_ns  #: on this host's clock
@@ -130,12 +125,7 @@ class ResultMailbox:
     """Keeps the newest result of each processor for one consumer, and leaves out those that are too old when taken."""
 
     def __init__(self, max_age_s: float | None = None, notifier: Notifier | None = None) -> None:
-        """Make an empty mailbox.
-
-        Args:
-            max_age_s: Oldest age that is accepted [s]; None: any.
-            notifier: Notified with each result; None: an own one.
-        """
+        """Make an empty mailbox, which leaves out what is older than ``max_age_s`` [s] when it is taken."""
         self.notifier = notifier or Notifier()
         self.expired = 0  #: results that were too old when their turn came
         self.closed = False
@@ -336,13 +326,7 @@ def _captured_ns(mailbox: Mailbox[Result]) -> int:
 
 
 def silence(processor: str, timeout_s: float, expired: int) -> str:
-    """Return the message of the error when no result came.
-
-    Args:
-        processor: Name of the processor.
-        timeout_s: How long was waited [s].
-        expired: How many results were too old meanwhile.
-    """
+    """Return the message of the error when no result came, with how many were too old meanwhile."""
     if expired:
         return f"no result of {processor} came within {timeout_s:g} s that was new enough; {expired} were too old"
     return (

@@ -93,10 +93,7 @@ class Mailboxes:
     ) -> None:
         """Make empty mailboxes of what is wanted; see :class:`InboxOptions`.
 
-        Raises:
-            UsageError: If ``max_age_s`` or the name of a processor is unusable.
-            UnknownNameError: If the vehicle has no camera of this name.
-            UnsupportedError: If frames are wanted and the vehicle has no camera.
+        Raises what :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel` raise.
         """
         known = state.results
         named = [known.everything] if processors is None else [known.channel(one) for one in processors]
@@ -293,14 +290,7 @@ class ClientState:
         return known[request]
 
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None:
-        """Emit an event of the client's own (number 0).
-
-        Args:
-            kind: Kind of the event.
-            text: What happened, for people.
-            severity: How serious it is.
-            **data: Details, by name.
-        """
+        """Emit an event of the client's own (number 0); ``data`` are its details, by name."""
         event = Event(kind, text, self._clock() + self._connection.offset_ns, severity, app=self.app, data=dict(data))
         self.recent.append(event)
         self.on_event.publish(event)
@@ -394,14 +384,7 @@ class Receiver:
         self._state.emit(EventKind.APPLICATION_LINK, text, severity, state=state.value, reason=reason)
 
     def tick(self, now_ns: int) -> int:
-        """Subscribe again to cameras that have stalled, and send due commands.
-
-        Args:
-            now_ns: On this process's clock.
-
-        Returns:
-            When to call again at the latest [ns].
-        """
+        """Subscribe again to cameras that have stalled, and send what is due; return when to call again [ns]."""
         self._state.video.renew(self._connection.state is LinkState.UP, now_ns)
         return self._commands.tick(now_ns)
 
@@ -474,9 +457,6 @@ def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
     """Return the predicate for what is waited for, and its name for people.
-
-    Args:
-        wanted: A flight state or its name, several of them, or a predicate on feedback.
 
     Raises:
         UnknownNameError: If there is no flight state of that name.
