@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from functools import partial, wraps
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Final, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar
+from typing import Any, Final, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar, Unpack
 
 from skyloop.address import shown_address
 from skyloop.child_process import GRACE_S, ChildProcess
 from skyloop.client.authority import Authority, check_seconds
 from skyloop.client.connection import Scheduler
-from skyloop.client.drone import Access, Drone
+from skyloop.client.drone import Access, Drone, DroneOptions
 from skyloop.client.piloting import OnExit
 from skyloop.errors import Hint, LinkError, MissingExtraError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.files import wait_readable
@@ -156,14 +156,7 @@ def connect(
     if not isinstance(authority, Authority | None):
         raise UsageError(f"authority is {authority!r:.80} and must be a skyloop.Authority, as Authority(priority=4)")
     drone, deadline = prepare(
-        target,
-        access=access,
-        name=name,
-        timeout_s=timeout_s,
-        rate_hz=rate_hz,
-        stall_s=stall_s,
-        on_exit=on_exit,
-        network=network,
+        target, name, timeout_s, network, access=access, rate_hz=rate_hz, stall_s=stall_s, on_exit=on_exit
     )
     drone._connect(timeout_s=deadline - time.monotonic(), authority=authority)
     return drone
@@ -171,14 +164,10 @@ def connect(
 
 def prepare(
     target: str,
-    *,
-    access: Access = "pilot",
     name: str | None = None,
     timeout_s: float | None = None,
-    rate_hz: float = 32.0,
-    stall_s: float = 1.0,
-    on_exit: OnExit = "land",
     network: NetworkChoice = None,
+    **options: Unpack[DroneOptions],
 ) -> tuple[Drone, float]:
     """Return a drone that is not connected yet, and until when that may take, on ``time.monotonic``.
 
@@ -190,30 +179,19 @@ def prepare(
         check_seconds("timeout_s", timeout_s)
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
-    if "://" in target:
-        connector = _connector(target)
-        dial, end, reach, scheduler = connector.dialer(deadline), connector.close, connector.reach, connector.scheduler
-    else:
+    if "://" not in target:
         # Another process can use the name alone only if it finds the proxy without network settings.
         others_find_it = network is None or network is False
-        dial, end, reach, scheduler = dial_by_name(target, network), None, target if others_find_it else None, None
+        return Drone(
+            dial_by_name(target, network), app=app, reach=target if others_find_it else None, **options
+        ), deadline
+    way = _connector(target)
     try:
-        drone = Drone(
-            dial,
-            app=app,
-            access=access,
-            rate_hz=rate_hz,
-            stall_s=stall_s,
-            on_exit=on_exit,
-            scheduler=scheduler,
-            on_close=end,
-            reach=reach,
-        )
+        options |= {"scheduler": way.scheduler, "on_close": way.close, "reach": way.reach}
+        return Drone(way.dialer(deadline), app=app, **options), deadline
     except BaseException:
-        if end is not None:
-            end()
+        way.close()
         raise
-    return drone, deadline
 
 
 def _connector(uri: str) -> Connector:

@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from skyloop.client.channels import Notifier
 from skyloop.client.monitoring import Thresholds
-from skyloop.client.session import ConnectionHandler, ProxySession
+from skyloop.client.session import ProxySession
 from skyloop.clock import Clock, nanoseconds
 from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError, UsageError
 from skyloop.messages import (
@@ -26,6 +26,9 @@ from skyloop.messages import (
     Welcome,
 )
 from skyloop.transport.base import Dialer
+
+if TYPE_CHECKING:
+    from skyloop.client.telemetry import Receiver
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is judged
 _AGAIN_S: Final = 1.0  #: how often a thread that waits for samples tries again to receive them itself
@@ -254,7 +257,7 @@ class ConnectionSupervisor:
     def __init__(
         self,
         connection: ProxyConnection,
-        handler: ConnectionHandler,
+        handler: Receiver,
         dial: Dialer,
         hello: Hello,
         *,
@@ -407,7 +410,7 @@ class ConnectionSupervisor:
         if session is None:
             return
         session.close(error)
-        self._handler.disconnected(reason)
+        self._handler.disconnected()
         if not self.connection.closing:
             self._set_state(LinkState.LOST, reason)
 

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Literal, ParamSpec, Self, TypedDict, TypeVar, Unpack
@@ -1193,19 +1193,13 @@ class Drone:
         """
         if depth is not None and depth < 1:
             raise UsageError(f"depth is {depth!r} and must be at least 1 result")
-        self._check_listener(function)
-        channel = self._state.results.everything if processor is None else self._state.results.channel(processor)
-        listener = ResultListener(
-            function,
-            channel,
-            self._piloting.report,
-            name="results" if processor is None else f"results of {processor}",
-            depth=depth or (EVENT_DEPTH if processor is None else 1),
-            inline=inline or self._state.scheduler.in_step,
-            on_cancel=self._state.forget,
-            max_age_s=checked_age(max_age_s),
-        )
-        self._state.listeners.append(listener)
+        known, make = self._state.results, partial(ResultListener, max_age_s=checked_age(max_age_s))
+        if processor is None:
+            channel, name, usual = known.everything, "results", EVENT_DEPTH
+        else:
+            channel, name, usual = known.channel(processor), f"results of {processor}", 1
+        listener = self._listen(channel, function, name, depth=depth or usual, inline=inline, make=make)
+        assert isinstance(listener, ResultListener)
         return listener
 
     # The end ---------------------------------------------------------------------------------------------------
@@ -1294,11 +1288,12 @@ class Drone:
         *,
         depth: int = 1,
         inline: bool = False,
+        make: Callable[..., Listener[T]] = Listener,
     ) -> Listener[T]:
         self._check_listener(function)
         state, report = self._state, self._piloting.report
         inline = inline or state.scheduler.in_step
-        listener = Listener(function, channel, report, name=name, depth=depth, inline=inline, on_cancel=state.forget)
+        listener = make(function, channel, report, name=name, depth=depth, inline=inline, on_cancel=state.forget)
         self._state.listeners.append(listener)
         return listener
 

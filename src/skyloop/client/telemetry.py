@@ -331,18 +331,13 @@ class ClientState:
 
 
 class Receiver:
-    """Handles what arrives from a proxy and changes of the connection.
+    """Gets all that arrives in any session and all that happens to the connection.
 
-    It is the :class:`skyloop.client.session.ConnectionHandler` of every session. ``feedback``, ``frame`` and the other
-    samples come on the receiving thread, the rest on the supervisor's.
+    ``feedback``, ``frame`` and the other samples come on the receiving thread, the rest on the supervisor's.
     """
 
     def __init__(
-        self,
-        state: ClientState,
-        connection: ProxyConnection,
-        commands: CommandSender,
-        restorer: Restorer,
+        self, state: ClientState, connection: ProxyConnection, commands: CommandSender, restorer: Restorer
     ) -> None:
         self._state = state
         self._connection = connection
@@ -351,6 +346,7 @@ class Receiver:
         self._clock = state.scheduler.clock
         self._overview_pages = OverviewPages()
         self.frame = state.video.receive
+        self.disconnected = commands.disconnected
         self.samples: Mapping[type, Callable[[Any, int], None]] = {
             Event: self._event,
             Applied: self._applied,
@@ -363,7 +359,7 @@ class Receiver:
         }
 
     def connected(self, welcome: Welcome) -> None:
-        """Reset the counters, and take in the vehicle's capabilities; see :class:`ConnectionHandler`."""
+        """Reset the counters, and take in the vehicle's capabilities: a proxy has answered Hello."""
         state = self._state
         state.welcome = welcome
         state.video.connected(welcome.capabilities.cameras, self._clock())
@@ -371,10 +367,6 @@ class Receiver:
         self._restorer.connected(welcome.run_id)
         self._commands.connected(welcome.app_id, welcome.run_id, welcome.capabilities)
         state.on_welcome.publish(welcome)
-
-    def disconnected(self, reason: str) -> None:  # noqa: ARG002  (link_changed publishes it)
-        """Drop the authority and the set-point; ``reason`` is published by :meth:`link_changed`."""
-        self._commands.disconnected()
 
     def link_changed(self, state: LinkState, reason: str) -> None:
         """Publish the state of the hop to the proxy, and an event."""
@@ -408,18 +400,12 @@ class Receiver:
         counter.add(now_ns + offset_ns - sample.published_ns, sample.captured_ns - offset_ns, now_ns)
         if not changed:
             self._commands.feedback(sample, now_ns)
+        status, reason, remedy = state.status, sample.link_reason, sample.link_remedy
         awake = before is not None and before.waking_up and not sample.waking_up
-        if (
-            sample.vehicle_link is not state.status.vehicle
-            or awake
-            or (
-                sample.link_reason
-                and (sample.link_reason, sample.link_remedy) != (state.status.reason, state.status.remedy)
-            )
-        ):
-            reason = sample.link_reason or ("" if awake else _link_reason(state.recent))
-            status = replace(state.status, vehicle=sample.vehicle_link, reason=reason, remedy=sample.link_remedy)
-            state.set_status(status)
+        news = reason and (reason, remedy) != (status.reason, status.remedy)
+        if sample.vehicle_link is not status.vehicle or awake or news:
+            reason = reason or ("" if awake else _link_reason(state.recent))
+            state.set_status(replace(status, vehicle=sample.vehicle_link, reason=reason, remedy=remedy))
 
     def _event(self, event: Event, now_ns: int) -> None:
         """Keep and publish an event."""
