@@ -7,14 +7,14 @@ version. Its functions may be called from any thread, and none waits unless its 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Unpack
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypedDict, TypeVar, Unpack
 
 if TYPE_CHECKING:
     from skyloop.client import ChannelStats, Drone, Listener
     from skyloop.client.drone import DroneOptions
     from skyloop.client.publishing import Membership
-    from skyloop.client.telemetry import InboxOptions, Mailboxes
+    from skyloop.client.telemetry import Mailboxes
     from skyloop.client.video import StreamChannel, StreamOptions, VideoChannel
     from skyloop.errors import SkyloopError
     from skyloop.messages import AnyAction, Feedback, Outcome
@@ -180,6 +180,17 @@ def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[Stream
     It calls its consumers on the receiving thread, and raises what :func:`video_channel` raises.
     """
     return drone._state.video.stream(camera, **how)
+
+
+class InboxOptions(TypedDict, total=False):
+    """What one thread waits for."""
+
+    feedback: bool  #: whether feedback is wanted; True if left out
+    frames: bool  #: whether frames are wanted; True if left out
+    camera: str | None  #: name of the camera; None: the vehicle's first
+    results: bool  #: whether results of processors are wanted
+    processors: Iterable[str] | None  #: names of the processors whose results are wanted; None: all
+    max_age_s: float | None  #: oldest age of a result that is accepted [s]; None: any
 
 
 def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:

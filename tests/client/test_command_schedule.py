@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client.actions import CommandSchedule
 from skyloop.clock import ManualClock
 from skyloop.errors import UsageError
 from skyloop.messages import (

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from skyloop import extend
-from skyloop.client import Authority, AuthorityStatus, Drone, command_schedule
+from skyloop.client import Authority, AuthorityStatus, Drone, actions
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
@@ -683,7 +683,7 @@ def test_a_take_off_that_the_proxy_ended_after_20_s_is_asked_for_anew_while_its_
     proxy: ScriptedProxy, drone: Drone
 ) -> None:
     """The library withdrew it before that, and the call waited for nothing until its 120 s were over."""
-    assert command_schedule._AT_MOST_NS[Takeoff] >= TAKEOFF_NS + 500_000_000, "the proxy's word comes first"
+    assert actions._AT_MOST_NS[Takeoff] >= TAKEOFF_NS + 500_000_000, "the proxy's word comes first"
 
     def vehicle() -> None:
         first = proxy.until_commanded(Takeoff())

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from skyloop.client import command_schedule
-from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client import actions
+from skyloop.client.actions import CommandSchedule
 from skyloop.client.drone import Drone
 from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.drivers.motor_stop import GIVE_UP_NS
@@ -226,7 +226,7 @@ def test_one_that_could_not_be_sent_is_withdrawn_or_soon_over() -> None:
 
 
 def test_what_is_not_shown_is_told(proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(command_schedule._AT_MOST_NS, EmergencyStop, 200_000_000)
+    monkeypatch.setitem(actions._AT_MOST_NS, EmergencyStop, 200_000_000)
     proxy.state = FlightState.FLYING
     told = threading.Event()
     drone.on_event(lambda event: told.set() if event.data.get("reason") == "stop_given_up" else None)

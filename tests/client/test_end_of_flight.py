@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from skyloop.client import Drone, Swarm
-from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client.actions import CommandSchedule
 from skyloop.control import Controller
 from skyloop.errors import ClosedError, SkyloopError, SwarmError
 from skyloop.messages import (

@@ -6,8 +6,8 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+from skyloop.client.actions import CommandSchedule
 from skyloop.client.authority import AuthorityTracker
-from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import Scheduler
 from skyloop.cockpit.control_session import GONE_S

@@ -1,26 +1,40 @@
-"""Actions of an application: checks of what they are asked with, and of whether one is done. Pure."""
+"""What an application asks for: checks of its numbers, whether it is done, and which command is sent when. Pure.
+
+The newest set-point wins: it is sent at once and, unless a newer one comes within one and a quarter periods, repeated
+at a steady rate on absolute deadlines. Without a set-point ``Idle`` is repeated, which keeps the authority and leaves
+the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never sent again.
+"""
 
 from __future__ import annotations
 
 import math
 import numbers
-from typing import Final
+from typing import Final, NamedTuple
 
-from skyloop.errors import (
-    RefusedError,
-    UsageError,
-)
+from skyloop.clock import nanoseconds
+from skyloop.errors import RefusedError, UsageError
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,
+    Attitude,
+    EmergencyStop,
+    Failsafe,
     Fate,
     Feedback,
     FlightState,
+    Hover,
+    Idle,
+    Land,
+    Outcome,
     Position,
     Refusal,
+    ResetEmergency,
     ReturnPhase,
     ReturnToStart,
+    Takeoff,
+    Velocity,
 )
+from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.feedback import is_on_earth
 from skyloop.messages.geometry import wrap_angle
 
@@ -29,6 +43,33 @@ _ACTIONS: Final = frozenset(ACTION_NAMES)
 _OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
 OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refused: it may be asked for again
 OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
+_IDLE: Final = Idle()
+_HOVER: Final = Hover()
+#: Actions that are done once the vehicle is in one of these states, where the proxy does not tell; then they are no
+#: longer sent.
+_DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
+    Takeoff: frozenset({FlightState.HOVERING, FlightState.FLYING}),
+    Land: frozenset({FlightState.LANDED}),
+    EmergencyStop: frozenset({FlightState.EMERGENCY}),
+    ReturnToStart: frozenset({FlightState.LANDED}),
+    ResetEmergency: frozenset(FlightState) - {FlightState.EMERGENCY},
+}
+#: How long such an action is repeated at least, as the known state may be from before it was commanded.
+_AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
+    Takeoff: nanoseconds(0.3),
+    Land: nanoseconds(0.3),
+    ReturnToStart: nanoseconds(0.3),
+    EmergencyStop: nanoseconds(0.1),
+    ResetEmergency: nanoseconds(0.1),
+}
+_AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
+    Takeoff: nanoseconds(21.0),  # the proxy ends it after 20 s, and tells whether it may be asked for again
+    Land: nanoseconds(60.0),  # since the proxy told last that it is under way
+    EmergencyStop: nanoseconds(8.0),  # the driver goes on for 10 s: a late repeat must not press it again
+    ResetEmergency: nanoseconds(2.0),
+}
+_UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that could not be sent for so long is not sent later
+_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: a stop is repeated so often, however seldom other commands are
 
 
 def checked(action: AnyAction) -> AnyAction:
@@ -165,3 +206,197 @@ class ReturnWatch:
         phase = feedback.return_phase
         self._began |= phase is not ReturnPhase.NONE
         return self._began and (phase is ReturnPhase.ARRIVED or feedback.state is FlightState.LANDED)
+
+
+class Unsent(NamedTuple):
+    """What was asked for once, and found no room on the way to the proxy."""
+
+    action: AnyAction
+    intent: int
+    since_ns: int
+    automatic: bool = False
+
+
+class CommandSchedule:
+    """Keeps the newest set-point of one application. Times are on this process's clock."""
+
+    def __init__(
+        self, *, rate_hz: float = 32.0, stall_s: float = 1.0, min_interval_s: float = 0.005, keep_s: float = 0.5
+    ) -> None:
+        """Start without a set-point.
+
+        Args:
+            rate_hz: Rate of repeats, 1 to 200 Hz.
+            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never. A
+                place to fly to and a return do not decay: the vehicle stops there.
+            min_interval_s: Least time between two set-points of the application [s]; repeats in between do not count.
+            keep_s: A set-point given while the link was down is sent when it is back, if it is not older than this [s].
+
+        Raises:
+            UsageError: If ``rate_hz`` or ``stall_s`` is out of range.
+        """
+        if not 1.0 <= rate_hz <= 200.0:
+            raise UsageError(f"rate_hz is {rate_hz!r} and must be from 1 to 200 commands a second")
+        if not stall_s > 0.0:
+            raise UsageError(f"stall_s is {stall_s!r} and must be more than 0 s (math.inf: never)")
+        self._period_ns = nanoseconds(1.0 / rate_hz)
+        self._stall_ns = None if stall_s == float("inf") else nanoseconds(stall_s)
+        self._min_interval_ns = nanoseconds(min_interval_s)
+        self._keep_ns = nanoseconds(keep_s)
+        self.action: AnyAction = _IDLE
+        self.intent = 0  #: number of the newest intent
+        self.automatic = False  #: the newest set-point is the library's own, not the application's
+        self.over: Outcome | None = None  #: what ended it, once it is over
+        self.owed: Unsent | None = None  #: what was asked for once, and not sent
+        self.latest: dict[type[AnyAction], int] = {}  #: number of the newest intent of each kind
+        self._asked_ns = 0
+        # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
+        # period longer, and only commands of the application delay the next one.
+        self._first_ns = self._period_ns * 5 // 4
+        self._new_sent_ns = -self._min_interval_ns  # when the newest intent was first sent
+        self._sent_intent = 0
+        self.due_ns = 0  #: when :meth:`next` has something to send
+        self._failsafe = Failsafe.NONE
+        self._reset_asked_ns: int | None = None  # while a stop was under way
+
+    def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
+        """Make ``action`` the set-point, which :meth:`may_ask` allows; return the number of this intent.
+
+        ``automatic``: the application did not ask for it itself.
+        """
+        resets = isinstance(action, ResetEmergency)
+        self._reset_asked_ns = now_ns if resets and self.stopping else None
+        if self._reset_asked_ns is not None:
+            return self.intent
+        stops = type(action) is Hover and type(self.action) is not Hover
+        self.action, self.over = action, None
+        self.intent += 1
+        self.latest[type(action)] = self.intent
+        self.automatic = automatic
+        self._asked_ns = now_ns
+        if stops or type(action) in _DONE_IN:  # rare and important: at once
+            self.due_ns = now_ns
+        else:
+            self.due_ns = max(now_ns, self._new_sent_ns + self._min_interval_ns)
+        return self.intent
+
+    @property
+    def stopping(self) -> bool:
+        """Whether an emergency stop is under way, which nothing but another may replace; see :meth:`may_ask`."""
+        return isinstance(self.action, EmergencyStop)
+
+    def may_ask(self, action: AnyAction) -> bool:
+        """Return whether the application may command this now.
+
+        An emergency stop is repeated until the vehicle shows it, or for 8 s: nothing else of this application is sent
+        meanwhile, or one lost packet would end it while sticks are held. ``Idle`` withdraws one that was never sent. A
+        reset is sent once the stop has shown, if that is soon.
+        """
+        if type(self.action) is not EmergencyStop or isinstance(action, EmergencyStop | ResetEmergency):
+            return True
+        return isinstance(action, Idle) and self.intent != self._sent_intent
+
+    @property
+    def open_ns(self) -> int:
+        """Time from which a new set-point is sent at once [ns]."""
+        return self._new_sent_ns + self._min_interval_ns
+
+    def next(self, now_ns: int) -> AnyAction | None:
+        """Return what to send now, under the present :attr:`intent`; None if it is too early."""
+        if now_ns < self.due_ns:
+            return None
+        kind, since_ns, is_sent = type(self.action), now_ns - self._asked_ns, self.intent == self._sent_intent
+        longest_ns = _UNSENT_STOP_NS if kind is EmergencyStop and not is_sent else _AT_MOST_NS.get(kind)
+        if (kind is Velocity or kind is Attitude) and self._stall_ns is not None and since_ns >= self._stall_ns:
+            self.action, self.automatic = _HOVER, True
+        elif longest_ns is not None and since_ns > longest_ns:
+            self.action, self.owed = _IDLE, None
+        period_ns, first_ns = self._period_ns, self._first_ns
+        if self.action is not _IDLE and kind is EmergencyStop:
+            period_ns, first_ns = min(period_ns, _STOP_PERIOD_NS), min(first_ns, _STOP_PERIOD_NS)
+        if not is_sent:
+            self._sent_intent, self._new_sent_ns = self.intent, now_ns
+            self.due_ns = now_ns + first_ns
+            return self.action
+        # The next deadline follows from the last one, not from the present time, so that the rate is kept; a deadline
+        # missed by more than a period is skipped.
+        self.due_ns += period_ns
+        if self.due_ns <= now_ns:
+            self.due_ns = now_ns + period_ns
+        return self.action
+
+    def not_sent(self, action: AnyAction, now_ns: int) -> None:
+        """Note that there was no room for what :meth:`next` returned: set-points follow anyway, a landing may not."""
+        if isinstance(action, EmergencyStop):
+            if self._new_sent_ns == now_ns:  # its first try: it may still be withdrawn, and is given up soon
+                self._sent_intent = -1
+        elif not _is_periodic(action):
+            self.owed = Unsent(action, self.intent, now_ns, self.automatic)
+
+    def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
+        """Return :attr:`owed` if it is to be sent before ``action``, which neither repeats nor revokes it.
+
+        What the library asks for by itself revokes all but a landing.
+        """
+        owed = self.owed
+        if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > self._keep_ns:
+            return None
+        if self.automatic and type(owed.action) is not Land:
+            return None
+        return owed if _is_periodic(action) else None
+
+    def decayed(self, before: AnyAction) -> bool:
+        """Return whether the set-point ``before`` has decayed to hover because the application made no call."""
+        return self.action is _HOVER and before is not _HOVER
+
+    def observe(self, feedback: Feedback, now_ns: int, app_id: int = 0) -> None:
+        """End what is over: by what the proxy tells of this intent, or because a failsafe overruled a set-point."""
+        kind, outcome = type(self.action), feedback.outcome
+        done_in = _DONE_IN.get(kind)
+        if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent):
+            if outcome.over:
+                self._end(outcome)
+            elif kind is Land and feedback.state is not FlightState.UNKNOWN:
+                self._asked_ns = now_ns  # the proxy goes on with it, however long it takes
+        if done_in is None:
+            if feedback.state is FlightState.EMERGENCY:
+                self.clear(Fate.EMERGENCY)
+        elif (
+            (outcome is None or kind is EmergencyStop)  # a proxy of an earlier version, or anybody's to press
+            and feedback.state in done_in
+            and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
+        ):
+            self.action, reset_ns = _IDLE, self._reset_asked_ns
+            if reset_ns is not None and now_ns - reset_ns <= _AT_MOST_NS[ResetEmergency]:
+                self.ask(ResetEmergency(), now_ns)
+        if feedback.failsafe is not self._failsafe:
+            self._failsafe = feedback.failsafe
+            if feedback.failsafe is not Failsafe.NONE:
+                self.clear(Fate.FAILSAFE)
+
+    def clear(self, fate: Fate) -> None:
+        """Drop the set-point, which ``fate`` ended here. An emergency stop stays."""
+        self._end(Outcome(0, self.intent, fate, Refusal.NOT_FRESH, ENDINGS[fate]))
+        self.owed = None
+
+    def _end(self, outcome: Outcome) -> None:
+        if self.over is None:
+            self.over = outcome
+        if type(self.action) is not EmergencyStop:
+            self.action = _IDLE
+
+    def resume(self, now_ns: int) -> None:
+        """Start to send (again): drop a set-point that is too old."""
+        if now_ns - self._asked_ns > self._keep_ns:
+            self.clear(Fate.LINK)
+        self._failsafe = Failsafe.NONE
+        self.due_ns = now_ns
+
+    @property
+    def wants_flight(self) -> bool:
+        """Whether the newest set-point keeps, or brings, the vehicle in the air."""
+        return isinstance(self.action, Takeoff | Hover | Velocity | Attitude | Position | ReturnToStart)
+
+
+def _is_periodic(action: AnyAction) -> bool:
+    return type(action) is Idle or isinstance(action, SET_POINTS)

@@ -138,6 +138,11 @@ class AuthorityTracker:
         return self.status.state == "held"
 
     @property
+    def awaited(self) -> bool:
+        """Whether it is asked for, and nothing shows yet that another application has it."""
+        return self.wanted and (self.status.state == "none" or not self.settled)
+
+    @property
     def answered(self) -> bool:
         """Whether what was asked for is held, waited for, or not wanted any more. A lost link is no answer."""
         return not self.pending and (self.status.state != "none" or not self.wanted)

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Final
 
+from skyloop.client.actions import CommandSchedule
 from skyloop.client.authority import AuthorityStatus, AuthorityTracker
 from skyloop.client.channels import Emit
-from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.monitoring import ChannelCounter
 from skyloop.errors import (
@@ -215,21 +215,6 @@ class CommandSender:
             RefusedError: If an emergency stop keeps back what is to be done once, or what is to be sent ``now``.
             LinkError: With ``now`` while the link is down.
         """
-        if self._connection.why_closed or type(action) in self._impossible:
-            self._check(action)
-        return self.send(action, now=now, automatic=automatic)
-
-    def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
-        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
-
-        :meth:`outcome` tells what became of it. ``again`` is the intent that it repeats under a new number; if
-        something else was asked for since, nothing is sent and the number stays.
-        """
-        self._check(action)
-        return self._put(action, automatic=automatic, again=again)[0]
-
-    def send(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
-        """Make ``action`` the newest set-point as :meth:`command` does, whatever the vehicle can do."""
         intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
             self._first_set_point = 0
@@ -237,6 +222,14 @@ class CommandSender:
         told = self.told
         self._first_set_point = self._first_set_point or intent
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
+
+    def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
+        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
+
+        :meth:`outcome` tells what became of it. ``again`` is the intent that it repeats under a new number; if
+        something else was asked for since, nothing is sent and the number stays.
+        """
+        return self._put(action, automatic=automatic, again=again)[0]
 
     def _put(
         self, action: AnyAction, *, now: bool = False, automatic: bool = False, again: int | None = None
@@ -246,6 +239,11 @@ class CommandSender:
         It can't be while the link is down, the authority is awaited, an emergency stop has not shown, or nobody is
         there. Raises :class:`GivenUpError` if the caller waits no longer; see :data:`cancelled`.
         """
+        connection, schedule, authority = self._connection, self._schedule, self._authority
+        if connection.why_closed:
+            raise ClosedError(connection.why_closed)
+        if why := self._impossible.get(type(action)):
+            raise UnsupportedError(f"{action.name} is not possible: {why}")
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
@@ -254,35 +252,30 @@ class CommandSender:
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
             if wanted and isinstance(action, _FLYING) and cancelled.get()():
                 raise GivenUpError  # before it was sent: what was asked for since then stays
-            if again is not None and again != self._schedule.intent:
+            if again is not None and again != schedule.intent:
                 return again, False
-            if automatic and type(action) is not Land and type(self._schedule.action) in LANDING:
-                return self._schedule.intent, False
-            authority = self._authority
-            may_send, connected = authority.held or stop, self._connection.connected
-            if (
-                not may_send
-                and connected
-                and not (authority.wanted and (authority.status.state == "none" or not authority.settled))
-            ):
+            if automatic and type(action) is not Land and type(schedule.action) in LANDING:
+                return schedule.intent, False
+            may_send, connected = authority.status.state == "held" or stop, connection.connected
+            if not may_send and connected and not authority.awaited:
                 raise self._not_ours(action)
             if stop and self.role is Role.OBSERVER:
                 raise self._not_ours(action)
-            if not self._schedule.may_ask(action):
+            if not schedule.may_ask(action):
                 if now or not isinstance(action, _STREAMED):
                     text = f"{action.name} was not sent: the emergency stop of this application has not shown yet"
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
-                return self._schedule.intent, False
-            intent = self._schedule.ask(action, now_ns, automatic=automatic)
+                return schedule.intent, False
+            intent = schedule.ask(action, now_ns, automatic=automatic)
             if not may_send or not connected or (isinstance(action, _FLYING) and not self.is_present(now_ns)):
                 if now:
                     if type(action) is not Land:  # what was refused now must not be carried out later
-                        self._schedule.clear(Fate.WITHDRAWN)
+                        schedule.clear(Fate.WITHDRAWN)
                     raise self._not_now(action)
                 return intent, False
-            if self._schedule.due_ns <= now_ns:
+            if schedule.due_ns <= now_ns:
                 return intent, self._send_next(now_ns)
-        self._connection.poke()  # the last one was sent just before: the supervisor's thread sends this one
+        connection.poke()  # the last one was sent just before: the supervisor's thread sends this one
         return intent, True
 
     def outcome(self, intent: int) -> Outcome | None:
@@ -408,21 +401,22 @@ class CommandSender:
 
     def tick(self, now_ns: int) -> int:
         """Send what is due; return when to call again at the latest, on this process's clock [ns]."""
-        last_request, stalled, due_ns = None, False, now_ns + _LATER_NS
-        unshown = False
+        last_request, stalled, unshown, due_ns = None, False, False, now_ns + _LATER_NS
         with self._lock:
-            authority, present = self._authority, self.is_present(now_ns)
+            authority, schedule, present = self._authority, self._schedule, self.is_present(now_ns)
             asks = self._ask_now or (authority.status.state == "none" and not authority.pending)
             if authority.wanted and present and asks:
                 self._ask_now = False
                 last_request = authority.last_request
                 authority.asked(last_request)
-            stopping = self._schedule.stopping
+            stopping = schedule.stopping
             if (authority.held and present) or stopping:
-                if self._schedule.due_ns <= now_ns:
-                    stalled = self._decay(now_ns)
-                    unshown = stopping and not self._schedule.stopping
-                due_ns = self._schedule.due_ns
+                if schedule.due_ns <= now_ns:
+                    before = schedule.action
+                    self._send_next(now_ns)
+                    stalled = schedule.decayed(before)
+                    unshown = stopping and not schedule.stopping
+                due_ns = schedule.due_ns
         if last_request is not None:
             self._connection.ask(last_request, self._answered, ANSWER_S)
         if stalled:
@@ -434,12 +428,6 @@ class CommandSender:
         return due_ns
 
     # Inside ----------------------------------------------------------------------------------------------------
-
-    def _decay(self, now_ns: int) -> bool:
-        """Send what is due; return whether that was a set-point's decay to hover."""
-        before = self._schedule.action
-        self._send_next(now_ns)
-        return self._schedule.decayed(before)
 
     def _send_next(self, now_ns: int) -> bool:
         schedule = self._schedule
@@ -502,12 +490,6 @@ class CommandSender:
     def _notify(self) -> None:
         self.notifier.notify()
         self._changed()
-
-    def _check(self, action: AnyAction) -> None:
-        """Raise if nothing can be commanded any more, or not this."""
-        self._connection.check_open()
-        if why := self._impossible.get(type(action)):
-            raise UnsupportedError(f"{action.name} is not possible: {why}")
 
     def _not_ours(self, action: AnyAction) -> AuthorityError:
         status = self.status

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from skyloop.client.actions import (
+    CommandSchedule,
     ReturnWatch,
     above_zero,
     checked,
@@ -37,7 +38,6 @@ from skyloop.client.authority import (
     authority_request,
 )
 from skyloop.client.channels import JOIN_S, Channel, Listener, Mailbox, checked_age
-from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.frame import Arrival, Frame

@@ -160,7 +160,7 @@ class Piloting:
             if commands.status.state != "held":
                 commands.drop()
                 return False
-            sent = commands.send(action, automatic=True)
+            sent = commands.command(action, automatic=True)
         except SkyloopError:
             return False
         if type(action) is not Idle:

@@ -452,7 +452,9 @@ class Swarm:
             checked(action)
         active = self.active
         ready = {name: active[name] for name in actions if name in active}
-        _wait_open(ready)
+        # A few milliseconds at most, until every drone sends a new set-point at once, so that none leaves later.
+        open_ns = max((drone._commands.open_ns for drone in ready.values()), default=0)
+        time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
@@ -467,10 +469,11 @@ class Swarm:
 
         sent, errors = _try_all({name: name for name in ready}, hand_over)
         if len(stamps) > 1:
-            self._note_spread(stamps[-1] - stamps[0])
+            self._spreads_ns.append(stamps[-1] - stamps[0])
+            del self._spreads_ns[:-DEPTH]
         if self.on_error != "continue":
             errors |= {name: _not_sent(ready[name]) for name, handed in sent.items() if not handed}
-        self.fail(_what(actions), errors)
+        self.fail(", ".join(sorted({action.name for action in actions.values()})), errors)
         return sent
 
     def each(self, function: Callable[[Drone], T], what: str = "") -> dict[str, T]:
@@ -680,8 +683,8 @@ class Swarm:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        aside = self._still_aside()
-        errors = aside | self._leave()
+        self.active  # noqa: B018  (takes those back that were given back)
+        errors = dict(self._aside) | self._leave()
         if not errors:
             return
         report = SwarmError("the flight", errors, len(self))
@@ -694,15 +697,6 @@ class Swarm:
     def _check_open(self) -> None:
         if self._closed:
             raise ClosedError("this swarm was closed: connect again")
-
-    def _still_aside(self) -> dict[str, Exception]:
-        self.active  # noqa: B018  (takes those back that were given back)
-        return dict(self._aside)
-
-    def _note_spread(self, spread_ns: int) -> None:
-        self._spreads_ns.append(spread_ns)
-        if len(self._spreads_ns) > DEPTH:
-            del self._spreads_ns[0]
 
 
 def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[str, R], dict[str, Exception]]:
@@ -735,12 +729,6 @@ def _place(name: str, numbers: Sequence[float], speed: float | None) -> Position
         raise UsageError(f"the place of {name} is {numbers!r:.60} and must be x, y, z [m], and if wanted the yaw [rad]")
     x, y, z, yaw = (*numbers, None)[:4]
     return position_action(x, y, z, yaw, speed)
-
-
-def _wait_open(drones: Mapping[str, Drone]) -> None:
-    """Wait, a few milliseconds at most, until every drone sends a new set-point at once, so that none leaves later."""
-    open_ns = max((drone._commands.open_ns for drone in drones.values()), default=0)
-    time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
 
 
 def _wait(
@@ -790,10 +778,6 @@ def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError |
 def _not_sent(drone: Drone) -> LinkError:
     link = drone.link
     return LinkError(f"the command was not sent: the link is {link.application.value} ({link.reason})")
-
-
-def _what(actions: Mapping[str, AnyAction]) -> str:
-    return ", ".join(sorted({action.name for action in actions.values()}))
 
 
 def in_parallel(

@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
 from types import TracebackType
-from typing import Any, Final, Protocol, Self, TypedDict, TypeVar
+from typing import Any, Final, Protocol, Self, TypeVar
 
 from skyloop.client.channels import C, Channel, FollowingChannel, Listener, Mailbox, Notifier, checked_age
 from skyloop.client.commands import CommandSender
@@ -57,17 +57,6 @@ class LinkStatus:
     remedy: str = ""  #: what a person can do about the vehicle's link while it is not up
 
 
-class InboxOptions(TypedDict, total=False):
-    """What one thread waits for."""
-
-    feedback: bool  #: whether feedback is wanted; True if left out
-    frames: bool  #: whether frames are wanted; True if left out
-    camera: str | None  #: name of the camera; None: the vehicle's first
-    results: bool  #: whether results of processors are wanted
-    processors: Iterable[str] | None  #: names of the processors whose results are wanted; None: all
-    max_age_s: float | None  #: oldest age of a result that is accepted [s]; None: any
-
-
 class Closable(Protocol):
     """What ends with the drone."""
 
@@ -91,7 +80,7 @@ class Mailboxes:
         processors: Iterable[str] | None = None,
         max_age_s: float | None = None,
     ) -> None:
-        """Make empty mailboxes of what is wanted; see :class:`InboxOptions`.
+        """Make empty mailboxes of what is wanted; see :class:`skyloop.extend.InboxOptions`.
 
         Raises what :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel` raise.
         """
