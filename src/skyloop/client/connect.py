@@ -181,10 +181,8 @@ def prepare(
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" not in target:
         # Another process can use the name alone only if it finds the proxy without network settings.
-        others_find_it = network is None or network is False
-        return Drone(
-            dial_by_name(target, network), app=app, reach=target if others_find_it else None, **options
-        ), deadline
+        options["reach"] = target if network is None or network is False else None
+        return Drone(dial_by_name(target, network), app=app, **options), deadline
     way = _connector(target)
     try:
         options |= {"scheduler": way.scheduler, "on_close": way.close, "reach": way.reach}
