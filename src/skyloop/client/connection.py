@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from skyloop.client.channels import Notifier
 from skyloop.client.monitoring import Thresholds
-from skyloop.client.session import ProxySession
+from skyloop.client.session import ConnectionHandler, ProxySession
 from skyloop.clock import Clock, nanoseconds
 from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError, UsageError
 from skyloop.messages import (
@@ -26,9 +26,6 @@ from skyloop.messages import (
     Welcome,
 )
 from skyloop.transport.base import Dialer
-
-if TYPE_CHECKING:
-    from skyloop.client.telemetry import Receiver
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is judged
 _AGAIN_S: Final = 1.0  #: how often a thread that waits for samples tries again to receive them itself
@@ -257,7 +254,7 @@ class ConnectionSupervisor:
     def __init__(
         self,
         connection: ProxyConnection,
-        handler: Receiver,
+        handler: ConnectionHandler,
         dial: Dialer,
         hello: Hello,
         *,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final, Protocol
 
 from skyloop.client.frame import size_error
 from skyloop.client.monitoring import LinkMonitor, Offset, OffsetEstimator, StallWatch, Thresholds
@@ -17,6 +17,7 @@ from skyloop.messages import (
     Feedback,
     FeedbackRequest,
     FrameHeader,
+    LinkState,
     Ping,
     Pong,
     Reply,
@@ -29,9 +30,6 @@ from skyloop.messages import (
 )
 from skyloop.messages.subscription import PLAIN
 from skyloop.transport.base import FEEDBACK, Dialer, Pixels, TransportClient, stream, video
-
-if TYPE_CHECKING:
-    from skyloop.client.telemetry import Receiver
 
 RETRY_S = 0.3  #: time after which an unanswered request is repeated; all requests are idempotent
 
@@ -125,13 +123,28 @@ _PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same until there are a few roun
 _FIRST: Final = 5
 
 
+class ConnectionHandler(Protocol):
+    """Gets samples, on the receiving thread, and what happens to the connection, on the supervisor's."""
+
+    def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello, and sent nothing else yet
+    def disconnected(self) -> None: ...
+    def link_changed(self, state: LinkState, reason: str) -> None: ...
+    def tick(self, now_ns: int) -> int: ...  #: does what is due; returns when to call it again at the latest [ns]
+    def feedback(self, sample: Feedback, now_ns: int) -> None: ...
+    def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
+    @property
+    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: called with the other kinds, and the time
+
+
 class ProxySession:
     """Decodes and counts what arrives on the transport's receiving thread, and hands it to the handler.
 
     It is the :class:`skyloop.transport.base.ClientHandler` of one connection.
     """
 
-    def __init__(self, handler: Receiver, poke: Callable[[], None], thresholds: Thresholds, clock: Clock) -> None:
+    def __init__(
+        self, handler: ConnectionHandler, poke: Callable[[], None], thresholds: Thresholds, clock: Clock
+    ) -> None:
         """Make a session that is not connected; ``poke`` wakes the supervisor."""
         self._handler = handler
         self._poke = poke

@@ -320,7 +320,7 @@ class ClientState:
 
 
 class Receiver:
-    """Gets all that arrives in any session and all that happens to the connection.
+    """Gets all that arrives in any session and all that happens to the connection: its handler in every session.
 
     ``feedback``, ``frame`` and the other samples come on the receiving thread, the rest on the supervisor's.
     """
