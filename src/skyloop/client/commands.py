@@ -267,7 +267,8 @@ class CommandSender:
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return schedule.intent, False
             intent = schedule.ask(action, now_ns, automatic=automatic)
-            if not may_send or not connected or (isinstance(action, _FLYING) and not self.is_present(now_ns)):
+            absent = self._present_until_ns is not None and now_ns > self._present_until_ns
+            if not may_send or not connected or (absent and isinstance(action, _FLYING)):
                 if now:
                     if type(action) is not Land:  # what was refused now must not be carried out later
                         schedule.clear(Fate.WITHDRAWN)
