@@ -38,7 +38,7 @@ from benchmarks.measuring.workers import Pipe, Worker, Workers
 from benchmarks.scale import FRAME_PERIOD_S, loopback
 from skyloop.bench import CAMERA, BenchVehicle, Machine, stamped
 from skyloop.client import Drone, connect
-from skyloop.client.core import Access
+from skyloop.client.drone import Access
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError
 from skyloop.host.fleet import VehicleSettings

@@ -20,7 +20,7 @@ from benchmarks.measuring.machine import cpu_time_s
 from benchmarks.measuring.schedule import sleep_until
 from benchmarks.measuring.workers import Pipe, Worker, Workers
 from skyloop.client import Drone, connect
-from skyloop.client.core import Access
+from skyloop.client.drone import Access
 from skyloop.client.swarm import Swarm
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import SkyloopError

@@ -16,7 +16,7 @@ from benchmarks.measuring.schedule import SMALL
 from skyloop.bench import Setpoint
 from skyloop.client import Drone
 from skyloop.client import connect as connect_by_name
-from skyloop.client.core import Access
+from skyloop.client.drone import Access
 from skyloop.client.video import VideoOptions
 from skyloop.errors import LinkError, SkyloopError, UnknownNameError
 from skyloop.messages import Encoding, FrameHeader

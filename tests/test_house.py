@@ -52,9 +52,9 @@ def private_uses(source: str, names: set[str]) -> list[str]:
 
 def test_private_attributes_are_found() -> None:
     names = private_names()
-    assert {"_core", "_state", "_listen", "_drones", "_leave"} <= names
-    mine = "class Mine(Drone):\n    def f(self, other):\n        return self._core, self._own, other.sync._state"
-    assert private_uses(mine, names) == ["3: self._core", "3: other.sync._state"]
+    assert {"_commands", "_state", "_listen", "_drones", "_leave"} <= names
+    mine = "class Mine(Drone):\n    def f(self, other):\n        return self._commands, self._own, other.sync._state"
+    assert private_uses(mine, names) == ["3: self._commands", "3: other.sync._state"]
     assert not private_uses("class Theirs:\n    def f(self):\n        return self._state\n", names)
 
 

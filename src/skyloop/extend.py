@@ -6,12 +6,13 @@ version. Its functions may be called from any thread, and none waits unless its 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Unpack
+import time
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypedDict, TypeVar, Unpack
 
 if TYPE_CHECKING:
     from skyloop.client import ChannelStats, Drone, Listener
-    from skyloop.client.core import DroneOptions, InboxOptions
+    from skyloop.client.drone import DroneOptions
     from skyloop.client.publishing import Membership
     from skyloop.client.telemetry import Mailboxes
     from skyloop.client.video import StreamChannel, StreamOptions, VideoChannel
@@ -26,35 +27,37 @@ class Known:
     """A drone's state in this process. Reading it sends no request, subscribes to nothing, and never raises."""
 
     def __init__(self, drone: Drone) -> None:
-        core = self._core = drone._core
-        self.app: Final = core.app  #: name of this application, as events give it
-        self.reach: Final = core.reach  #: name or address by which another process reaches the vehicle; None: it can't
-        self.subscriber: Final = core.state.video.subscriber  #: unique to this drone object, for :func:`stream_channel`
+        self._drone, state = drone, drone._state
+        self.app: Final = state.app  #: name of this application, as events give it
+        self.reach: Final = (
+            drone._reach
+        )  #: name or address by which other processes reach the vehicle; None: they can't
+        self.subscriber: Final = state.video.subscriber  #: unique to this drone object, for :func:`stream_channel`
 
     @property
     def newest(self) -> Feedback | None:
         """The newest feedback, however old; None before the first."""
-        return self._core.state.newest
+        return self._drone._state.newest
 
     @property
     def is_ending(self) -> bool:
         """Whether the end of the flight has begun, or the drone is closed: commands raise :class:`ClosedError`."""
-        return self._core.ending
+        return self._drone._piloting.ending
 
     @property
     def is_far(self) -> bool:
         """Whether frames come over a network, in the encoding that each consumer requests."""
-        return self._core.connection.variants
+        return self._drone._connection.variants
 
     @property
     def listeners(self) -> list[Listener[Any]]:
         """The application's callbacks that were not cancelled."""
-        return list(self._core.listeners)
+        return list(self._drone._state.listeners)
 
     @property
     def stats(self) -> dict[str, ChannelStats]:
         """Statistics by channel, like :attr:`skyloop.Drone.stats` but without a request to the proxy."""
-        return self._core.state.stats(self._core.commands.sends)
+        return self._drone._state.stats(self._drone._commands.sends)
 
 
 class Commands(Protocol):
@@ -76,7 +79,8 @@ class Commands(Protocol):
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer a request to hand over the authority; see :meth:`skyloop.client.commands.CommandSender.answer`."""
 
-    # The presence of the person who flies: while it is required and they are absent, only an emergency stop is sent.
+    # The presence of the person who flies: while it is required and they are absent, nothing is repeated and nothing
+    # new is flown; what ends a flight is sent once, and an emergency stop as ever.
     def flown_by_person(self) -> None: ...  #: their presence is required from now on
     def present_until(self, until_ns: int) -> None: ...  #: on this process's clock [ns]; never shortens it
     def is_present(self, now_ns: int) -> bool: ...  #: also True where no presence is required
@@ -84,12 +88,12 @@ class Commands(Protocol):
 
 def commands(drone: Drone) -> Commands:
     """Return this application's commands and outcomes; :meth:`skyloop.Drone.command` and :func:`ask` send one."""
-    return drone._core.commands
+    return drone._commands
 
 
 def ask(drone: Drone, action: AnyAction) -> int:
     """Command ``action``, whose numbers were checked, as :meth:`skyloop.Drone.command`; return the intent's number."""
-    return drone._core.commands.ask(action)
+    return drone._commands.ask(action)
 
 
 def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:
@@ -108,8 +112,8 @@ def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = Fa
         Whether something was sent.
     """
     if for_good:
-        drone._core.commands.bar()
-    return drone._core.let_go(reason, land=land)
+        drone._commands.bar()
+    return drone._piloting.let_go(reason, land=land)
 
 
 def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **options: Unpack[DroneOptions]) -> D:
@@ -120,16 +124,26 @@ def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **o
         dial: Makes a connection to the proxy each time one is needed.
         app: Name of this application, 1 to 64 characters.
         timeout_s: Time for the proxy to answer and to send feedback [s].
-        **options: As for :class:`skyloop.client.core.DroneCore`.
+        **options: See :class:`skyloop.client.drone.DroneOptions`.
 
     Raises:
-        SkyloopError: As :meth:`skyloop.client.core.DroneCore.open`.
+        SkyloopError: As :func:`skyloop.connect`.
     """
-    from skyloop.client.core import DroneCore
+    drone = kind(dial, app=app, **options)
+    drone._connect(timeout_s=timeout_s, acquire=False)
+    return drone
 
-    core = DroneCore(dial, app=app, **options)
-    core.open(timeout_s=timeout_s, acquire=False)
-    return kind(core)
+
+def connect_to_stop(name: str, app: str) -> Drone:
+    """Connect to a running proxy as a pilot that waits for no feedback and never asks for the authority.
+
+    Raises what :func:`skyloop.connect` raises.
+    """
+    from skyloop.client.connect import prepare
+
+    drone, deadline_s = prepare(name, name=app, on_exit="hover")
+    drone._connect(timeout_s=deadline_s - time.monotonic(), acquire=False, wait_for_state=False)
+    return drone
 
 
 def end_flight(drone: Drone, report: Callable[[str], object]) -> SkyloopError | None:
@@ -137,7 +151,7 @@ def end_flight(drone: Drone, report: Callable[[str], object]) -> SkyloopError | 
 
     ``report`` is called with each step, a text for people, on this thread. Returns what went wrong, or None.
     """
-    return drone._core.end_flight(report)
+    return drone._piloting.end_flight(report)
 
 
 def video_channel(
@@ -157,7 +171,7 @@ def video_channel(
         UsageError: If an option is out of range.
         ClosedError: If the drone was closed.
     """
-    return drone._core.channel(camera, max_fps=max_fps, part=part)
+    return drone._state.video.channel(camera, max_fps=max_fps, part=part)
 
 
 def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
@@ -165,7 +179,18 @@ def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[Stream
 
     It calls its consumers on the receiving thread, and raises what :func:`video_channel` raises.
     """
-    return drone._core.stream(camera, **how)
+    return drone._state.video.stream(camera, **how)
+
+
+class InboxOptions(TypedDict, total=False):
+    """What one thread waits for."""
+
+    feedback: bool  #: whether feedback is wanted; True if left out
+    frames: bool  #: whether frames are wanted; True if left out
+    camera: str | None  #: name of the camera; None: the vehicle's first
+    results: bool  #: whether results of processors are wanted
+    processors: Iterable[str] | None  #: names of the processors whose results are wanted; None: all
+    max_age_s: float | None  #: oldest age of a result that is accepted [s]; None: any
 
 
 def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:
@@ -173,7 +198,9 @@ def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:
 
     They fill while they are open as a context manager. It raises what :func:`video_channel` raises.
     """
-    return drone._core.inbox(**wanted)
+    from skyloop.client.telemetry import Mailboxes
+
+    return Mailboxes(drone._state, **wanted)
 
 
 def join_processor(
@@ -196,4 +223,11 @@ def join_processor(
         UsageError: If ``name`` or ``code`` is unusable, or from an inline callback.
         UnknownNameError: If the vehicle has no camera of this name.
     """
-    return drone._core.join_processor(name, code=code, camera=camera, shared=shared, timeout_s=timeout_s)
+    from skyloop.client.publishing import Membership
+
+    state = drone._state
+    membership = Membership(
+        drone._connection, state, name, code, lambda: state.video.channel(camera).camera.name, shared=shared
+    )
+    membership.start(timeout_s)
+    return membership

@@ -13,7 +13,6 @@ import pytest
 import typer
 
 from skyloop.cli import ending
-from skyloop.client.core import DroneCore
 from skyloop.client.drone import Drone, open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError
 from skyloop.messages import EmergencyStop, FlightState, Hover, RequestAuthority, ReturnToStart
@@ -32,9 +31,9 @@ def proxy() -> Iterator[ScriptedProxy]:
 def test_a_stop_waits_for_no_state_and_no_authority(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
     """The vehicle's downlink is dead, and the proxy answers no request: it can be stopped all the same."""
 
-    def prepare(_: str, **options: Any) -> tuple[DroneCore, float]:
-        core = DroneCore(proxy.server.dial, app=options["name"], on_exit="hover", policy=QUICK)
-        return core, time.monotonic() + WAIT_S
+    def prepare(_: str, **options: Any) -> tuple[Drone, float]:
+        drone = Drone(proxy.server.dial, app=options["name"], on_exit="hover", policy=QUICK)
+        return drone, time.monotonic() + WAIT_S
 
     monkeypatch.setattr(sys.modules["skyloop.client.connect"], "prepare", prepare)
     monkeypatch.setattr(ending, "STOPPING_S", 0.5)

@@ -392,7 +392,7 @@ def test_an_emergency_stop_is_heard_while_control_is_asked_for_or_given_back(
     with flown(proxy) as drone:
         pilot, answered = Teleop(drone, 0.5, 0.8), threading.Event()
         monkeypatch.setattr(drone, "request_authority", lambda: answered.wait(WAIT_S))
-        monkeypatch.setattr(drone._core.connection, "call", lambda *_: pytest.fail("R waits for an answer"))
+        monkeypatch.setattr(drone._connection, "call", lambda *_: pytest.fail("R waits for an answer"))
         for order in ("take", "take", "stop"):
             pilot.obey(order)
         proxy.until_commanded(EmergencyStop())
@@ -418,7 +418,7 @@ def test_what_the_hands_ask_for_is_flown(proxy: ScriptedProxy) -> None:
         pilot.obey(FORWARD)
         pilot.obey("land")
         pilot.obey("centre")
-        assert drone._core.commands.newest == Land()
+        assert drone._commands.newest == Land()
         pilot.obey("takeoff")
         pilot.obey("stop")
         proxy.until_commanded(EmergencyStop())
@@ -451,7 +451,7 @@ def test_keys_that_have_no_effect_say_why(proxy: ScriptedProxy) -> None:
         assert pilot._message == f"the keys have no effect: {text}"
         proxy.more.clear()
         proxy.stop()
-        drone._core.state.notifier.wait_for(lambda: drone.link.application.value == "lost", WAIT_S)
+        drone._state.notifier.wait_for(lambda: drone.link.application.value == "lost", WAIT_S)
         pilot.obey(FORWARD)
         assert pilot._message.startswith("the keys have no effect: the link is ")
         proxy.start()

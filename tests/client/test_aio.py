@@ -566,6 +566,34 @@ def test_a_command_cancelled_before_it_was_sent_is_not_sent_any_more(proxy: Scri
     run(fly())
 
 
+def test_a_command_within_another_wait_that_is_cancelled_ends_with_it(proxy: ScriptedProxy) -> None:
+    """A coroutine that a thread waits for went on flying when nobody waited for that thread any more."""
+    proxy.state = FlightState.FLYING
+    go_on = threading.Event()
+
+    async def fly() -> None:
+        drone = await aio.connect("me", on_exit="hover")
+        loop = asyncio.get_running_loop()
+
+        async def late() -> None:
+            await asyncio.to_thread(go_on.wait, WAIT_S)
+            await drone.go_to(x=1.0, y=0.0, z=1.0, timeout_s=WAIT_S)
+
+        def work() -> None:
+            asyncio.run_coroutine_threadsafe(late(), loop).result()
+
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(in_thread(work), 0.02)
+        go_on.set()
+        for worker in [thread for thread in threading.enumerate() if thread.name == "skyloop-aio"]:
+            await asyncio.to_thread(worker.join, WAIT_S)
+        await asyncio.to_thread(proxy.from_now_on, Idle())
+        assert not [one for one in proxy.actions() if isinstance(one, Position)]
+        await drone.close()
+
+    run(fly())
+
+
 def test_a_cancelled_flight_leaves_alone_what_was_asked_for_since(proxy: ScriptedProxy) -> None:
     """Its hover, some milliseconds later, ended the new one."""
     proxy.state = FlightState.FLYING

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client.actions import CommandSchedule
 from skyloop.clock import ManualClock
 from skyloop.errors import UsageError
 from skyloop.messages import (
@@ -170,6 +170,16 @@ def test_what_there_was_no_room_for(unsent: AnyAction, then: AnyAction, first: A
     bench = Bench()
     not_sent(bench, unsent)
     assert owed(bench, then) == first
+
+
+@pytest.mark.parametrize(("unsent", "first"), [(Takeoff(), None), (Land(), Land())])
+def test_letting_go_sends_no_take_off_that_found_no_room(unsent: AnyAction, first: AnyAction | None) -> None:
+    """It went out just before the command that withdrew it."""
+    bench = Bench()
+    not_sent(bench, unsent)
+    bench.commander.ask(Idle(), bench.clock(), automatic=True)
+    found = bench.commander.first(Idle(), bench.clock())
+    assert (None if found is None else found.action) == first
 
 
 def test_nothing_takes_the_place_of_an_emergency_stop_and_nothing_else_outlives_the_authority() -> None:

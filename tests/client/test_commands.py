@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from skyloop import extend
-from skyloop.client import Authority, AuthorityStatus, Drone, command_schedule
-from skyloop.client.core import DroneCore
+from skyloop.client import Authority, AuthorityStatus, Drone, actions
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
@@ -155,7 +154,7 @@ def test_take_off_and_land(proxy: ScriptedProxy, drone: Drone) -> None:
 
 
 def test_a_landing_that_finds_no_room_is_sent_before_the_next_set_point(proxy: ScriptedProxy, drone: Drone) -> None:
-    connection = drone._core.connection
+    connection = drone._connection
     transmit, full = connection.transmit, threading.Event()
 
     def through_a_full_socket(packet: bytes) -> bool:
@@ -258,7 +257,7 @@ def test_a_landing_asked_for_during_a_return_of_the_autopilots_own_is_the_caller
         if pressed == "under the lease":
             lost_lease(proxy, proxy.until_commanded(Land()))
         else:
-            drone._core.state.notifier.wait_for(lambda: drone._core.commands.newest == Land(), WAIT_S)
+            drone._state.notifier.wait_for(lambda: drone._commands.newest == Land(), WAIT_S)
             proxy.more["others"] = in_rtl
             drone.wait(lambda feedback: feedback.others == in_rtl, WAIT_S)
             del proxy.answers[RequestAuthority]
@@ -293,7 +292,7 @@ def test_a_pilot_who_takes_a_landing_by_hand_keeps_it_whoever_had_the_vehicle_be
 
     def vehicle() -> None:
         if had == "no lease":
-            drone._core.state.notifier.wait_for(lambda: drone._core.commands.newest == Land(), WAIT_S)
+            drone._state.notifier.wait_for(lambda: drone._commands.newest == Land(), WAIT_S)
             del proxy.answers[RequestAuthority]
         # One that was on its way when the lease was lost may come first.
         proxy.until(lambda: proxy.owner is not None and landings(proxy.owner[2]) != [], "it lands under its lease")
@@ -301,7 +300,7 @@ def test_a_pilot_who_takes_a_landing_by_hand_keeps_it_whoever_had_the_vehicle_be
         first = landings(proxy.owner[2])[0]
         proxy.more["others"] = None
         proxy.more["outcome"] = Outcome(proxy.owner[0], first.intent)
-        drone._core.state.notifier.wait_for(lambda: _told(drone) == first.intent, WAIT_S)
+        drone._state.notifier.wait_for(lambda: _told(drone) == first.intent, WAIT_S)
         del proxy.more["outcome"]
         proxy.more["others"] = others
         drone.wait(lambda feedback: feedback.others == others, WAIT_S)
@@ -319,7 +318,7 @@ def test_a_pilot_who_takes_a_landing_by_hand_keeps_it_whoever_had_the_vehicle_be
 
 
 def _told(drone: Drone) -> int:
-    told = drone._core.commands.told
+    told = drone._commands.told
     return 0 if told is None else told.intent
 
 
@@ -353,6 +352,103 @@ def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, dron
         drone.land(timeout_s=0.5)
     changing.join(WAIT_S)
     assert len({command.intent for command in proxy.commands if command.action == Land()}) == 1
+
+
+@pytest.mark.parametrize("ending", [Land(), EmergencyStop(), Hover(), Idle()])
+def test_a_take_off_that_the_application_itself_ends_raises_at_once(
+    proxy: ScriptedProxy, drone: Drone, ending: AnyAction
+) -> None:
+    """It waited for its whole time-out, though another thread had landed the vehicle or stopped its motors."""
+
+    def change_of_mind() -> None:
+        proxy.until_commanded(Takeoff())
+        drone.command(ending)
+        at = len(proxy.commands)
+        proxy.more["outcome"] = Outcome(drone.app_id, proxy.until_commanded(ending, at).intent, Fate.COMPLETED)
+
+    changing = background(change_of_mind)
+    begun_s = time.monotonic()
+    with pytest.raises(RefusedError, match="takeoff was ended on the way: another command took its place") as raised:
+        drone.takeoff(timeout_s=3 * WAIT_S)
+    changing.join(WAIT_S)
+    assert raised.value.code == "replaced"
+    assert time.monotonic() - begun_s < 2 * WAIT_S
+    assert drone._commands.newest in (ending, Idle()), "what was asked for since is left alone"
+
+
+@pytest.mark.parametrize("behind", [Hover(), Idle(), Velocity(forward=0.1)])
+def test_what_is_asked_for_behind_a_take_off_that_has_begun_does_not_end_it(
+    proxy: ScriptedProxy, drone: Drone, behind: AnyAction
+) -> None:
+    def vehicle() -> None:
+        proxy.until_commanded(Takeoff())
+        proxy.state = FlightState.TAKING_OFF
+        drone.wait("taking_off", WAIT_S)
+        drone.command(behind)
+        at = len(proxy.commands)
+        proxy.more["outcome"] = Outcome(drone.app_id, proxy.until_commanded(behind, at).intent)
+        drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
+        proxy.state = FlightState.HOVERING
+
+    rising = background(vehicle)
+    drone.takeoff(timeout_s=WAIT_S)
+    rising.join(WAIT_S)
+
+
+@pytest.mark.parametrize("since", [Hover(), Idle(), Velocity(forward=0.1), Land()])
+def test_a_take_off_is_not_asked_for_anew_over_what_was_asked_for_a_moment_before(
+    proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch, since: AnyAction
+) -> None:
+    """Between the look at what became of it and the repeat another thread asked for something else: it took off."""
+    commands, looks = drone._commands, 0
+    outcome = commands.outcome
+
+    def seen(intent: int) -> Outcome | None:
+        nonlocal looks
+        found = outcome(intent)
+        if found is not None and found.reason is Refusal.DRIVER_FAILED:
+            looks += 1
+            if looks == 2:  # the one that asks again
+                time.sleep(0.6)
+                drone.command(since)
+        return found
+
+    def vehicle() -> None:
+        refuse(proxy, proxy.until_commanded(Takeoff()), Refusal.DRIVER_FAILED, "me: not yet")
+
+    monkeypatch.setattr(commands, "outcome", seen)
+    refusing = background(vehicle)
+    with pytest.raises((NoAnswerError, RefusedError)):
+        drone.takeoff(timeout_s=2.0)
+    refusing.join(WAIT_S)
+    assert looks >= 2
+    assert len({command.intent for command in proxy.commands if command.action == Takeoff()}) == 1
+
+
+def test_who_flies_by_a_page_that_is_not_known_to_be_there_is_not_sent_flying(
+    proxy: ScriptedProxy, drone: Drone
+) -> None:
+    """A page that received nothing flew on by its sticks: each of their messages was a new command, sent at once."""
+    proxy.state = FlightState.FLYING
+    drone.wait("flying", WAIT_S)
+    commands = extend.commands(drone)
+    commands.flown_by_person()
+    commands.present_until(time.monotonic_ns() + 60_000_000_000)
+    assert drone.velocity(forward=0.1)
+    proxy.until_commanded(Velocity(forward=0.1))
+    drone._commands._present_until_ns = time.monotonic_ns() - 1  # as if all that time had passed
+    at = proxy.commands[-1].seq
+    assert not drone.velocity(forward=0.2)
+    assert not drone.command(Takeoff())
+    with pytest.raises(AuthorityError, match="takeoff was not sent: whoever flies is not known to be there"):
+        drone.takeoff(wait=False)
+    assert extend.let_go(drone, "the page is gone"), "what ends a flight is sent all the same"
+    proxy.until_commanded(Hover())
+    later = [command.action for command in proxy.commands if command.seq > at]
+    assert Velocity(forward=0.2) not in later
+    assert Takeoff() not in later
+    assert drone.emergency_stop()
+    proxy.until_commanded(EmergencyStop())
 
 
 def test_a_reason_is_no_older_than_the_last_change_of_what_it_speaks_of(proxy: ScriptedProxy, drone: Drone) -> None:
@@ -525,7 +621,7 @@ def test_a_take_off_that_runs_out_of_time_is_withdrawn(proxy: ScriptedProxy, dro
     with pytest.raises(NoAnswerError):
         drone.takeoff(timeout_s=0.2)
     instead = Idle() if state is FlightState.LANDED else Hover()
-    number = drone._core.commands.intent
+    number = drone._commands.intent
     later = proxy.from_now_on(instead)
     assert Takeoff() not in [command.action for command in later]
     assert {command.intent for command in later} == {number}, "no new intent: it takes the vehicle from nobody"
@@ -561,7 +657,7 @@ def test_an_interrupted_call_leaves_nothing_to_happen_later(
     proxy.state = state
     drone.wait(state.value, WAIT_S)
     with pytest.raises(KeyboardInterrupt):
-        drone._core.complete(action, interrupt, True, WAIT_S)
+        drone._piloting.complete(action, interrupt, True, WAIT_S)
     assert {command.action for command in proxy.from_now_on(instead)} == {instead}
 
 
@@ -587,7 +683,7 @@ def test_a_take_off_that_the_proxy_ended_after_20_s_is_asked_for_anew_while_its_
     proxy: ScriptedProxy, drone: Drone
 ) -> None:
     """The library withdrew it before that, and the call waited for nothing until its 120 s were over."""
-    assert command_schedule._AT_MOST_NS[Takeoff] >= TAKEOFF_NS + 500_000_000, "the proxy's word comes first"
+    assert actions._AT_MOST_NS[Takeoff] >= TAKEOFF_NS + 500_000_000, "the proxy's word comes first"
 
     def vehicle() -> None:
         first = proxy.until_commanded(Takeoff())
@@ -604,9 +700,9 @@ def test_a_take_off_that_the_proxy_ended_after_20_s_is_asked_for_anew_while_its_
 
 
 def test_no_take_off_is_asked_for_anew_once_the_flight_ends(proxy: ScriptedProxy, drone: Drone) -> None:
-    drone._core.commands.bar()
+    drone._commands.bar()
     with pytest.raises(ClosedError, match="too late"):
-        drone._core.commands.ask(Takeoff(), automatic=True)
+        drone._commands.ask(Takeoff(), automatic=True)
 
 
 def test_a_refused_take_off_that_nobody_waits_for_is_not_repeated(proxy: ScriptedProxy, drone: Drone) -> None:
@@ -901,18 +997,18 @@ def test_a_link_that_is_lost_before_the_answer_is_no_answer(proxy: ScriptedProxy
 
 
 def test_a_person_whose_link_is_lost_before_the_answer_is_told_so(proxy: ScriptedProxy) -> None:
-    core = DroneCore(proxy.server.dial, app="me", policy=QUICK)
-    core.open(timeout_s=WAIT_S, acquire=False)
+    drone = Drone(proxy.server.dial, app="me", policy=QUICK)
+    drone._connect(timeout_s=WAIT_S, acquire=False)
     try:
-        core.commands.flown_by_person()
-        core.commands.present_until(time.monotonic_ns() + 60_000_000_000)
+        drone._commands.flown_by_person()
+        drone._commands.present_until(time.monotonic_ns() + 60_000_000_000)
         proxy.answers[RequestAuthority] = None
         lost = background(lambda: proxy.until(lambda: asked(proxy) > 0, "the request"), proxy.hang_up)
         with pytest.raises(NoAnswerError, match="the link was lost, or the authority given back"):
-            core.commands.request(RequestAuthority(), 0.0)
+            drone._commands.request(RequestAuthority(), 0.0)
         lost.join(WAIT_S)
     finally:
-        core.close()
+        drone.close()
 
 
 def test_who_reconnects_waits_until_the_earlier_session_is_forgotten(proxy: ScriptedProxy, drone: Drone) -> None:

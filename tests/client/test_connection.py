@@ -235,12 +235,12 @@ def test_callbacks_follow_a_proxy_that_is_restarted_with_another_camera(
         assert set(frames) == set(inline) == {"top"}
         assert named == []
         stream = VideoRequest("top", encoding="h264", kbit_s=100).stream_topic
-        assert drone._core.state.video.streams[stream].consumed
+        assert drone._state.video.streams[stream].consumed
     for listener in listeners:
         listener.cancel()
-    assert not any(channel.consumed for channel in drone._core.state.video.variants.values())
-    assert not any(channel.consumed for channel in drone._core.state.video.streams.values())
-    assert not drone._core.state.on_welcome.consumed
+    assert not any(channel.consumed for channel in drone._state.video.variants.values())
+    assert not any(channel.consumed for channel in drone._state.video.streams.values())
+    assert not drone._state.on_welcome.consumed
 
 
 def test_a_processor_follows_a_proxy_that_is_restarted_with_another_camera(proxy: ScriptedProxy, drone: Drone) -> None:
@@ -380,12 +380,12 @@ def test_questions_over_a_lost_link_wait_for_its_return(proxy: ScriptedProxy, dr
 def test_questions_end_with_the_time_or_the_drone(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.answers[GetParameter] = None
     with pytest.raises(NoAnswerError, match=r"GetParameter.*0\.1 s"):
-        drone._core.connection.call(lambda: GetParameter("x"), 0.1)
+        drone._connection.call(lambda: GetParameter("x"), 0.1)
     ended: list[BaseException] = []
 
     def ask() -> None:
         try:
-            drone._core.connection.call(lambda: GetParameter("x"), WAIT_S)
+            drone._connection.call(lambda: GetParameter("x"), WAIT_S)
         except ClosedError as error:
             ended.append(error)
 
@@ -402,14 +402,14 @@ def test_an_error_of_ours_in_the_link_s_thread_does_not_end_it(
 ) -> None:
     told = Told(drone)
     failing = iter([True])
-    tick = drone._core.commands.tick
+    tick = drone._commands.tick
 
     def fail_once(now_ns: int) -> int:
         if next(failing, False):
             raise RuntimeError("a mistake")
         return tick(now_ns)
 
-    monkeypatch.setattr(drone._core.commands, "tick", fail_once)
+    monkeypatch.setattr(drone._commands, "tick", fail_once)
     at = told.until(LinkState.LOST)
     told.until(LinkState.UP, at)
     assert "a mistake" in caplog.text
@@ -453,7 +453,7 @@ def test_the_offset_between_clocks(proxy: ScriptedProxy, monkeypatch: pytest.Mon
     monkeypatch.setattr("tests.support.scripted_proxy.time", ProxyTime)
     drone = open_drone(dial, app="me", policy=QUICK)
     try:
-        assert abs(drone._core.connection.offset_ns - ahead_ns) < 50_000_000
+        assert abs(drone._connection.offset_ns - ahead_ns) < 50_000_000
         drone.hover()
         proxy.until(lambda: len(proxy.commands) > 2)
         assert abs(proxy.commands[-1].sent_ns - ProxyTime.monotonic_ns()) < 2 * 10**9
@@ -486,6 +486,6 @@ def test_closing_from_an_inline_listener(proxy: ScriptedProxy) -> None:
         drone.on_feedback(close, inline=True)
         assert closed.wait(WAIT_S)
         assert drone.link.application is LinkState.CLOSED
-        thread = drone._core.supervisor._thread
+        thread = drone._supervisor._thread
         thread.join(WAIT_S)
         assert not thread.is_alive()

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, Frame, LinkStatus, Listener
-from skyloop.client.core import DroneCore
 from skyloop.client.video import IDLE_KEPT
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import (
@@ -161,11 +160,11 @@ def test_in_a_fork_a_drone_neither_lands_nor_releases_what_its_parent_flies(prox
     with flown(proxy) as drone:
         proxy.state = FlightState.HOVERING
         drone.wait("hovering", WAIT_S)
-        drone._core.forked()
+        drone._piloting.forked()
         asked, commanded = list(proxy.requests), proxy.actions()
         with pytest.raises(ClosedError, match=r"belongs to process \d+, of which this one is a fork: connect here"):
             drone.velocity(forward=1.0)
-        drone._core.end_flight()
+        drone._piloting.end_flight()
         drone.close()
         assert proxy.requests == asked
         assert Land() not in proxy.actions()[len(commanded) :]
@@ -473,7 +472,7 @@ def test_an_error_in_the_block_comes_out_and_a_landing_that_fails_is_logged(
 
     with flown(proxy) as drone:
         drone.command(Hover())
-        monkeypatch.setattr(drone._core, "complete", no_landing)
+        monkeypatch.setattr(drone._piloting, "complete", no_landing)
         with pytest.raises(RuntimeError, match="mine"), drone:
             raise RuntimeError("mine")
     assert "it did not land" in caplog.text
@@ -488,19 +487,18 @@ def test_a_landed_drone_is_just_left(proxy: ScriptedProxy) -> None:
 @pytest.mark.parametrize("options", [{"access": "fly"}, {"on_exit": "crash"}, {"app": ""}, {"app": "x" * 65}])
 def test_unusable_options(proxy: ScriptedProxy, options: dict[str, str]) -> None:
     with pytest.raises(UsageError):
-        DroneCore(proxy.server.dial, **{"app": "me", **options})  # type: ignore[arg-type]
+        Drone(proxy.server.dial, **{"app": "me", **options})  # type: ignore[arg-type]
 
 
 def test_closing_waits_for_all_listeners_together_and_wakes_who_asks_for_the_authority(
     proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """2 s for each listener in turn; and 8 s, with another error, for a request of the authority."""
-    monkeypatch.setattr("skyloop.client.core.JOIN_S", 0.4)
+    monkeypatch.setattr("skyloop.client.drone.JOIN_S", 0.4)
     go_on, asked = threading.Event(), threading.Event()
     errors: list[Exception] = []
-    core = DroneCore(proxy.server.dial, app="closing")
-    core.open(acquire=False)
-    drone = Drone(core)
+    drone = Drone(proxy.server.dial, app="closing")
+    drone._connect(acquire=False)
     listeners = [drone.on_feedback(lambda _: go_on.wait(WAIT_S)) for _ in range(4)]
     proxy.answers[RequestAuthority] = None
 
@@ -525,14 +523,14 @@ def test_closing_waits_for_all_listeners_together_and_wakes_who_asks_for_the_aut
 
 def test_channels_that_nobody_reads_are_forgotten(proxy: ScriptedProxy, drone: Drone) -> None:
     """Each rate and size that was ever asked for was kept for good."""
-    state = drone._core.state
-    watched = drone._core.channel(scale=0.5)
+    state = drone._state
+    watched = drone._state.video.channel(scale=0.5)
     with drone.on_frame(lambda _: None, scale=0.5), drone.on_feedback(lambda _: None, max_hz=7.0):
         for number in range(1, 100):
-            drone._core.channel(max_fps=float(number))
-            drone._core.stream(max_fps=float(number))
+            drone._state.video.channel(max_fps=float(number))
+            drone._state.video.stream(max_fps=float(number))
             state.feedback_channel(FeedbackRequest(max_hz=1.0 + number / 10))
-        assert drone._core.channel(scale=0.5) is watched
+        assert drone._state.video.channel(scale=0.5) is watched
         assert {id(channel) for channel in state.video.channels.values()} <= {
             id(one) for one in state.video.variants.values()
         }
@@ -548,7 +546,7 @@ def test_two_threads_that_ask_for_the_same_channel_get_the_same(drone: Drone) ->
     def ask() -> None:
         start.wait(WAIT_S)
         for number in range(1, 20):
-            found.add((number, id(drone._core.channel(max_fps=float(number)))))
+            found.add((number, id(drone._state.video.channel(max_fps=float(number)))))
 
     threads = [threading.Thread(target=ask) for _ in range(8)]
     for thread in threads:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from skyloop.client import command_schedule
-from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client import actions
+from skyloop.client.actions import CommandSchedule
 from skyloop.client.drone import Drone
 from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.drivers.motor_stop import GIVE_UP_NS
@@ -114,7 +114,7 @@ def test_what_a_stop_keeps_back_is_told(proxy: ScriptedProxy, drone: Drone) -> N
     assert set(proxy.actions()) <= {EmergencyStop(), Idle()}
     proxy.state = FlightState.EMERGENCY
     drone.wait("emergency", WAIT_S)
-    proxy.until(lambda: not drone._core.commands.stopping)
+    proxy.until(lambda: not drone._commands.stopping)
     assert drone.hover()
 
 
@@ -185,6 +185,22 @@ def test_a_reset_is_sent_once_the_stop_has_shown_if_that_is_soon(after_s: float,
     assert schedule.next(clock()) == then
 
 
+@pytest.mark.parametrize("there_is_room", [True, False])
+def test_it_is_repeated_at_once_however_seldom_other_commands_are(there_is_room: bool) -> None:
+    """At 1 Hz one lost packet, or one moment without room, left the motors running for 1.25 s more."""
+    clock, schedule = ManualClock(), CommandSchedule(rate_hz=1.0)
+    schedule.ask(EmergencyStop(), clock())
+    sent = []
+    for _ in range(500):
+        if (action := schedule.next(clock())) is not None:
+            sent.append(action)
+            if not there_is_room:
+                schedule.not_sent(action, clock())
+        clock.advance(0.001)
+    assert sent == [EmergencyStop()] * 10
+    assert schedule.due_ns - clock() <= 50_000_000
+
+
 def test_it_is_given_up_when_the_driver_gives_it_up() -> None:
     clock, schedule = ManualClock(), CommandSchedule()
     schedule.ask(EmergencyStop(), clock())
@@ -210,7 +226,7 @@ def test_one_that_could_not_be_sent_is_withdrawn_or_soon_over() -> None:
 
 
 def test_what_is_not_shown_is_told(proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(command_schedule._AT_MOST_NS, EmergencyStop, 200_000_000)
+    monkeypatch.setitem(actions._AT_MOST_NS, EmergencyStop, 200_000_000)
     proxy.state = FlightState.FLYING
     told = threading.Event()
     drone.on_event(lambda event: told.set() if event.data.get("reason") == "stop_given_up" else None)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from skyloop.client import Drone, Swarm
-from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client.actions import CommandSchedule
 from skyloop.control import Controller
 from skyloop.errors import ClosedError, SkyloopError, SwarmError
 from skyloop.messages import (
@@ -63,7 +63,7 @@ def newest(proxy: ScriptedProxy) -> Command:
 def test_a_hover_of_the_librarys_own_says_so_and_a_programs_does_not(proxy: ScriptedProxy, drone: Drone) -> None:
     drone.velocity(forward=0.5)
     assert not newest(proxy).automatic
-    assert drone._core.let_go("a test says so")
+    assert drone._piloting.let_go("a test says so")
     hover = proxy.until_commanded(Hover())
     assert hover.automatic
     drone.hover()
@@ -104,20 +104,19 @@ def test_what_letting_go_sends(
     proxy.state = more.pop("state", FLYING)  # type: ignore[assignment]
     proxy.more = more
     drone.wait(lambda f: all(getattr(f, name) == value for name, value in {"state": proxy.state, **more}.items()))
-    core = drone._core
-    core.commands.command(asked)
-    assert core.let_go("a test says so") is (sent is not None)
-    assert core.commands.newest == (asked if sent is None else sent)
+    drone._commands.command(asked)
+    assert drone._piloting.let_go("a test says so") is (sent is not None)
+    assert drone._commands.newest == (asked if sent is None else sent)
 
 
 def test_without_the_authority_nothing_is_sent_now_or_later(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.take_over()
     drone.wait(lambda _: drone.authority.state == "preempted", WAIT_S)
     count = len(proxy.commands)
-    assert not drone._core.let_go("a test says so")
+    assert not drone._piloting.let_go("a test says so")
     assert Hover() not in proxy.actions()[count:]
     drone.close()
-    assert not drone._core.let_go("a test says so")
+    assert not drone._piloting.let_go("a test says so")
 
 
 # Interrupts ------------------------------------------------------------------------------------------------------
@@ -143,7 +142,7 @@ def test_ctrl_c_in_a_flight_to_a_place_hovers(
         call(drone)
     assert proxy.until_commanded(Hover(), count).automatic
     assert action is None or action in proxy.actions()
-    assert drone._core.commands.newest == Hover()
+    assert drone._commands.newest == Hover()
 
 
 def test_ctrl_c_in_a_take_off_that_does_not_begin_ends_it(proxy: ScriptedProxy, drone: Drone) -> None:
@@ -163,7 +162,7 @@ def test_ctrl_c_in_a_landing_lets_it_go_on(proxy: ScriptedProxy, drone: Drone) -
     background(lambda: proxy.until_commanded(Land()), lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         drone.land()
-    assert drone._core.commands.newest == Land()
+    assert drone._commands.newest == Land()
 
 
 @pytest.mark.parametrize("how", [KeyboardInterrupt, SystemExit])
@@ -194,7 +193,7 @@ def test_a_controller_that_has_landed_and_fails_is_left_to_land(proxy: ScriptedP
 
     with pytest.raises(ValueError, match="a bug"):
         Landing(drone).run()
-    assert drone._core.commands.newest == Land()
+    assert drone._commands.newest == Land()
 
 
 # The end ---------------------------------------------------------------------------------------------------------
@@ -247,7 +246,7 @@ def test_an_emergency_stop_passes_when_the_end_has_begun(proxy: ScriptedProxy, d
         drone.emergency_stop,
         lambda: setattr(proxy, "state", FlightState.EMERGENCY),
     )
-    assert drone._core.end_flight() is None
+    assert drone._piloting.end_flight() is None
     stopping.join(WAIT_S)
     assert EmergencyStop() in proxy.actions()
 
@@ -264,7 +263,7 @@ def test_who_waits_for_another_command_hears_that_the_flight_ends(proxy: Scripte
     thread = background(fly)
     proxy.until_commanded(Position(8.0, 0.0, 1.0))
     down = landing(proxy)
-    assert drone._core.end_flight() is None
+    assert drone._piloting.end_flight() is None
     thread.join(WAIT_S)
     down.join(WAIT_S)
     assert raised
@@ -294,13 +293,34 @@ def test_sys_exit_in_a_callback_ends_the_flight(proxy: ScriptedProxy, drone: Dro
 
     down = landing(proxy)
     drone.on_feedback(leave, inline=inline)
-    proxy.until(lambda: drone.closed or drone._core.ending, "the end begins")
+    proxy.until(lambda: drone.closed or drone._piloting.ending, "the end begins")
     down.join(WAIT_S)
-    assert drone._core.end_flight() is None, "waits for the end that is under way"
+    assert drone._piloting.end_flight() is None, "waits for the end that is under way"
     assert drone.closed
     assert proxy.until_commanded(Land()).automatic
     told = [event.text for event in drone.recent_events() if event.kind is EventKind.CALLBACK_ERROR]
     assert told[0] == "feedback raised SystemExit: enough"
+
+
+@pytest.mark.parametrize("inline", [False, True])
+def test_sys_exit_in_a_callback_lands_also_where_there_is_no_thread_to_wait_for_it(
+    proxy: ScriptedProxy, drone: Drone, inline: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Commands were refused from then on, and nothing ended the flight."""
+    begin = threading.Thread.start
+
+    def start(thread: threading.Thread) -> None:
+        if thread.name == "skyloop-end":
+            raise RuntimeError("can't start new thread")
+        begin(thread)
+
+    def end(_: Feedback) -> None:
+        raise SystemExit("enough")
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    drone.velocity(forward=0.5)
+    drone.on_feedback(end, inline=inline)
+    assert proxy.until_commanded(Land()).automatic
 
 
 def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
@@ -315,7 +335,7 @@ def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
         proxy.notifier.notify()
 
     down = background(lambda: proxy.until(lambda: bool(steps)), lambda: setattr(proxy, "state", LANDED))
-    assert drone._core.end_flight(report) is None
+    assert drone._piloting.end_flight(report) is None
     down.join(WAIT_S)
     assert steps == ["it returns to its start and lands"]
     assert {action.name for action in proxy.actions()} <= {"idle"}
@@ -337,7 +357,7 @@ def test_what_others_fly_is_left_to_them_at_the_end(
     take(proxy)
     drone.wait(lambda f: f.others is not None or drone.authority.state == "preempted", WAIT_S)
     steps: list[str] = []
-    assert drone._core.end_flight(steps.append) is None
+    assert drone._piloting.end_flight(steps.append) is None
     assert steps == [told]
     assert {action.name for action in proxy.actions()} <= {"idle"}
 
@@ -448,13 +468,13 @@ def test_the_end_of_a_swarm_bars_all_its_drones_before_the_first_lands(
 ) -> None:
     other, swarm = two
     barred: list[bool] = []
-    end = drone._core.end_flight
+    end = drone._piloting.end_flight
 
     def watched() -> SkyloopError | None:
-        barred.append(swarm["b"]._core.ending)
+        barred.append(swarm["b"]._piloting.ending)
         return end()
 
-    monkeypatch.setattr(drone._core, "end_flight", watched)
+    monkeypatch.setattr(drone._piloting, "end_flight", watched)
     down = landing(proxy), landing(other)
     with swarm:
         pass
@@ -476,6 +496,6 @@ def test_who_took_it_a_moment_ago_keeps_it_too(proxy: ScriptedProxy, drone: Dron
 
     steps: list[str] = []
     taking = background(take)
-    assert drone._core.end_flight(steps.append) is None
+    assert drone._piloting.end_flight(steps.append) is None
     taking.join(WAIT_S)
     assert steps == ["landing", "the vehicle is in RTL: the drone is left to it"]

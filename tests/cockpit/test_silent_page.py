@@ -6,8 +6,8 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+from skyloop.client.actions import CommandSchedule
 from skyloop.client.authority import AuthorityTracker
-from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import Scheduler
 from skyloop.cockpit.control_session import GONE_S
@@ -29,7 +29,13 @@ class Flown:
         scheduler = Scheduler()
         scheduler.clock = lambda: self.now_ns
         connection: Any = SimpleNamespace(
-            connected=True, offset_ns=0, transmit=self._transmit, poke=lambda: None, ask=self._ask
+            connected=True,
+            offset_ns=0,
+            transmit=self._transmit,
+            poke=lambda: None,
+            ask=self._ask,
+            why_closed="",
+            check_open=lambda: None,
         )
         self.pilot = CommandSender(
             Role.PILOT,

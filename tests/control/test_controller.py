@@ -128,7 +128,7 @@ def test_a_slow_callback_gets_the_newest_and_is_an_overrun(proxy: ScriptedProxy,
 
     drone.frame()
     sending = background(
-        lambda: drone.wait(lambda _: len(drone._core.state.video.channels["front"]._drops) == 1, WAIT_S),
+        lambda: drone.wait(lambda _: len(drone._state.video.channels["front"]._drops) == 1, WAIT_S),
         lambda: proxy.frame(1),
     )
     controller = Slow(drone)
@@ -261,7 +261,7 @@ def test_a_forgotten_take_off_is_named(proxy: ScriptedProxy, drone: Drone, state
 
 
 def test_limited_set_points_are_told_by_limit_and_number(proxy: ScriptedProxy, drone: Drone) -> None:
-    def limited(asked: float, app: str = drone._core.app, limit: str = "limits.yaw_rate") -> None:
+    def limited(asked: float, app: str = drone._state.app, limit: str = "limits.yaw_rate") -> None:
         proxy.event(EventKind.COMMAND_CLAMPED, "limited", app, limit=limit, asked=asked, applied=1.75)
 
     def known(asked: float) -> bool:

@@ -84,7 +84,7 @@ def test_one_slot_a_processor_and_the_newest_wins(proxy: ScriptedProxy, drone: D
                 one.send(seq)
             two.send(5)
             two.send(6)
-            newest = drone._core.state.results.channel("finder")
+            newest = drone._state.results.channel("finder")
             drone.wait(lambda _: newest.newest is not None and newest.newest.seq == 6, WAIT_S)
 
     controller = Noting(drone, busy)

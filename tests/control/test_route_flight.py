@@ -90,7 +90,7 @@ def test_a_stall_of_this_program_is_told_as_what_it_was(fate: Fate, told: str, m
         flight = FlyRoute(drone, TRIANGLE)
         flight._leg = 7
         outcome = Outcome(1, 7, fate, Refusal.NOT_FRESH, "position refused: a zone")
-        monkeypatch.setattr(drone._core.commands, "outcome", lambda intent: outcome if intent == 7 else None)
+        monkeypatch.setattr(drone._commands, "outcome", lambda intent: outcome if intent == 7 else None)
         assert [flight._why_ended(), flight._why_ended()] == [told, ""]
 
 
@@ -110,7 +110,7 @@ def test_a_hover_of_the_same_program_is_not_ended_by_the_next_leg() -> None:
         flight.run(seconds=10.0)
         assert flight.law.state == "paused"
         assert math.hypot(*(drone.feedback().position_m or ())[:2]) < 0.4
-        assert not drone._core.commands._schedule.automatic, "the hover that was asked for goes on"
+        assert not drone._commands._schedule.automatic, "the hover that was asked for goes on"
     assert told[-1].text == TAKEN
 
 

@@ -128,6 +128,38 @@ def test_each_awaits_all_at_the_same_time(field: Field) -> None:
     run(fly())
 
 
+def test_a_cancelled_each_flies_no_more(field: Field) -> None:
+    """Its coroutines went on, and took back each landing that was asked for since."""
+
+    async def fly() -> None:
+        async with aio.swarm(*NAMES) as drones:
+            await drones.takeoff()
+            flying = asyncio.Barrier(len(NAMES) + 1)
+            ended: list[str] = []
+
+            async def patrol(drone: aio.Drone) -> None:
+                await flying.wait()
+                try:
+                    while True:
+                        drone.hover()  # which a cancelled wait does not refuse
+                        await asyncio.sleep(0.01)
+                finally:
+                    ended.append(drone.name)
+
+            patrols = asyncio.create_task(drones.each(patrol))
+            await flying.wait()
+            patrols.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await patrols
+            while sorted(ended) != sorted(NAMES):
+                await asyncio.sleep(0.005)
+            await drones.land()
+            await asyncio.sleep(0.1)
+            assert field.states() == {FlightState.LANDED}
+
+    run(fly())
+
+
 def test_a_policy_that_lands_the_others_does_not_hold_up_the_event_loop(field: Field) -> None:
     others = [field.vehicles[name] for name in NAMES if name != "bravo"]
     for vehicle in others:

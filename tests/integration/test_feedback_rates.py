@@ -187,11 +187,11 @@ def test_another_connection_asks_for_the_same() -> None:
         got: list[Feedback] = []
         with drone.on_feedback(got.append, max_hz=20):
             wait_until(lambda: server.subscribers("feedback?max_hz=20") == 1, "it is narrowed")
-            session = drone._core.connection.session
+            session = drone._connection.session
             assert session is not None
             assert session._end is not None
             session._end.close()
-            wait_until(lambda: drone._core.connection.session not in (None, session), "another session")
+            wait_until(lambda: drone._connection.session not in (None, session), "another session")
             wait_until(lambda: server.subscribers("feedback?max_hz=20") == 1, "asked for in it")
             count, now_ns = len(got), time.monotonic_ns()
             wait_until(lambda: len(got) > count and got[-1].published_ns > now_ns, "samples come again")

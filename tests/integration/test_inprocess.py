@@ -259,7 +259,7 @@ def test_a_pilot_whose_link_is_cut_leaves_a_hovering_then_landing_vehicle(node: 
         pilot.takeoff()
         pilot.velocity(forward=0.5)
         pilot.wait("flying", WAIT_S)
-        pilot._core.supervisor.close()  # as if it were killed
+        pilot._supervisor.close()  # as if it were killed
         eye.wait("landed", WAIT_S)
         pilot.close()
     order = [step for number, step in enumerate(steps) if number == 0 or step is not steps[number - 1]]
@@ -305,7 +305,7 @@ def test_forged_commands_change_nothing(node: Node, drone: Drone) -> None:
 def test_statistics_of_all_channels(node: Node, drone: Drone) -> None:
     drone.takeoff()
     drone.frame()
-    drone.wait(lambda _: drone._core.state.video.channels["front"].counter.count > 10, WAIT_S)
+    drone.wait(lambda _: drone._state.video.channels["front"].counter.count > 10, WAIT_S)
     stats = drone.stats
     for name in ("command", "feedback", "video/front"):
         delay = stats[name].delay_s

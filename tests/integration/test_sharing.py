@@ -82,7 +82,7 @@ def test_a_holder_that_declines_keeps_it_and_who_asked_is_told_why(shared: Share
         assert (bob.authority.state, bob.authority.holder, bob.authority.position) == ("queued", "alice", 1)
         alice.on_takeover(lambda _: "landing")
         bob.request_authority(takeover="ask", stay=True)
-        known = bob._core.commands._authority
+        known = bob._commands._authority
         wait_until(lambda: known.declined.endswith("alice does not hand the authority over to bob yet: landing"), "no")
         assert alice.authority.state == "held"
         assert bob.authority.state == "queued"
@@ -150,11 +150,11 @@ def test_whose_time_is_over_is_relieved_and_does_not_ask_again(shared: Shared) -
 def test_a_pilot_that_was_silent_finds_its_name_there_and_gets_a_new_lease(shared: Shared) -> None:
     with shared.joined("alice") as alice, shared.joined("eve", access="observe") as eve:
         lease = alice.authority.lease
-        transmit = alice._core.connection.transmit
-        alice._core.connection.transmit = lambda packet: True  # nothing leaves it any more
+        transmit = alice._connection.transmit
+        alice._connection.transmit = lambda packet: True  # nothing leaves it any more
         kept = eve.wait(lambda feedback: not feedback.lease, WAIT_S)
         assert kept.owner == "alice"
-        alice._core.connection.transmit = transmit
+        alice._connection.transmit = transmit
         held(alice)
         wait_until(lambda: alice.authority.lease > lease, "a new lease")
         assert alice.hover()

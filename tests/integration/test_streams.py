@@ -60,7 +60,7 @@ def decoded(pictures: list[EncodedFrame]) -> list[np.ndarray]:
 
 
 def test_a_stream_begins_with_a_key_and_each_picture_is_one_whole_image(node: Node) -> None:
-    with node.connected() as drone, Watch(drone._core.stream(kbit_s=500)) as watch:
+    with node.connected() as drone, Watch(drone._state.video.stream(kbit_s=500)) as watch:
         pictures = watch.take(10)
         assert [one.key for one in pictures[:2]] == [True, False]
         numbers = [one.seq for one in pictures]
@@ -100,7 +100,10 @@ def test_smaller_and_fewer_pictures(far: Node) -> None:
 
 def test_many_watch_one_encoding(node: Node) -> None:
     with node.connected() as one, node.connected(access="observe") as other:  # noqa: SIM117
-        with Watch(one._core.stream(kbit_s=400)) as first, Watch(other._core.stream(kbit_s=400)) as second:
+        with (
+            Watch(one._state.video.stream(kbit_s=400)) as first,
+            Watch(other._state.video.stream(kbit_s=400)) as second,
+        ):
             first.take(3)
             (late, *_) = second.take(3)
             assert late.key, "whoever comes later gets a key picture"
@@ -111,7 +114,7 @@ def test_many_watch_one_encoding(node: Node) -> None:
 
 
 def test_a_subscriber_that_misses_a_picture_asks_for_a_key(node: Node) -> None:
-    with node.connected() as drone, Watch(drone._core.stream(kbit_s=400)) as watch:
+    with node.connected() as drone, Watch(drone._state.video.stream(kbit_s=400)) as watch:
         last = watch.take(8)[-1]
         watch.stream.report(last.seq, wants_key=True)
         assert any(picture.key for picture in watch.take(40))
@@ -121,7 +124,7 @@ def test_what_is_lost_on_the_way_costs_pictures_and_never_shows(far: Node) -> No
     with far.connected() as drone:
         frames = drone.frames(encoding="h264", kbit_s=400)
         next(frames)
-        stream = drone._core.state.video.streams["stream/front?kbit_s=400"]
+        stream = drone._state.video.streams["stream/front?kbit_s=400"]
         decoder, received = stream.decoder, stream.receive
         assert decoder is not None
         numbers = itertools.count()
@@ -149,7 +152,7 @@ def test_a_damaged_picture_is_not_shown(far: Node) -> None:
     with far.connected() as drone:
         frames = drone.frames(encoding="h264", kbit_s=400)
         next(frames)
-        stream = drone._core.state.video.streams["stream/front?kbit_s=400"]
+        stream = drone._state.video.streams["stream/front?kbit_s=400"]
         received, numbers, damaged = stream.receive, itertools.count(1), set()
 
         def flipping(part: EncodedFrame) -> None:
@@ -168,7 +171,7 @@ def test_a_decoder_that_is_too_slow_goes_on_with_a_key(far: Node) -> None:
     with far.connected() as drone:
         frames = drone.frames(encoding="h264", kbit_s=400)
         next(frames)
-        decoder = drone._core.state.video.streams["stream/front?kbit_s=400"].decoder
+        decoder = drone._state.video.streams["stream/front?kbit_s=400"].decoder
         assert decoder is not None
         before, slow, decode = decoder.dropped, threading.Event(), decoder._decode
 
@@ -200,16 +203,16 @@ def test_after_a_silence_the_stream_goes_on_without_a_key(monkeypatch: pytest.Mo
 
 def test_the_encoder_ends_with_its_last_subscriber(node: Node) -> None:
     with node.connected() as drone:
-        with Watch(drone._core.stream(kbit_s=400)) as watch:
+        with Watch(drone._state.video.stream(kbit_s=400)) as watch:
             watch.take(3)
         (form,) = node.proxy.publisher.streams.known
         drone.wait(lambda _: form._thread is None, WAIT_S + IDLE_S)
-        with Watch(drone._core.stream(kbit_s=400)) as watch:
+        with Watch(drone._state.video.stream(kbit_s=400)) as watch:
             assert watch.take(2)[0].key
 
 
 def test_a_stream_that_nobody_acknowledges_stops_and_takes_up_again(near: Drone) -> None:
-    with Watch(near._core.stream(subscriber="me"), reports=False) as watch:
+    with Watch(near._state.video.stream(subscriber="me"), reports=False) as watch:
         few = watch.take(2)
         near.wait(lambda _: watch.came.qsize() == 0, WAIT_S)
         held = len(few)
@@ -256,7 +259,7 @@ def test_a_listener_gets_pictures_that_can_be_decoded(node: Node) -> None:
 
 
 def test_forms_are_bounded(near: Drone) -> None:
-    streams = [near._core.stream(kbit_s=100 + number) for number in range(MAX_FORMS + 1)]
+    streams = [near._state.video.stream(kbit_s=100 + number) for number in range(MAX_FORMS + 1)]
     watches = [Watch(stream) for stream in streams]
     problems: queue.Queue[str] = queue.Queue()
     with near.on_event(lambda event: problems.put(event.text) if event.kind == "packet_malformed" else None):
@@ -272,5 +275,5 @@ def test_forms_are_bounded(near: Drone) -> None:
 def test_without_a_rate_or_a_name_a_form_makes_no_sense(near: Drone) -> None:
     problems: queue.Queue[str] = queue.Queue()
     told = near.on_event(lambda event: problems.put(event.text) if event.kind == "packet_malformed" else None)
-    with told, Watch(near._core.stream(scale=0.5)):
+    with told, Watch(near._state.video.stream(scale=0.5)):
         assert "says nothing of a rate: add kbit_s" in problems.get(timeout=WAIT_S)

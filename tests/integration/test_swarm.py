@@ -292,7 +292,7 @@ def test_set_points_leave_at_one_tick_and_the_spread_is_measured(field: Field) -
         for count in range(5):
             sent = drones.send({name: Velocity(0.1 * count, 0.01 * n) for n, name in enumerate(NAMES)})
             assert sent == dict.fromkeys(NAMES, True)
-            assert max(drone._core.commands.open_ns for drone in drones) <= time.monotonic_ns() + 5_000_000
+            assert max(drone._commands.open_ns for drone in drones) <= time.monotonic_ns() + 5_000_000
         spread = drones.spread
         assert before is None
         assert spread is not None
@@ -359,7 +359,7 @@ def test_when_a_loop_ends_what_it_flew_hovers_at_once(field: Field, end: type[Ba
                     if end is None:
                         break
                     raise end
-        commands = {name: drone._core.commands for name, drone in drones.items()}
+        commands = {name: drone._commands for name, drone in drones.items()}
         assert type(commands["alpha"].newest) is type(commands["charlie"].newest) is Hover
         assert type(commands["bravo"].newest) is not Hover, "it was not flown by the loop"
         wait_until(lambda: type(field.vehicles["alpha"].applied[-1]) is Hover, "it hovers")

@@ -12,6 +12,10 @@ from skyloop.client import Drone, Result
 from skyloop.client.drone import open_drone
 from skyloop.client.publishing import Membership
 from skyloop.errors import NameTakenError, UnknownNameError, UsageError
+from skyloop.extend import join_processor
+from tests.client.scripted import QUICK
+from tests.integration.fake_vehicle import FakeVehicle
+from tests.integration.test_inprocess import WAIT_S, Node
 from tests.support.fake_vehicle import WAIT_S, FakeVehicle, Node
 from tests.support.scripted_proxy import QUICK
 
@@ -42,17 +46,17 @@ def part(membership: Membership) -> tuple[int, int] | None:
 
 
 def test_shares_follow_the_workers(node: Node, drone: Drone) -> None:
-    one = drone._core.join_processor("detector", code="Detector 1")
+    one = join_processor(drone, "detector", code="Detector 1")
     assert part(one) == (0, 1)
     with observer(node, "two") as other:
-        two = other._core.join_processor("detector", code="Detector 1")
+        two = join_processor(other, "detector", code="Detector 1")
         assert part(two) == (1, 2)
         drone.wait(lambda _: part(one) == (0, 2), WAIT_S)
     drone.wait(lambda _: part(one) == (0, 1), WAIT_S)
 
 
 def test_a_worker_that_is_not_ready_has_no_part(node: Node, drone: Drone) -> None:
-    one = drone._core.join_processor("detector", code="Detector 1")
+    one = join_processor(drone, "detector", code="Detector 1")
     able = threading.Event()
     one.ready = able.is_set
     one.renew()
@@ -66,7 +70,7 @@ def test_what_is_found_is_published(node: Node, drone: Drone) -> None:
     with observer(node, "eye") as eye:
         eye.on_result(got.append, "detector")
         eye.wait(lambda _: node.server.subscribers("results/detector") == 1, WAIT_S)
-        one = drone._core.join_processor("detector", code="Detector 1")
+        one = join_processor(drone, "detector", code="Detector 1")
         frame = drone.next_frame(timeout_s=WAIT_S)
         assert one.publish(frame, {"x": 2}, took_s=0.01)
         eye.wait(lambda _: bool(got), WAIT_S)
@@ -79,40 +83,40 @@ def test_what_is_found_is_published(node: Node, drone: Drone) -> None:
 
 
 def test_other_code_under_the_same_name_is_refused(node: Node, drone: Drone) -> None:
-    drone._core.join_processor("detector", code="Detector 1")
+    join_processor(drone, "detector", code="Detector 1")
     with observer(node, "two") as other:
         with pytest.raises(NameTakenError, match=r"one \(application 1\) runs other code under the name detector"):
-            other._core.join_processor("detector", code="Detector 2")
-        assert part(other._core.join_processor("detector2", code="Detector 2")) == (0, 1)
+            join_processor(other, "detector", code="Detector 2")
+        assert part(join_processor(other, "detector2", code="Detector 2")) == (0, 1)
 
 
 def test_bad_arguments(drone: Drone) -> None:
     with pytest.raises(UsageError, match="name of a processor"):
-        drone._core.join_processor("a b", code="")
+        join_processor(drone, "a b", code="")
     with pytest.raises(UnknownNameError, match="no camera named 'frnt'"):
-        drone._core.join_processor("detector", code="", camera="frnt")
+        join_processor(drone, "detector", code="", camera="frnt")
     with pytest.raises(UsageError, match="code"):
-        drone._core.join_processor("detector", code="x" * 129)
+        join_processor(drone, "detector", code="x" * 129)
 
 
 def test_a_restarted_proxy_is_joined_again(node: Node, drone: Drone) -> None:
-    one = drone._core.join_processor("detector", code="Detector 1")
+    one = join_processor(drone, "detector", code="Detector 1")
     node.restart()
     drone.wait(lambda _: part(one) == (0, 1), WAIT_S)
     assert one.refused is None
 
 
 def test_a_worker_may_end_before_its_drone(drone: Drone) -> None:
-    one = drone._core.join_processor("detector", code="Detector 1")
+    one = join_processor(drone, "detector", code="Detector 1")
     one.close()
     one.close()
     assert part(one) is None
 
 
 def test_a_name_taken_while_the_proxy_was_away_is_told(node: Node, drone: Drone) -> None:
-    one = drone._core.join_processor("detector", code="Detector 1")
+    one = join_processor(drone, "detector", code="Detector 1")
     with observer(node, "two") as other:
-        other._core.join_processor("detector", code="Detector 1")
+        join_processor(other, "detector", code="Detector 1")
         one.code = "Detector 2"  # as when this one comes back after that one
         one.renew()
         drone.wait(lambda _: one.refused is not None, WAIT_S)
@@ -123,5 +127,5 @@ def test_a_name_taken_while_the_proxy_was_away_is_told(node: Node, drone: Drone)
 def test_membership_ends_with_the_drone(node: Node) -> None:
     before = set(threading.enumerate())
     with observer(node) as drone:
-        drone._core.join_processor("detector", code="Detector 1")
+        join_processor(drone, "detector", code="Detector 1")
     assert set(threading.enumerate()) - before == set()

@@ -17,6 +17,7 @@ import skyloop
 from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UnknownNameError, UsageError
+from skyloop.extend import join_processor
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -89,7 +90,7 @@ def test_everything_is_in_the_file(fly: Fly, tmp_path: Path) -> None:
         drone.velocity(forward=0.25)
         frame = drone.next_frame(timeout_s=WAIT_S)
         assert drone.annotate(frame, [Polyline(((1.0, 1.0), (5.0, 5.0)))], source="tracker")
-        membership = drone._core.join_processor("detector", code="Detector 1")
+        membership = join_processor(drone, "detector", code="Detector 1")
         assert membership.publish(frame, {"score": 0.5})
         assert drone.log.text("found it", severity="warning")
         assert drone.log.numbers(error=0.25, gain=2)

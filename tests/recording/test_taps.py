@@ -30,7 +30,7 @@ class Rig:
         self.items: list[Item] = []
         self.sink: Callable[[EncodedFrame], None] | None = None
         topic = SimpleNamespace(add=self._add, remove=self._remove, report=lambda seq, *, wants_key: None)
-        drone = SimpleNamespace(_core=SimpleNamespace(stream=lambda name, *, subscriber: topic))
+        drone = SimpleNamespace(_state=SimpleNamespace(video=SimpleNamespace(stream=lambda name, *, subscriber: topic)))
         self.stream = Stream(self._put, cast(Any, drone), "front")
         self.stream.start()
 

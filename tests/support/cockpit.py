@@ -138,7 +138,7 @@ class FakeDrone:
         self.log_listeners: list[Any] = []
         self.requests: list[tuple[str, dict[str, Any]]] = []  #: cameras that were subscribed to, and how
         self.streams: list[FakeStream] = []  #: as H.264, in the order in which they were first asked for
-        self._core = SimpleNamespace(stream=self._stream)
+        self._state = SimpleNamespace(video=SimpleNamespace(stream=self._stream))
         self.clock_offset_ns = 0
         self.closed = False
         self._size = width, height

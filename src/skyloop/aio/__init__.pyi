@@ -6,9 +6,10 @@ from skyloop import client
 from skyloop.aio.bridge import Callback as Callback, Opening, T
 from skyloop.client.authority import Authority, AuthorityStatus, TakeoverAnswer, TakeoverRequest, TakeoverWay
 from skyloop.client.connect import ConnectOptions, NetworkChoice
-from skyloop.client.core import Access, OnExit
+from skyloop.client.drone import Access
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.monitoring import ChannelStats, Distribution
+from skyloop.client.piloting import OnExit
 from skyloop.client.preflight import PreflightFinding
 from skyloop.client.results import Result
 from skyloop.client.swarm import Missing, OnError, Target, Tick
@@ -201,8 +202,9 @@ class Drone:
 
         Raises:
             NoAnswerError: If the vehicle does not hover in time; names its state and, if known, the reason.
-            RefusedError: If the proxy refuses to take off in the present state, a failsafe, a lost link or a new lease
-                ends it before it shows, or the vehicle lands or disarms before it hovers, whoever made it.
+            RefusedError: If the proxy refuses to take off in the present state; a failsafe, a lost link, a new lease or
+                another command of this application ends it before it shows; the application lands the vehicle or stops
+                its motors meanwhile; or it lands or disarms before it hovers, whoever made it.
             UnsupportedError: If the vehicle can't take off.
             LinkError: Without ``wait``, if the link is down; the vehicle does not take off later either.
             AuthorityError: If the authority is not held, or another application takes it over meanwhile.
@@ -855,7 +857,7 @@ class Swarm:
     def __iter__(self) -> Iterator[Drone]: ...
     def __repr__(self) -> str: ...
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
-        """Await ``function`` of all active drones at the same time, on this event loop.
+        """Await ``function`` of all active drones at the same time, on this event loop. Cancelling it cancels them.
 
         Args:
             function: A coroutine function; what it raises counts as for :meth:`skyloop.Swarm.each`.

@@ -8,6 +8,7 @@ import inspect
 import re
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager
 from functools import wraps
 from types import TracebackType
@@ -72,9 +73,11 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
         else:
             future.set_result(result)  # type: ignore[arg-type]
 
+    outside = cancelled.get()  # of a thread that waits for this coroutine
+
     def work() -> None:
         result, error = None, None
-        cancelled.set(future.cancelled)
+        cancelled.set(lambda: future.cancelled() or outside())
         try:
             result = function()
         except BaseException as problem:  # noqa: BLE001  (it is raised where the result is awaited)
@@ -298,13 +301,13 @@ class Drone:
     async def frames(
         self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> AsyncIterator[client.Frame]:
-        core, notifier, clock = self.sync._core, LoopNotifier(), asyncio.get_running_loop().time
-        channel, mailbox = core.follow(lambda: core.channel(camera, **how)), Mailbox[Arrival](notifier=notifier)
-        with core.closing(mailbox), channel.into(mailbox):
+        state, notifier, clock = self.sync._state, LoopNotifier(), asyncio.get_running_loop().time
+        channel, mailbox = state.follow(lambda: state.video.channel(camera, **how)), Mailbox[Arrival](notifier=notifier)
+        with state.closing(mailbox), channel.into(mailbox):
             deadline = clock() + timeout_s
             while not self.sync.closed:
                 if not await notifier.within(deadline - clock()):
-                    raise core.no_frame(channel.current.camera.name, timeout_s)
+                    raise state.no_frame(channel.current.camera.name, timeout_s)
                 frame = await _decoded(channel.current, mailbox.take(), how.get("max_age_s"))
                 if frame is not None:
                     yield frame
@@ -314,9 +317,9 @@ class Drone:
     async def results(
         self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0
     ) -> AsyncIterator[client.Result]:
-        core, notifier, clock = self.sync._core, LoopNotifier(), asyncio.get_running_loop().time
+        state, notifier, clock = self.sync._state, LoopNotifier(), asyncio.get_running_loop().time
         mailbox = ResultMailbox(checked_age(max_age_s), notifier)
-        with core.closing(mailbox), core.result_channel(processor).into(mailbox):
+        with state.closing(mailbox), state.results.channel(processor).into(mailbox):
             deadline = clock() + timeout_s
             while not self.sync.closed:
                 if not await notifier.within(deadline - clock()):
@@ -383,7 +386,7 @@ class Swarm:
         return f"<aio.{repr(self.sync)[1:]}"
 
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
-        """Await ``function`` of all active drones at the same time, on this event loop.
+        """Await ``function`` of all active drones at the same time, on this event loop. Cancelling it cancels them.
 
         Args:
             function: A coroutine function; what it raises counts as for :meth:`skyloop.Swarm.each`.
@@ -394,14 +397,25 @@ class Swarm:
         """
         loop = asyncio.get_running_loop()
         ours = {id(drone.sync): drone for drone in self}
+        begun: list[Future[T]] = []
+        over = False
 
         async def call(drone: Drone) -> T:
+            if over:
+                raise asyncio.CancelledError
             return await function(drone)
 
         def wait_for(drone: client.Drone) -> T:
-            return asyncio.run_coroutine_threadsafe(call(ours[id(drone)]), loop).result()
+            waiting = asyncio.run_coroutine_threadsafe(call(ours[id(drone)]), loop)
+            begun.append(waiting)
+            return waiting.result()
 
-        return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
+        try:
+            return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
+        finally:  # where it was cancelled they would fly on, over what is commanded next
+            over = True
+            for waiting in begun:
+                waiting.cancel()
 
     @like(client.Swarm.ticks)
     async def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:

@@ -17,7 +17,7 @@ import typer
 from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
 from skyloop.cli.text import error_text
 from skyloop.errors import AuthorityError, LinkError, NoAnswerError, SkyloopError, UsageError
-from skyloop.extend import Known, let_go
+from skyloop.extend import Known, connect_to_stop, let_go
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -245,13 +245,9 @@ def _over_already(name: str, program: str) -> str:
 
 def _stop(name: str) -> str:
     """Cut the motors. It needs no authority, and waits for no answer but that of the connection."""
-    from skyloop.client import Drone
-    from skyloop.client.connect import prepare
     from skyloop.messages import FlightState
 
-    core, deadline_s = prepare(name, name="skyloop stop", on_exit="hover")
-    core.open(timeout_s=deadline_s - time.monotonic(), acquire=False, wait_for_state=False)
-    with closing(Drone(core)) as drone:
+    with closing(connect_to_stop(name, "skyloop stop")) as drone:
         if not drone.capabilities.actions:
             return "takes no commands: it shows a recording or a camera"
         end_s = time.monotonic() + STOPPING_S

@@ -1,60 +1,79 @@
-"""Actions of an application: checks of what they are asked with, and the wait until one is done."""
+"""What an application asks for: checks of its numbers, whether it is done, and which command is sent when. Pure.
+
+The newest set-point wins: it is sent at once and, unless a newer one comes within one and a quarter periods, repeated
+at a steady rate on absolute deadlines. Without a set-point ``Idle`` is repeated, which keeps the authority and leaves
+the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never sent again.
+"""
 
 from __future__ import annotations
 
 import math
 import numbers
-import time
-from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
-from skyloop.client.commands import CommandSender, GivenUpError, cancelled
-from skyloop.client.connection import ProxyConnection
-from skyloop.client.telemetry import ClientState
-from skyloop.errors import (
-    AuthorityError,
-    ClosedError,
-    NoAnswerError,
-    RefusedError,
-    UnsupportedError,
-    UsageError,
-)
+from skyloop.clock import nanoseconds
+from skyloop.errors import RefusedError, UsageError
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,
+    Attitude,
+    EmergencyStop,
+    Failsafe,
     Fate,
     Feedback,
     FlightState,
+    Hover,
+    Idle,
     Land,
-    LinkState,
     Outcome,
     Position,
     Refusal,
+    ResetEmergency,
     ReturnPhase,
     ReturnToStart,
     Takeoff,
+    Velocity,
 )
 from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.feedback import is_on_earth
 from skyloop.messages.geometry import wrap_angle
 
 AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
-#: Where the proxy does not tell: feedback received sooner after a command may be older than it.
-_STALE_NS: Final = 100_000_000
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 _OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
-AGAIN_NS: Final = 500_000_000  #: between a take-off that is not possible yet and the next attempt
-_NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
 OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refused: it may be asked for again
 OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
+_IDLE: Final = Idle()
+_HOVER: Final = Hover()
+#: Actions that are done once the vehicle is in one of these states, where the proxy does not tell; then they are no
+#: longer sent.
+_DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
+    Takeoff: frozenset({FlightState.HOVERING, FlightState.FLYING}),
+    Land: frozenset({FlightState.LANDED}),
+    EmergencyStop: frozenset({FlightState.EMERGENCY}),
+    ReturnToStart: frozenset({FlightState.LANDED}),
+    ResetEmergency: frozenset(FlightState) - {FlightState.EMERGENCY},
+}
+#: How long such an action is repeated at least, as the known state may be from before it was commanded.
+_AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
+    Takeoff: nanoseconds(0.3),
+    Land: nanoseconds(0.3),
+    ReturnToStart: nanoseconds(0.3),
+    EmergencyStop: nanoseconds(0.1),
+    ResetEmergency: nanoseconds(0.1),
+}
+_AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
+    Takeoff: nanoseconds(21.0),  # the proxy ends it after 20 s, and tells whether it may be asked for again
+    Land: nanoseconds(60.0),  # since the proxy told last that it is under way
+    EmergencyStop: nanoseconds(8.0),  # the driver goes on for 10 s: a late repeat must not press it again
+    ResetEmergency: nanoseconds(2.0),
+}
+_UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that could not be sent for so long is not sent later
+_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: a stop is repeated so often, however seldom other commands are
 
 
 def checked(action: AnyAction) -> AnyAction:
-    """Return ``action`` if it can be commanded.
-
-    Raises:
-        UsageError: If it is no action, or has a number that is not finite or makes no sense.
-    """
+    """Return ``action`` if it can be commanded, else raise :class:`UsageError`."""
     if type(action) not in _ACTIONS:
         raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
     try:
@@ -71,17 +90,10 @@ def checked(action: AnyAction) -> AnyAction:
 
 
 def position_action(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
-    """Return the action that flies to a place.
+    """Return the action that flies to a place: x east, y north, z up [m], yaw from x [rad], greatest speed [m/s].
 
-    Args:
-        x: East [m].
-        y: North [m].
-        z: Up [m].
-        yaw: Counter-clockwise from x [rad]; None: keep the present one.
-        speed: Greatest one [m/s]; None: as fast as the limits allow.
-
-    Raises:
-        UsageError: If something is no number, not finite, or makes no sense.
+    None keeps the present yaw, and is as fast as the limits allow. Raises :class:`UsageError` for what is no number,
+    not finite, or makes no sense.
     """
     place = Position(
         number("x", x),
@@ -95,14 +107,9 @@ def position_action(x: object, y: object, z: object, yaw: object = None, speed: 
 
 
 def return_action(height_m: object, land: object) -> ReturnToStart:
-    """Return the action that flies back to the start.
+    """Return the action that flies back to the start; None: as the proxy's parameters say.
 
-    Args:
-        height_m: Above the start, at least, on the way [m]; None: the proxy's parameter.
-        land: Whether to land there; None: the proxy's parameter.
-
-    Raises:
-        UsageError: If something is no number or no bool, or makes no sense.
+    Raises :class:`UsageError` if something is no number or no bool, or makes no sense.
     """
     if not (land is None or isinstance(land, bool)):
         raise UsageError(f"land is {land!r:.60} and must be True, False or None (as return.land says)")
@@ -117,12 +124,11 @@ def in_world_axes(
     newest: Feedback | None,
     age_s: float,
 ) -> tuple[object, object, object]:
-    """Return x, y, z of a place that is given in either way.
+    """Return x, y, z [m] of a place that is given in either way; the values of the other one are None.
 
     Args:
-        local: x, y, z in world axes [m], or three times None.
-        earth: Latitude and longitude [°] and altitude above mean sea level [m], or three times None; None for the
-            altitude alone: the present height.
+        local: x, y, z in world axes [m].
+        earth: Latitude and longitude [°], altitude above mean sea level [m] or None: the present height.
         newest: The newest feedback.
         age_s: Its age [s].
 
@@ -154,15 +160,7 @@ def in_world_axes(
 
 
 def above_zero(name: str, value: object) -> float:
-    """Return ``value`` as a finite float above zero.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: What was given.
-
-    Raises:
-        UsageError: If it is no such number.
-    """
+    """Return the value of an argument as a finite float above zero, else raise :class:`UsageError`."""
     found = number(name, value)
     if not found > 0.0:
         raise UsageError(f"{name} is {found:g} and must be more than 0")
@@ -170,15 +168,7 @@ def above_zero(name: str, value: object) -> float:
 
 
 def number(name: str, value: object) -> float:
-    """Return ``value`` as a finite float.
-
-    Args:
-        name: Name of the argument, for the error.
-        value: What was given.
-
-    Raises:
-        UsageError: If it is no real number, or not finite.
-    """
+    """Return the value of an argument as a finite float, else raise :class:`UsageError`."""
     if type(value) is not float and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
         raise UsageError(f"{name} is {value!r:.60} and must be a number")
     try:
@@ -193,11 +183,7 @@ def number(name: str, value: object) -> float:
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
     """Return whether a vehicle is in the air at a place, and nearly at rest.
 
-    Args:
-        target: The place.
-        feedback: The vehicle's; without a velocity it counts as at rest.
-        tolerance_m: How far from it is near enough [m].
-        tolerance_rad: The same of its yaw, if it has one [rad].
+    The yaw matters where the place has one; a vehicle that tells no velocity counts as at rest.
     """
     if feedback.position_m is None or math.dist(feedback.position_m, target.place) > tolerance_m:
         return False
@@ -222,195 +208,195 @@ class ReturnWatch:
         return self._began and (phase is ReturnPhase.ARRIVED or feedback.state is FlightState.LANDED)
 
 
-class ActionWait:
-    """One commanded action, and the wait for feedback that shows that it is done."""
+class Unsent(NamedTuple):
+    """What was asked for once, and found no room on the way to the proxy."""
+
+    action: AnyAction
+    intent: int
+    since_ns: int
+    automatic: bool = False
+
+
+class CommandSchedule:
+    """Keeps the newest set-point of one application. Times are on this process's clock."""
 
     def __init__(
-        self,
-        action: AnyAction,
-        is_done: Callable[[Feedback], bool],
-        commands: CommandSender,
-        state: ClientState,
-        connection: ProxyConnection,
-        *,
-        automatic: bool = False,
+        self, *, rate_hz: float = 32.0, stall_s: float = 1.0, min_interval_s: float = 0.005, keep_s: float = 0.5
     ) -> None:
-        """Send the action.
+        """Start without a set-point.
 
         Args:
-            action: The action.
-            is_done: Whether feedback that is newer than the action shows it.
-            commands: Sends it, now and where it is commanded again, under a new number, and tells what became of it.
-            state: Newest feedback.
-            connection: State of the link.
-            automatic: The library asks by itself, which takes no vehicle from others, also at the end of the flight.
+            rate_hz: Rate of repeats, 1 to 200 Hz.
+            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never. A
+                place to fly to and a return do not decay: the vehicle stops there.
+            min_interval_s: Least time between two set-points of the application [s]; repeats in between do not count.
+            keep_s: A set-point given while the link was down is sent when it is back, if it is not older than this [s].
 
         Raises:
-            SkyloopError: As :meth:`CommandSender.ask`.
+            UsageError: If ``rate_hz`` or ``stall_s`` is out of range.
         """
-        self._action = action
-        self._is_done = is_done
-        self._automatic = automatic
-        self._commands = commands
-        self._state = state
-        self._connection = connection
-        self._problem: Exception | None = None
-        self._why = ""  # it was not done yet, for people
-        self._why_link: LinkState | None = None  # the vehicle's link at that time, of which it may speak
-        self._flew = False  # it was in the air meanwhile
-        self._refused, self._refused_ns = 0, 0  # the newest intent of ours that was not possible yet, and since when
-        self._asked_ns = state.scheduler.clock()
-        # The call may take the vehicle from the pilot who has it now, or when it can first be sent.
-        self._others, self._may_be_sent = self._others_now, commands.may_ask
-        self._intent = commands.ask(action, automatic=automatic)
+        if not 1.0 <= rate_hz <= 200.0:
+            raise UsageError(f"rate_hz is {rate_hz!r} and must be from 1 to 200 commands a second")
+        if not stall_s > 0.0:
+            raise UsageError(f"stall_s is {stall_s!r} and must be more than 0 s (math.inf: never)")
+        self._period_ns = nanoseconds(1.0 / rate_hz)
+        self._stall_ns = None if stall_s == float("inf") else nanoseconds(stall_s)
+        self._min_interval_ns = nanoseconds(min_interval_s)
+        self._keep_ns = nanoseconds(keep_s)
+        self.action: AnyAction = _IDLE
+        self.intent = 0  #: number of the newest intent
+        self.automatic = False  #: the newest set-point is the library's own, not the application's
+        self.over: Outcome | None = None  #: what ended it, once it is over
+        self.owed: Unsent | None = None  #: what was asked for once, and not sent
+        self.latest: dict[type[AnyAction], int] = {}  #: number of the newest intent of each kind
+        self._asked_ns = 0
+        # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
+        # period longer, and only commands of the application delay the next one.
+        self._first_ns = self._period_ns * 5 // 4
+        self._new_sent_ns = -self._min_interval_ns  # when the newest intent was first sent
+        self._sent_intent = 0
+        self.due_ns = 0  #: when :meth:`next` has something to send
+        self._failsafe = Failsafe.NONE
+        self._reset_asked_ns: int | None = None  # while a stop was under way
+
+    def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
+        """Make ``action`` the set-point, which :meth:`may_ask` allows; return the number of this intent.
+
+        ``automatic``: the application did not ask for it itself.
+        """
+        resets = isinstance(action, ResetEmergency)
+        self._reset_asked_ns = now_ns if resets and self.stopping else None
+        if self._reset_asked_ns is not None:
+            return self.intent
+        stops = type(action) is Hover and type(self.action) is not Hover
+        self.action, self.over = action, None
+        self.intent += 1
+        self.latest[type(action)] = self.intent
+        self.automatic = automatic
+        self._asked_ns = now_ns
+        if stops or type(action) in _DONE_IN:  # rare and important: at once
+            self.due_ns = now_ns
+        else:
+            self.due_ns = max(now_ns, self._new_sent_ns + self._min_interval_ns)
+        return self.intent
 
     @property
-    def outdone(self) -> bool:
-        """Whether the application asked for something else since, which a set-point behind a take-off is not."""
-        commands = self._commands
-        behind = type(self._action) is Takeoff and isinstance(commands.newest, SET_POINTS)
-        return commands.intent != self._intent and not behind
+    def stopping(self) -> bool:
+        """Whether an emergency stop is under way, which nothing but another may replace; see :meth:`may_ask`."""
+        return isinstance(self.action, EmergencyStop)
 
-    def wait(self, timeout_s: float, deadline_s: float) -> None:
-        """Wait until the action is done.
+    def may_ask(self, action: AnyAction) -> bool:
+        """Return whether the application may command this now.
 
-        Args:
-            timeout_s: What the caller gave [s], for the error.
-            deadline_s: Until when, on ``time.monotonic``.
-
-        Raises:
-            NoAnswerError: If it is not done in time.
-            ClosedError: If the drone is closed.
-            AuthorityError: If another application takes over.
-            UnsupportedError: If the vehicle does not support it.
-            RefusedError: If the proxy refuses it in the present state, or something ends it.
+        An emergency stop is repeated until the vehicle shows it, or for 8 s: nothing else of this application is sent
+        meanwhile, or one lost packet would end it while sticks are held. ``Idle`` withdraws one that was never sent. A
+        reset is sent once the stop has shown, if that is soon.
         """
-        if not self._state.notifier.wait_for(self._over, deadline_s - time.monotonic()):
-            raise NoAnswerError(self._not_reached(timeout_s))
-        if self._problem is not None:
-            raise self._problem
-
-    def _over(self) -> bool:
-        """Whether it is done, or waiting longer can't help."""
-        if type(self._action) is Land and self._done():  # whoever landed it
+        if type(self.action) is not EmergencyStop or isinstance(action, EmergencyStop | ResetEmergency):
             return True
-        self._problem = self._why_not()
-        return self._problem is not None or self._done()
-
-    def _done(self) -> bool:
-        """Whether feedback from after it shows that it is done."""
-        newest = self._state.newest
-        if newest is None:
-            return False
-        self._flew = self._flew or newest.state.airborne
-        if not self._is_done(newest):
-            return False
-        outcome = newest.outcome
-        if outcome is None:
-            return self._state.received_ns - self._asked_ns > _STALE_NS
-        if outcome.app_id != self._commands.app_id or outcome.intent < self._intent:
-            return False
-        if outcome.intent == self._intent and type(self._action) is Land and not self._flew:
-            return outcome.over  # it stood already: a take-off may have been on its way
-        return True
-
-    def _why_not(self) -> Exception | None:
-        """Why waiting longer can't help; None if it can. Asks again for what may be possible then."""
-        name = self._action.name
-        if self._commands.why_closed or (self._commands.barred and not self._automatic):
-            return ClosedError(f"this drone was closed while {name} was under way")
-        if cancelled.get()():
-            return GivenUpError()
-        status = self._commands.status
-        if status.state in ("queued", "preempted"):
-            return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
-        told = self._commands.told
-        if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
-            self._note(told.text)  # nothing any more, once a repeat is carried out
-            if not told.over:  # carried out: whoever has the vehicle from now on took it since
-                self._others, self._may_be_sent = None, True
-        outcome = self._commands.outcome(self._intent)
-        if outcome is None or not outcome.failed:
-            return None
-        if outcome.reason is Refusal.UNSUPPORTED:
-            return UnsupportedError(outcome.text)
-        if outcome.fate not in OUTDONE:
-            self._note(outcome.text)
-        if type(self._action) is Takeoff:
-            return self._why_no_takeoff(outcome)
-        if type(self._action) is Land:
-            return self._why_no_landing(outcome)
-        if outcome.fate in OUTDONE:
-            return RefusedError(f"{name} was ended on the way: another command took its place", code="replaced")
-        if outcome.fate in OVERRULED:
-            if not self._commands.may_ask:
-                return None
-            return RefusedError(
-                f"{name} was ended on the way, by a failsafe or a lost link: send the command again", code="not_fresh"
-            )
-        return _refused(outcome)
-
-    def _why_no_takeoff(self, outcome: Outcome) -> Exception | None:
-        if outcome.reason in _NOT_YET or outcome.fate is Fate.TIMED_OUT:
-            now_ns, newest = self._state.scheduler.clock(), self._state.newest
-            if self._refused != self._intent:
-                self._refused, self._refused_ns = self._intent, now_ns
-            # Its withdrawal shows as a landing at first, which would end another take-off.
-            # One that still wakes up is asked again when it is awake: until then it can only refuse.
-            stands = newest is not None and not newest.state.airborne and not newest.waking_up
-            if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
-                self._again()
-            return None
-        if outcome.fate in OUTDONE:
-            return None  # what has begun ends by itself
-        if outcome.fate in OVERRULED:
-            newest = self._state.newest
-            rose = newest is not None and newest.state.airborne and newest.state is not FlightState.LANDING
-            if rose or not self._commands.may_ask:  # what rose by then hovers in the end, and it is done
-                return None
-            text = f"takeoff was ended on the way, as {ENDINGS[outcome.fate]}: take off again"
-            return RefusedError(text, code=Refusal.NOT_FRESH)
-        return _refused(outcome)
-
-    def _why_no_landing(self, outcome: Outcome) -> Exception | None:
-        """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
-        if outcome.fate in OVERRULED:
-            if self._commands.may_ask:
-                # The caller still asks for it, but a pilot who took the vehicle by hand since then keeps it. While the
-                # application's own link is lost, nothing shows that.
-                taken = self._may_be_sent and self._others_now not in (None, self._others)
-                self._again(automatic=taken or outcome.fate not in (Fate.FAILSAFE, Fate.AUTHORITY))
-            return None
-        return None if outcome.fate in OUTDONE else _refused(outcome)
-
-    def _again(self, *, automatic: bool = True) -> None:
-        self._asked_ns = self._state.scheduler.clock()
-        self._intent = self._commands.ask(self._action, automatic=automatic or self._automatic)
+        return isinstance(action, Idle) and self.intent != self._sent_intent
 
     @property
-    def _others_now(self) -> str | None:
-        return None if self._state.newest is None else self._state.newest.others
+    def open_ns(self) -> int:
+        """Time from which a new set-point is sent at once [ns]."""
+        return self._new_sent_ns + self._min_interval_ns
 
-    def _not_reached(self, timeout_s: float) -> str:
-        newest, connection = self._state.newest, self._connection
-        state = "in a state that is not known" if newest is None else newest.state.value
-        text = f"{self._action.name} was not completed within {timeout_s:g} s: the vehicle is {state}"
-        if connection.state.value not in ("up", "degraded"):
-            return f"{text}, and the link is {connection.state.value} ({connection.reason})"
-        if newest is not None and newest.vehicle_link not in (LinkState.UP, LinkState.DEGRADED):
-            return f"{text}, and its own link is {newest.vehicle_link.value} ({newest.link_reason})"
-        if newest is not None and newest.waking_up:
-            return f"{text}; it is {newest.link_reason}"
-        return f"{text}; {self._why}" if self._why and self._why_link is self._vehicle_link else text
+    def next(self, now_ns: int) -> AnyAction | None:
+        """Return what to send now, under the present :attr:`intent`; None if it is too early."""
+        if now_ns < self.due_ns:
+            return None
+        kind, since_ns, is_sent = type(self.action), now_ns - self._asked_ns, self.intent == self._sent_intent
+        longest_ns = _UNSENT_STOP_NS if kind is EmergencyStop and not is_sent else _AT_MOST_NS.get(kind)
+        if (kind is Velocity or kind is Attitude) and self._stall_ns is not None and since_ns >= self._stall_ns:
+            self.action, self.automatic = _HOVER, True
+        elif longest_ns is not None and since_ns > longest_ns:
+            self.action, self.owed = _IDLE, None
+        period_ns, first_ns = self._period_ns, self._first_ns
+        if self.action is not _IDLE and kind is EmergencyStop:
+            period_ns, first_ns = min(period_ns, _STOP_PERIOD_NS), min(first_ns, _STOP_PERIOD_NS)
+        if not is_sent:
+            self._sent_intent, self._new_sent_ns = self.intent, now_ns
+            self.due_ns = now_ns + first_ns
+            return self.action
+        # The next deadline follows from the last one, not from the present time, so that the rate is kept; a deadline
+        # missed by more than a period is skipped.
+        self.due_ns += period_ns
+        if self.due_ns <= now_ns:
+            self.due_ns = now_ns + period_ns
+        return self.action
 
-    def _note(self, why: str) -> None:
-        if self._why != why:
-            self._why, self._why_link = why, self._vehicle_link
+    def not_sent(self, action: AnyAction, now_ns: int) -> None:
+        """Note that there was no room for what :meth:`next` returned: set-points follow anyway, a landing may not."""
+        if isinstance(action, EmergencyStop):
+            if self._new_sent_ns == now_ns:  # its first try: it may still be withdrawn, and is given up soon
+                self._sent_intent = -1
+        elif not _is_periodic(action):
+            self.owed = Unsent(action, self.intent, now_ns, self.automatic)
+
+    def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
+        """Return :attr:`owed` if it is to be sent before ``action``, which neither repeats nor revokes it.
+
+        What the library asks for by itself revokes all but a landing.
+        """
+        owed = self.owed
+        if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > self._keep_ns:
+            return None
+        if self.automatic and type(owed.action) is not Land:
+            return None
+        return owed if _is_periodic(action) else None
+
+    def decayed(self, before: AnyAction) -> bool:
+        """Return whether the set-point ``before`` has decayed to hover because the application made no call."""
+        return self.action is _HOVER and before is not _HOVER
+
+    def observe(self, feedback: Feedback, now_ns: int, app_id: int = 0) -> None:
+        """End what is over: by what the proxy tells of this intent, or because a failsafe overruled a set-point."""
+        kind, outcome = type(self.action), feedback.outcome
+        done_in = _DONE_IN.get(kind)
+        if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent):
+            if outcome.over:
+                self._end(outcome)
+            elif kind is Land and feedback.state is not FlightState.UNKNOWN:
+                self._asked_ns = now_ns  # the proxy goes on with it, however long it takes
+        if done_in is None:
+            if feedback.state is FlightState.EMERGENCY:
+                self.clear(Fate.EMERGENCY)
+        elif (
+            (outcome is None or kind is EmergencyStop)  # a proxy of an earlier version, or anybody's to press
+            and feedback.state in done_in
+            and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
+        ):
+            self.action, reset_ns = _IDLE, self._reset_asked_ns
+            if reset_ns is not None and now_ns - reset_ns <= _AT_MOST_NS[ResetEmergency]:
+                self.ask(ResetEmergency(), now_ns)
+        if feedback.failsafe is not self._failsafe:
+            self._failsafe = feedback.failsafe
+            if feedback.failsafe is not Failsafe.NONE:
+                self.clear(Fate.FAILSAFE)
+
+    def clear(self, fate: Fate) -> None:
+        """Drop the set-point, which ``fate`` ended here. An emergency stop stays."""
+        self._end(Outcome(0, self.intent, fate, Refusal.NOT_FRESH, ENDINGS[fate]))
+        self.owed = None
+
+    def _end(self, outcome: Outcome) -> None:
+        if self.over is None:
+            self.over = outcome
+        if type(self.action) is not EmergencyStop:
+            self.action = _IDLE
+
+    def resume(self, now_ns: int) -> None:
+        """Start to send (again): drop a set-point that is too old."""
+        if now_ns - self._asked_ns > self._keep_ns:
+            self.clear(Fate.LINK)
+        self._failsafe = Failsafe.NONE
+        self.due_ns = now_ns
 
     @property
-    def _vehicle_link(self) -> LinkState | None:
-        return None if self._state.newest is None else self._state.newest.vehicle_link
+    def wants_flight(self) -> bool:
+        """Whether the newest set-point keeps, or brings, the vehicle in the air."""
+        return isinstance(self.action, Takeoff | Hover | Velocity | Attitude | Position | ReturnToStart)
 
 
-def _refused(outcome: Outcome) -> RefusedError:
-    return RefusedError(outcome.text, code=str(outcome.reason))
+def _is_periodic(action: AnyAction) -> bool:
+    return type(action) is Idle or isinstance(action, SET_POINTS)

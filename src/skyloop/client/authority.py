@@ -58,11 +58,7 @@ class Authority:
 
 
 def check_seconds(what: str, seconds: object) -> None:
-    """Check a time to wait.
-
-    Raises:
-        UsageError: If it is no finite number, or negative.
-    """
+    """Check a time to wait [s]: raise :class:`UsageError` if it is no finite number, or negative."""
     if not (isinstance(seconds, int | float) and 0.0 <= seconds < math.inf):
         raise UsageError(f"{what} is {seconds!r} and must be a number of seconds")
 
@@ -115,12 +111,7 @@ class EndedSessions:
 
 
 class AuthorityTracker:
-    """Follows the authority of one application. Methods that return a bool return whether the status changed.
-
-    Args:
-        name: Of the application.
-        ended: Sessions of the same process that have ended; None: only those of this tracker.
-    """
+    """Follows the authority of one application. Methods that return a bool return whether the status changed."""
 
     #: Feedback that names no owner may be older than the grant for this long.
     SETTLE_NS = nanoseconds(0.5)
@@ -147,6 +138,11 @@ class AuthorityTracker:
         return self.status.state == "held"
 
     @property
+    def awaited(self) -> bool:
+        """Whether it is asked for, and nothing shows yet that another application has it."""
+        return self.wanted and (self.status.state == "none" or not self.settled)
+
+    @property
     def answered(self) -> bool:
         """Whether what was asked for is held, waited for, or not wanted any more. A lost link is no answer."""
         return not self.pending and (self.status.state != "none" or not self.wanted)
@@ -162,12 +158,7 @@ class AuthorityTracker:
         return self.status.state != "queued" or (self._owner_id != 0 and not self.behind_itself)
 
     def connected(self, app_id: int, run_id: int = 0) -> None:
-        """Reset on a new connection, on which older leases mean nothing.
-
-        Args:
-            app_id: Number of this application there.
-            run_id: Number of the proxy's run; in another one the numbers of applications mean nothing.
-        """
+        """Reset on a new connection, on which older leases mean nothing, and on another run numbers of applications."""
         if run_id != self._run_id:
             self._owner_id = 0
         self.app_id, self._run_id = app_id, run_id
@@ -189,12 +180,9 @@ class AuthorityTracker:
         self.status = replace(self.status, priority=request.priority)
 
     def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
-        """Note a grant, known from a reply, an event or feedback.
+        """Note a grant, known from a reply, an event or feedback; one that was lost since is ignored.
 
-        Args:
-            lease: Number of the lease; an old one that was lost since is ignored.
-            now_ns: On this process's clock.
-            until_ns: When its time is over, on the proxy's clock; None: not limited, or known from before.
+        ``until_ns``: when its time is over, on the proxy's clock; None: not limited, or known from before.
         """
         self.pending = False
         if lease <= self._lease and not self.held:
@@ -205,13 +193,7 @@ class AuthorityTracker:
         return self._set(AuthorityStatus("held", lease, self.status.priority, self._name, until_ns=until_ns))
 
     def queued(self, position: int, holder: str, expected_wait_s: float | None = None) -> bool:
-        """Note the position in the queue.
-
-        Args:
-            position: From 1, the next.
-            holder: Name of the application that holds the authority.
-            expected_wait_s: As in :class:`AuthorityStatus`.
-        """
+        """Note the position in the queue; see :class:`AuthorityStatus`."""
         self.pending = False
         state: AuthorityState = "preempted" if self.status.state == "preempted" else "queued"
         return self._set(AuthorityStatus(state, 0, self.status.priority, holder, position, expected_wait_s))
@@ -309,12 +291,7 @@ class TakeoverQuery:
 
 
 def authority_request(priority: int, for_s: float | None = None, takeover: TakeoverWay = "now") -> RequestAuthority:
-    """Return the request for the authority.
-
-    Args:
-        priority: 0 (highest) to 31 (lowest).
-        for_s: How long it is wanted [s], at most a day; None: open.
-        takeover: ``"now"`` or ``"ask"``.
+    """Return the request for the authority, with the meaning that it has in :class:`Authority`.
 
     Raises:
         UsageError: If an argument is out of range.
@@ -335,13 +312,8 @@ def answering(
 ) -> Callable[[Event], None]:
     """Return a callback for events that calls ``function`` when this application is asked to hand the authority over.
 
-    Args:
-        function: Decides; see :data:`TakeoverAnswer`.
-        app_id: Returns the number of this application.
-        answer: Sends the decision: lease, number of the application that asks, whether it is granted, the reason.
-
-    Raises:
-        UsageError: If ``function`` can't be called.
+    ``answer`` is given the lease, the number of the application that asks, whether it is granted, and the reason.
+    Raises :class:`UsageError` if ``function`` can't be called.
     """
     if not callable(function):
         raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")

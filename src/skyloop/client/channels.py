@@ -44,9 +44,7 @@ class Channel(Generic[T]):
     def __init__(self, subscribe: Callable[[bool], None] | None = None) -> None:
         """Make a channel without consumers.
 
-        Args:
-            subscribe: Called with True when the first consumer comes or the channel is kept, and with False when the
-                last consumer goes, under the channel's lock.
+        ``subscribe`` is told whether samples are wanted, whenever that changes, under the channel's lock.
         """
         self.subscribed = False  #: whether samples are wanted now: there is a consumer, or it is kept
         self.kept = False  #: subscribed for good, by :meth:`keep`
@@ -57,12 +55,7 @@ class Channel(Generic[T]):
         self._subscribe = subscribe
 
     def add(self, consumer: Callable[[T], None], dropped: Callable[[], int]) -> None:
-        """Deliver to ``consumer`` too, on the publishing thread.
-
-        Args:
-            consumer: Called with each sample; must be quick.
-            dropped: Returns how many samples it has missed.
-        """
+        """Deliver to ``consumer`` too, quickly, on the publishing thread; ``dropped`` returns how many it missed."""
         with self._lock:
             self._drops[consumer] = dropped
             self._consumers = (*self._consumers, consumer)
@@ -127,12 +120,7 @@ class FollowingChannel(Channel[T], Generic[T, C]):
     """
 
     def __init__(self, find: Callable[[], C], changes: Channel[Any]) -> None:
-        """Begin with the present channel.
-
-        Args:
-            find: Returns the channel; it may raise what keeps the one before.
-            changes: Published to when there may be another channel.
-        """
+        """Begin with what ``find`` returns, and find again with each sample of ``changes``, unless it raises."""
         super().__init__()
         self.current = find()
         self._find = find
@@ -298,13 +286,7 @@ class Mailbox(Generic[T]):
     __slots__ = ("_items", "_lock", "_offered", "closed", "delivered", "depth", "notifier")
 
     def __init__(self, depth: int = 1, notifier: Notifier | None = None) -> None:
-        """Make an empty mailbox.
-
-        Args:
-            depth: How many items are kept.
-            notifier: Notified with each item; one that is shared lets a thread wait for several mailboxes. None: an own
-                one.
-        """
+        """Make an empty mailbox; a ``notifier`` that is shared lets a thread wait for several."""
         self.depth = depth
         self.notifier = notifier or Notifier()
         self.closed = False
@@ -345,14 +327,7 @@ class Mailbox(Generic[T]):
             return self._items[0] if self._items else None
 
     def wait(self, timeout_s: float | None = None) -> T | None:
-        """Take an item like :meth:`take`, but wait for one.
-
-        Args:
-            timeout_s: How long to wait [s]; None: for ever.
-
-        Returns:
-            The item; None if none came in time or the mailbox was closed.
-        """
+        """Take an item like :meth:`take`, but wait for one, for ever with None. None: none came, or it was closed."""
         self.notifier.wait_for(lambda: bool(self._items) or self.closed, timeout_s)
         return None if self.closed else self.take()
 
@@ -388,14 +363,9 @@ class Notifier:
             lock.release()
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until ``ready()`` is true.
+        """Wait until ``ready()`` is true, for ever with None; return whether it became true in time.
 
-        Args:
-            ready: Checked on this thread, at first and after each notification.
-            timeout_s: How long to wait [s]; None: for ever.
-
-        Returns:
-            Whether it became true in time.
+        It is checked on this thread, at first and after each notification.
         """
         if ready():
             return True
@@ -421,22 +391,14 @@ class Notifier:
 
 
 def checked_name(processor: str) -> str:
-    """Return ``processor`` if it can be the name of a processor.
-
-    Raises:
-        UsageError: If it can't.
-    """
+    """Return ``processor`` if it can be the name of a processor, else raise :class:`UsageError`."""
     if not isinstance(processor, str) or not re.fullmatch(PROCESSOR_NAME, processor):
         raise UsageError(f"the name of a processor has 1 to 64 letters, digits and any of _ . -, not {processor!r:.80}")
     return processor
 
 
 def checked_age(max_age_s: float | None) -> float | None:
-    """Return ``max_age_s`` if it can be a limit of age [s].
-
-    Raises:
-        UsageError: If it is no number, NaN or negative.
-    """
+    """Return ``max_age_s`` if it can be a limit of age [s], or None, else raise :class:`UsageError`."""
     if max_age_s is not None and (not isinstance(max_age_s, int | float) or math.isnan(max_age_s) or max_age_s < 0):
         raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds")
     return max_age_s

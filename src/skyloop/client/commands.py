@@ -7,9 +7,9 @@ from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Final
 
+from skyloop.client.actions import CommandSchedule
 from skyloop.client.authority import AuthorityStatus, AuthorityTracker
 from skyloop.client.channels import Emit
-from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.monitoring import ChannelCounter
 from skyloop.errors import (
@@ -96,18 +96,11 @@ class CommandSender:
     ) -> None:
         """Prepare to send; nothing is sent before :meth:`connected`.
 
-        Args:
-            role: Pilot or observer.
-            authority: State of the authority.
-            schedule: Decides which command is sent when.
-            connection: Sends packets and requests.
-            scheduler: Source of the time and of waiting.
-            emit: Gets the events that are made here.
-            changed: Called when the status of the authority has changed, on the thread that found out: the receiving
-                one, the supervisor's, or an application's.
-            granted: Called with the number of each new lease, on the same threads.
+        ``emit`` gets the events that are made here. ``changed`` is called when the status of the authority has changed,
+        and ``granted`` with the number of each new lease, on the thread that found out: the receiving one, the
+        supervisor's, or an application's.
         """
-        self._role = role
+        self.role = role
         self._authority = authority
         self._schedule = schedule
         self._connection = connection
@@ -121,7 +114,6 @@ class CommandSender:
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
         self.barred = False  #: the end of the flight has begun: only the library's own commands and a stop pass
-        self.why_closed = ""  #: why nothing can be commanded any more; empty while something can
         self._impossible: dict[type, str] = {}  # why, of what neither vehicle nor proxy can do
         self.told: Outcome | None = None  #: the newest that the proxy told of this application's intents
         self._first_set_point = 0  # number of the first in the present row of set-points; 0: the newest is none
@@ -148,6 +140,10 @@ class CommandSender:
         """Time on this process's clock from which a new set-point is sent at once [ns]."""
         return self._schedule.open_ns
 
+    def latest(self, *kinds: type[AnyAction]) -> int:
+        """Return the number of the newest intent of these kinds; 0 if there was none."""
+        return max(self._schedule.latest.get(kind, 0) for kind in kinds)
+
     @property
     def newest(self) -> AnyAction:
         """What is repeated now; idle where nothing is."""
@@ -162,11 +158,6 @@ class CommandSender:
         """Let no more commands of the application pass but an emergency stop: when this returns, none is on its way."""
         with self._lock:
             self.barred = True
-
-    def close(self, why: str) -> None:
-        """Command nothing any more, and wake who waits for the authority: nobody gets it."""
-        self.why_closed = why
-        self.notifier.notify()
 
     @property
     def stopping(self) -> bool:
@@ -186,11 +177,9 @@ class CommandSender:
     def present_until(self, until_ns: int) -> None:
         """Extend the time until which the person who flies is known to be present; never shortens it.
 
-        After that time nothing is repeated and no authority is requested, so that the proxy takes the pilot for silent;
-        only an emergency stop is still sent. The sending thread checks this itself, however busy other threads are.
-
-        Args:
-            until_ns: On this process's clock.
+        After that time nothing is repeated, nothing new is flown and no authority is requested, so that the proxy takes
+        the pilot for silent; what ends a flight is still sent, once, and an emergency stop as ever. The sending thread
+        checks this itself, however busy other threads are.
         """
         with self._lock:
             known_ns = self._present_until_ns
@@ -219,30 +208,12 @@ class CommandSender:
                 the end of the flight has begun, too.
 
         Raises:
-            ClosedError: After :meth:`close`, and from :meth:`bar` on.
+            ClosedError: Once the drone is closed, and from :meth:`bar` on.
             UnsupportedError: If neither the vehicle nor its proxy can do it.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
                 with ``now`` also while the authority is still awaited.
             RefusedError: If an emergency stop keeps back what is to be done once, or what is to be sent ``now``.
             LinkError: With ``now`` while the link is down.
-        """
-        if self.why_closed or type(action) in self._impossible:
-            self._check(action)
-        return self.send(action, now=now, automatic=automatic)
-
-    def ask(self, action: AnyAction, *, automatic: bool = False) -> int:
-        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
-
-        :meth:`outcome` tells what became of it.
-        """
-        self._check(action)
-        return self._put(action, automatic=automatic)[0]
-
-    def send(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
-        """Make ``action`` the newest set-point as :meth:`command` does, whatever the vehicle can do.
-
-        Returns:
-            Whether it was sent; False also while set-points are refused.
         """
         intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
@@ -252,16 +223,27 @@ class CommandSender:
         self._first_set_point = self._first_set_point or intent
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
 
-    def _put(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> tuple[int, bool]:
-        """Make ``action`` the newest set-point, and send it if it can be.
+    def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
+        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
 
-        Returns:
-            The number of the intent; and False if it can't be sent now, because the link is down or the authority is
-            still awaited, or because an emergency stop of this application has not shown yet.
-
-        Raises:
-            GivenUpError: If the caller waits no longer; see :data:`cancelled`.
+        :meth:`outcome` tells what became of it. ``again`` is the intent that it repeats under a new number; if
+        something else was asked for since, nothing is sent and the number stays.
         """
+        return self._put(action, automatic=automatic, again=again)[0]
+
+    def _put(
+        self, action: AnyAction, *, now: bool = False, automatic: bool = False, again: int | None = None
+    ) -> tuple[int, bool]:
+        """Make ``action`` the newest set-point, and send it if it can be; return the intent and whether it was sent.
+
+        It can't be while the link is down, the authority is awaited, an emergency stop has not shown, or nobody is
+        there. Raises :class:`GivenUpError` if the caller waits no longer; see :data:`cancelled`.
+        """
+        connection, schedule, authority = self._connection, self._schedule, self._authority
+        if connection.why_closed:
+            raise ClosedError(connection.why_closed)
+        if why := self._impossible.get(type(action)):
+            raise UnsupportedError(f"{action.name} is not possible: {why}")
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
@@ -270,33 +252,31 @@ class CommandSender:
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
             if wanted and isinstance(action, _FLYING) and cancelled.get()():
                 raise GivenUpError  # before it was sent: what was asked for since then stays
-            if automatic and type(action) is not Land and type(self._schedule.action) in LANDING:
-                return self._schedule.intent, False
-            authority = self._authority
-            may_send, connected = authority.held or stop, self._connection.connected
-            if (
-                not may_send
-                and connected
-                and not (authority.wanted and (authority.status.state == "none" or not authority.settled))
-            ):
+            if again is not None and again != schedule.intent:
+                return again, False
+            if automatic and type(action) is not Land and type(schedule.action) in LANDING:
+                return schedule.intent, False
+            may_send, connected = authority.status.state == "held" or stop, connection.connected
+            if not may_send and connected and not authority.awaited:
                 raise self._not_ours(action)
-            if stop and self._role is Role.OBSERVER:
+            if stop and self.role is Role.OBSERVER:
                 raise self._not_ours(action)
-            if not self._schedule.may_ask(action):
+            if not schedule.may_ask(action):
                 if now or not isinstance(action, _STREAMED):
                     text = f"{action.name} was not sent: the emergency stop of this application has not shown yet"
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
-                return self._schedule.intent, False
-            intent = self._schedule.ask(action, now_ns, automatic=automatic)
-            if not may_send or not connected:
+                return schedule.intent, False
+            intent = schedule.ask(action, now_ns, automatic=automatic)
+            absent = self._present_until_ns is not None and now_ns > self._present_until_ns
+            if not may_send or not connected or (absent and isinstance(action, _FLYING)):
                 if now:
                     if type(action) is not Land:  # what was refused now must not be carried out later
-                        self._schedule.clear(Fate.WITHDRAWN)
+                        schedule.clear(Fate.WITHDRAWN)
                     raise self._not_now(action)
                 return intent, False
-            if self._schedule.due_ns <= now_ns:
+            if schedule.due_ns <= now_ns:
                 return intent, self._send_next(now_ns)
-        self._connection.poke()  # the last one was sent just before: the supervisor's thread sends this one
+        connection.poke()  # the last one was sent just before: the supervisor's thread sends this one
         return intent, True
 
     def outcome(self, intent: int) -> Outcome | None:
@@ -317,19 +297,14 @@ class CommandSender:
             self._schedule.clear(Fate.WITHDRAWN)
 
     def request(self, request: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
-        """Request the authority and wait for it; see :meth:`skyloop.client.drone.Drone.request_authority`.
-
-        Args:
-            request: The request.
-            wait_s: How long to wait in the queue [s].
-            stay: Stay in the queue after ``wait_s`` instead of raising.
+        """Request the authority and wait for it; see :meth:`skyloop.Drone.request_authority`.
 
         Raises:
             AuthorityError: If it is not held after ``wait_s``, if it is refused, or if this application only observes.
             NoAnswerError: If the proxy does not answer the request, or the link is lost and not back in time.
             ClosedError: If the drone is closed meanwhile.
         """
-        if self._role is Role.OBSERVER:
+        if self.role is Role.OBSERVER:
             raise AuthorityError("this application observes", code="observer").with_hint(Hint.FLY)
         authority = self._authority
         with self._lock:
@@ -341,7 +316,7 @@ class CommandSender:
         if answered:
             self._wait(lambda: authority.held or not authority.wanted, max(0.0, wait_s))
             self._wait(lambda: authority.settled, OWN_S)
-        if self.why_closed:
+        if self._connection.why_closed:
             raise ClosedError("this drone was closed while it asked for the authority")
         if not answered:
             self.release(wait=False)
@@ -357,21 +332,13 @@ class CommandSender:
         raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy").with_hint(Hint.OBSERVE)
 
     def _wait(self, ready: Callable[[], bool], timeout_s: float) -> bool:
-        return self.notifier.wait_for(lambda: self.why_closed != "" or ready(), timeout_s)
+        return self.notifier.wait_for(lambda: self._connection.why_closed != "" or ready(), timeout_s)
 
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer an application that asks for the authority; an answer that is too late changes nothing.
 
-        Args:
-            lease: The lease that is asked for.
-            app_id: Number of the application that asks.
-            grant: Whether to hand it over.
-            reason: Why not, for people; cut to the length that a message can hold.
-            wait: Wait until the proxy has it.
-
-        Raises:
-            RefusedError: With ``wait``, if the authority is not held any more.
-            LinkError: With ``wait``, if the proxy does not answer.
+        With ``wait`` the proxy has it when this returns, or it raises :class:`RefusedError`, if the authority is not
+        held any more, or :class:`LinkError`.
         """
         answer = AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON])
         if not wait:
@@ -382,11 +349,7 @@ class CommandSender:
     def release(self, *, wait: bool = True) -> None:
         """Release the authority, or leave the queue. Does nothing if it is neither held nor wanted.
 
-        Args:
-            wait: Wait for the proxy's answer.
-
-        Raises:
-            NoAnswerError: If the proxy does not answer.
+        With ``wait`` it raises :class:`NoAnswerError` if the proxy does not answer.
         """
         with self._lock:
             known = self._authority.wanted or self.status.state != "none"
@@ -403,13 +366,7 @@ class CommandSender:
     # For the connection ----------------------------------------------------------------------------------------
 
     def connected(self, app_id: int, run_id: int = 0, capabilities: Capabilities | None = None) -> None:
-        """Reset on a new connection: :meth:`tick` requests the authority again if it is wanted.
-
-        Args:
-            app_id: Number of this application there.
-            run_id: Number of the proxy's run.
-            capabilities: Of the vehicle; None: not known.
-        """
+        """Reset on a new connection: :meth:`tick` requests the authority again if it is wanted."""
         self._impossible = {} if capabilities is None else impossible(capabilities)
         with self._lock:
             self._authority.connected(app_id, run_id)
@@ -444,29 +401,23 @@ class CommandSender:
             self._moved(before, now_ns)
 
     def tick(self, now_ns: int) -> int:
-        """Send what is due.
-
-        Args:
-            now_ns: On this process's clock.
-
-        Returns:
-            When to call again at the latest [ns].
-        """
-        last_request, stalled, due_ns = None, False, now_ns + _LATER_NS
-        unshown = False
+        """Send what is due; return when to call again at the latest, on this process's clock [ns]."""
+        last_request, stalled, unshown, due_ns = None, False, False, now_ns + _LATER_NS
         with self._lock:
-            authority, present = self._authority, self.is_present(now_ns)
+            authority, schedule, present = self._authority, self._schedule, self.is_present(now_ns)
             asks = self._ask_now or (authority.status.state == "none" and not authority.pending)
             if authority.wanted and present and asks:
                 self._ask_now = False
                 last_request = authority.last_request
                 authority.asked(last_request)
-            stopping = self._schedule.stopping
+            stopping = schedule.stopping
             if (authority.held and present) or stopping:
-                if self._schedule.due_ns <= now_ns:
-                    stalled = self._decay(now_ns)
-                    unshown = stopping and not self._schedule.stopping
-                due_ns = self._schedule.due_ns
+                if schedule.due_ns <= now_ns:
+                    before = schedule.action
+                    self._send_next(now_ns)
+                    stalled = schedule.decayed(before)
+                    unshown = stopping and not schedule.stopping
+                due_ns = schedule.due_ns
         if last_request is not None:
             self._connection.ask(last_request, self._answered, ANSWER_S)
         if stalled:
@@ -478,12 +429,6 @@ class CommandSender:
         return due_ns
 
     # Inside ----------------------------------------------------------------------------------------------------
-
-    def _decay(self, now_ns: int) -> bool:
-        """Send what is due; return whether that was a set-point's decay to hover."""
-        before = self._schedule.action
-        self._send_next(now_ns)
-        return self._schedule.decayed(before)
 
     def _send_next(self, now_ns: int) -> bool:
         schedule = self._schedule
@@ -547,16 +492,9 @@ class CommandSender:
         self.notifier.notify()
         self._changed()
 
-    def _check(self, action: AnyAction) -> None:
-        """Raise if nothing can be commanded any more, or not this."""
-        if self.why_closed:
-            raise ClosedError(self.why_closed)
-        if why := self._impossible.get(type(action)):
-            raise UnsupportedError(f"{action.name} is not possible: {why}")
-
     def _not_ours(self, action: AnyAction) -> AuthorityError:
         status = self.status
-        if self._role is Role.OBSERVER:
+        if self.role is Role.OBSERVER:
             return AuthorityError(f"{action.name}: this application observes", code="observer").with_hint(Hint.FLY)
         if status.state == "preempted":
             return AuthorityError(
@@ -575,6 +513,8 @@ class CommandSender:
     def _not_now(self, action: AnyAction) -> LinkError | AuthorityError:
         later = "; it is sent if that changes within half a second" if type(action) is Land else ""
         not_sent = f"{action.name} was not sent"
+        if self._authority.held and self._connection.connected:
+            return AuthorityError(f"{not_sent}: whoever flies is not known to be there", code="no_authority")
         if self._connection.connected:
             text = f"{not_sent}: the proxy has not confirmed the authority yet{later}"
             return AuthorityError(text, code="no_authority")

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from functools import partial, wraps
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Final, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar
+from typing import Any, Final, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar, Unpack
 
 from skyloop.address import shown_address
 from skyloop.child_process import GRACE_S, ChildProcess
 from skyloop.client.authority import Authority, check_seconds
 from skyloop.client.connection import Scheduler
-from skyloop.client.core import Access, DroneCore, OnExit
-from skyloop.client.drone import Drone
+from skyloop.client.drone import Access, Drone, DroneOptions
+from skyloop.client.piloting import OnExit
 from skyloop.errors import Hint, LinkError, MissingExtraError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.files import wait_readable
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
@@ -155,31 +155,20 @@ def connect(
     """
     if not isinstance(authority, Authority | None):
         raise UsageError(f"authority is {authority!r:.80} and must be a skyloop.Authority, as Authority(priority=4)")
-    core, deadline = prepare(
-        target,
-        access=access,
-        name=name,
-        timeout_s=timeout_s,
-        rate_hz=rate_hz,
-        stall_s=stall_s,
-        on_exit=on_exit,
-        network=network,
+    drone, deadline = prepare(
+        target, name, timeout_s, network, access=access, rate_hz=rate_hz, stall_s=stall_s, on_exit=on_exit
     )
-    core.open(timeout_s=deadline - time.monotonic(), authority=authority)
-    return Drone(core)
+    drone._connect(timeout_s=deadline - time.monotonic(), authority=authority)
+    return drone
 
 
 def prepare(
     target: str,
-    *,
-    access: Access = "pilot",
     name: str | None = None,
     timeout_s: float | None = None,
-    rate_hz: float = 32.0,
-    stall_s: float = 1.0,
-    on_exit: OnExit = "land",
     network: NetworkChoice = None,
-) -> tuple[DroneCore, float]:
+    **options: Unpack[DroneOptions],
+) -> tuple[Drone, float]:
     """Return a drone that is not connected yet, and until when that may take, on ``time.monotonic``.
 
     A private proxy is started. Arguments and errors are those of :func:`connect`.
@@ -190,30 +179,17 @@ def prepare(
         check_seconds("timeout_s", timeout_s)
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
-    if "://" in target:
-        connector = _connector(target)
-        dial, end, reach, scheduler = connector.dialer(deadline), connector.close, connector.reach, connector.scheduler
-    else:
+    if "://" not in target:
         # Another process can use the name alone only if it finds the proxy without network settings.
-        others_find_it = network is None or network is False
-        dial, end, reach, scheduler = dial_by_name(target, network), None, target if others_find_it else None, None
+        options["reach"] = target if network is None or network is False else None
+        return Drone(dial_by_name(target, network), app=app, **options), deadline
+    way = _connector(target)
     try:
-        core = DroneCore(
-            dial,
-            app=app,
-            access=access,
-            rate_hz=rate_hz,
-            stall_s=stall_s,
-            on_exit=on_exit,
-            scheduler=scheduler,
-            on_close=end,
-            reach=reach,
-        )
+        options |= {"scheduler": way.scheduler, "on_close": way.close, "reach": way.reach}
+        return Drone(way.dialer(deadline), app=app, **options), deadline
     except BaseException:
-        if end is not None:
-            end()
+        way.close()
         raise
-    return core, deadline
 
 
 def _connector(uri: str) -> Connector:
@@ -242,11 +218,7 @@ class Connector(Protocol):
         """What another process connects to for the same vehicle; None if it can't."""
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer that at first waits until the proxy serves.
-
-        Args:
-            deadline_s: Until when it waits at most, on ``time.monotonic``.
-        """
+        """Return a dialer that at first waits until the proxy serves, until ``deadline_s`` on ``time.monotonic``."""
 
     def close(self) -> None:
         """End whatever was started. Idempotent."""
@@ -260,12 +232,7 @@ class PrivateProxy:
     """
 
     def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
-        """Start the child.
-
-        Args:
-            uri: Address of the vehicle.
-            command: Command line before the address.
-        """
+        """Start the child; ``command`` is its command line before the address."""
         scheme = re.sub(r"[^a-z0-9]", "", uri.partition("://")[0].lower()) or "vehicle"
         self.name = f"{scheme[:16]}-{os.getpid()}-{next(_numbers)}"
         self.reach = self.name
@@ -276,13 +243,10 @@ class PrivateProxy:
         self.pid = self._process.pid  #: process id of the child
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer that at first waits until the proxy serves.
+        """Return a dialer that at first waits until the proxy serves, until ``deadline_s`` on ``time.monotonic``.
 
         It raises :class:`NoAnswerError` if that takes too long, :class:`UsageError` if the address makes no sense, and
         :class:`LinkError` if the child has ended, with the end of what it wrote to standard error.
-
-        Args:
-            deadline_s: Until when it waits at most, on ``time.monotonic``.
         """
         inner = _local(self.name)
 
@@ -333,11 +297,7 @@ class PrivateProxy:
 
 
 def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> NetworkSettings | None:
-    """Return how to search the network; None if it is not to be searched.
-
-    Args:
-        network: As for :func:`connect`.
-        keys: Folder of an identity, for the command line; None: from ``network``.
+    """Return how to search the network; None if it is not to be searched. ``keys`` are the command line's.
 
     Raises:
         UsageError: If an address or the folder is not valid.
@@ -363,14 +323,8 @@ def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
     """Return the dialer of the proxy with this name.
 
     Each time it prefers a proxy on this host, where Linux' local transport is available. It raises
-    :class:`UnknownNameError`, which says where it searched, and :class:`LinkError`.
-
-    Args:
-        name: Name of the proxy.
-        network: As for :func:`connect`.
-
-    Raises:
-        UsageError: If ``name`` can't be a name.
+    :class:`UnknownNameError`, which says where it searched, and :class:`LinkError`. Raises :class:`UsageError` if
+    ``name`` can't be a name.
     """
     check_name(name)
     settings = network_settings(network)
@@ -414,11 +368,7 @@ def _hinting(near: Dialer) -> Dialer:
 
 
 def running_names(network: NetworkChoice = None) -> list[str]:
-    """Return the names of running proxies, sorted: on this host, and on the network if it is asked for.
-
-    Args:
-        network: As for :func:`connect`.
-    """
+    """Return the names of running proxies, sorted: on this host, and on the network if it is asked for."""
     from skyloop.transport.local import list_names
 
     near = {proxy.name for proxy in list_names()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from skyloop.client.channels import Notifier
 from skyloop.client.monitoring import Thresholds
 from skyloop.client.session import ConnectionHandler, ProxySession
 from skyloop.clock import Clock, nanoseconds
-from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError
+from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError, UsageError
 from skyloop.messages import (
     AnyReply,
     AnyRequest,
@@ -61,6 +62,7 @@ class ProxyConnection:
         self.transmit: Callable[[bytes], bool] = _nowhere
         self.state = LinkState.CONNECTING
         self.reason = ""
+        self.why_closed = ""  #: why nothing can be asked for any more; empty while something can
         self.poked = False  #: the supervisor is to attend to it now
         self.closing = False
         self.woken = Notifier()  #: wakes the supervisor
@@ -117,26 +119,28 @@ class ProxyConnection:
         session = self._session
         return 0 if session is None else session.uncertainty_ns
 
+    def check_open(self) -> None:
+        """Raise :class:`ClosedError` once the drone was closed, or belongs to the parent process."""
+        if self.why_closed:
+            raise ClosedError(self.why_closed)
+
+    def check_may_wait(self) -> None:
+        """Raise :class:`UsageError` on the receiving thread."""
+        if self.receiving:
+            raise UsageError("an inline listener can't wait for what it would itself have to receive")
+
     def poke(self) -> None:
         """Wake the supervisor, so that it attends to the connection now."""
         self.poked = True
         self.woken.notify()
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:
-        """Receive on the calling thread, where there is a session whose transport can.
-
-        See :meth:`skyloop.transport.base.TransportClient.lead`.
-        """
+        """Receive on the calling thread; see :meth:`skyloop.transport.base.TransportClient.lead`."""
         session = self._session
         return session is not None and session.lead(ready, wake, timeout_s)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
-        """Subscribe to a topic or unsubscribe, in this session and all that follow.
-
-        Args:
-            topic: Name of the topic.
-            on: False unsubscribes.
-        """
+        """Subscribe to a topic or unsubscribe, in this session and all that follow."""
         with self._lock:
             if on == (topic in self._topics):
                 return
@@ -157,10 +161,7 @@ class ProxyConnection:
     def ask(self, body: AnyRequest, done: Callable[[AnyReply | LinkError], None], timeout_s: float = 2.0) -> None:
         """Send a request without waiting.
 
-        Args:
-            body: The request.
-            done: Called once with the answer or an error, on another thread or this one; must be quick.
-            timeout_s: After which ``done`` gets a :class:`NoAnswerError` [s].
+        ``done`` is called once with the answer, or an error after ``timeout_s``, on any thread; it must be quick.
         """
         session = self._session
         if session is None:
@@ -213,6 +214,9 @@ class ProxyConnection:
 
     def forked(self) -> None:
         """Send nothing, wait for nothing: the session belongs to the parent process."""
+        self.why_closed = (
+            f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect here as well"
+        )
         self.closing = True
         self._session, self.transmit = None, _nowhere
         self.state, self.reason = LinkState.CLOSED, "the connection belongs to the parent process"
@@ -260,14 +264,7 @@ class ConnectionSupervisor:
     ) -> None:
         """Prepare to connect; :meth:`start` does it.
 
-        Args:
-            connection: Gets each session.
-            handler: Gets what arrives.
-            dial: Makes a connection.
-            hello: First request on each connection.
-            policy: When to reconnect and when a link counts as lost.
-            clock: This process's clock.
-            begin: Sees to it that :meth:`attend` is called from the first session on; None: a thread does.
+        ``begin`` sees to it that :meth:`attend` is called from the first session on; None: a thread does.
         """
         self.connection = connection
         self._handler = handler
@@ -280,10 +277,7 @@ class ConnectionSupervisor:
         self._thread = threading.Thread(target=self._run, name="skyloop-link", daemon=True)
 
     def start(self, timeout_s: float = 5.0) -> None:
-        """Connect for the first time, and keep connected from then on.
-
-        Args:
-            timeout_s: For how long to try again if the proxy does not answer Hello [s].
+        """Connect for the first time, within ``timeout_s``, and keep connected from then on.
 
         Raises:
             NoAnswerError: If the proxy does not answer Hello.
@@ -320,11 +314,7 @@ class ConnectionSupervisor:
         self._thread.start()
 
     def attend(self) -> float:
-        """Do what is due now.
-
-        Returns:
-            For how long there is nothing to do [s], unless the connection is poked.
-        """
+        """Do what is due now; return for how long there is nothing to do [s], unless the connection is poked."""
         self.connection.poked = False
         try:
             return self._step()
@@ -417,7 +407,7 @@ class ConnectionSupervisor:
         if session is None:
             return
         session.close(error)
-        self._handler.disconnected(reason)
+        self._handler.disconnected()
         if not self.connection.closing:
             self._set_state(LinkState.LOST, reason)
 

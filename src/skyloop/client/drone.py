@@ -7,15 +7,16 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, ParamSpec, Self, TypeVar, Unpack
+from typing import Any, Final, Literal, ParamSpec, Self, TypedDict, TypeVar, Unpack
 
 import msgspec
 import numpy as np
 
 from skyloop.client.actions import (
+    CommandSchedule,
     ReturnWatch,
     above_zero,
     checked,
@@ -28,20 +29,25 @@ from skyloop.client.actions import (
 from skyloop.client.authority import (
     Authority,
     AuthorityStatus,
+    AuthorityTracker,
+    EndedSessions,
     TakeoverAnswer,
     TakeoverRequest,
     TakeoverWay,
     answering,
     authority_request,
 )
-from skyloop.client.channels import Channel, Listener, Mailbox, checked_age
-from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
+from skyloop.client.channels import JOIN_S, Channel, Listener, Mailbox, checked_age
+from skyloop.client.commands import CommandSender
+from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.monitoring import ChannelStats, Distribution
+from skyloop.client.parameters import Config, Restorer
+from skyloop.client.piloting import OnExit, Piloting
 from skyloop.client.preflight import PreflightFinding, inspect
-from skyloop.client.publishing import checked_time
+from skyloop.client.publishing import Logbook, checked_time
 from skyloop.client.results import Result, ResultListener, ResultMailbox, is_old, silence
-from skyloop.client.telemetry import LinkStatus, Wanted, as_predicate
+from skyloop.client.telemetry import ClientState, LinkStatus, Receiver, Wanted, as_predicate
 from skyloop.client.video import StreamChannel, VideoOptions
 from skyloop.errors import (
     AuthorityError,
@@ -63,7 +69,9 @@ from skyloop.messages import (
     EventKind,
     Feedback,
     FeedbackRequest,
+    FlightState,
     GetStatistics,
+    Hello,
     Hover,
     Idle,
     Land,
@@ -84,15 +92,33 @@ from skyloop.messages.command import check_pose
 from skyloop.messages.frame import Chain
 from skyloop.messages.relayed import Shape
 from skyloop.messages.subscription import PLAIN
-from skyloop.transport.base import Dialer
+from skyloop.transport.base import EVENTS, Dialer
 
+Access = Literal["pilot", "observe"]
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
+UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
+DOWN: Final = frozenset({FlightState.LANDED})
 EVENT_DEPTH: Final = 256  #: how many events, log entries and the like wait for a slow callback
 WHOLE_S: Final = 1.0  #: for every field of feedback to come, where less had been asked for
 _LOOK_S: Final = 0.5  #: how often who waits for a frame looks whether its camera is still there
+_SOON_S: Final = 1.0  #: a vehicle that still wakes up then is waited for audibly
+_ENDED: Final = EndedSessions()  #: of all drones of this process
 _log = logging.getLogger("skyloop")
+
+
+class DroneOptions(TypedDict, total=False):
+    """Options of a :class:`Drone`."""
+
+    access: Access  #: ``"pilot"`` may command, ``"observe"`` only reads
+    rate_hz: float  #: rate at which commands are repeated, 1 to 200 Hz
+    stall_s: float  #: time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never
+    on_exit: OnExit  #: what an airborne vehicle does at the end of the block
+    policy: RedialPolicy | None  #: when to reconnect and when a link counts as lost
+    scheduler: Scheduler | None  #: source of the time and of waiting; None: real time
+    on_close: Callable[[], None] | None  #: called at the end of :meth:`Drone.close`, on the closing thread
+    reach: str | None  #: name or address under which another process reaches the same vehicle; None if none can
 
 
 def by_name(function: Callable[P, R]) -> Callable[P, R]:
@@ -150,21 +176,120 @@ class Drone:
     unread one (:meth:`next_feedback`, :meth:`next_frame`), or all that come (:meth:`frames`, :meth:`on_feedback`).
     """
 
-    def __init__(self, core: DroneCore) -> None:
-        """Show what ``core`` is made of to an application; :func:`skyloop.connect` does it."""
-        self._core = core
-        self._commands = core.commands
-        self._state = core.state
-        self.config = core.config
-        self.log = core.log
+    def __init__(
+        self,
+        dial: Dialer,
+        *,
+        app: str,
+        access: Access = "pilot",
+        rate_hz: float = 32.0,
+        stall_s: float = 1.0,
+        on_exit: OnExit = "land",
+        policy: RedialPolicy | None = None,
+        scheduler: Scheduler | None = None,
+        on_close: Callable[[], None] | None = None,
+        reach: str | None = None,
+    ) -> None:
+        """Prepare a drone that is not connected yet; :func:`skyloop.connect` does it. See :class:`DroneOptions`.
+
+        Raises:
+            UsageError: If ``access``, ``on_exit``, ``app``, ``rate_hz`` or ``stall_s`` is out of range.
+        """
+        if access not in ("pilot", "observe"):
+            raise UsageError(f'access is {access!r} and must be "pilot" or "observe"')
+        if on_exit not in ("land", "hover"):
+            raise UsageError(f'on_exit is {on_exit!r} and must be "land" or "hover"')
+        if not 1 <= len(app) <= 64:
+            raise UsageError(f"an application's name has 1 to 64 characters, not {len(app)}: {app!r:.80}")
+        role = Role.PILOT if access == "pilot" else Role.OBSERVER
+        scheduler = scheduler or Scheduler()
+        self._reach = reach
+        self._on_close = on_close
         self._read: Feedback | None = None  # the last sample that feedback() or next_feedback() returned
+        # Each part uses those before it; the receiver handles what arrives in every session.
+        connection = self._connection = ProxyConnection(scheduler.clock)
+        authority = AuthorityTracker(app, _ENDED)
+        state = self._state = ClientState(app, connection, scheduler, whole_feedback=access == "pilot")
+        restorer = Restorer(connection, state.emit)
+        self.config = Config(connection, authority, restorer)
+        self.log = Logbook(connection, app)
+        schedule = CommandSchedule(rate_hz=rate_hz, stall_s=stall_s)
+        changed = state.notifier.notify
+        self._commands = CommandSender(
+            role, authority, schedule, connection, scheduler, emit=state.emit, changed=changed, granted=restorer.granted
+        )
+        self._piloting = Piloting(connection, state, self._commands, on_exit, self.close)
+        receiver = Receiver(state, connection, self._commands, restorer)
+        self._supervisor = ConnectionSupervisor(
+            connection, receiver, dial, Hello(app, role), policy=policy, clock=scheduler.clock, begin=scheduler.begin
+        )
+        connection.subscribe(EVENTS)
+
+    def _connect(
+        self,
+        *,
+        timeout_s: float = 5.0,
+        authority: Authority | None = None,
+        acquire: bool = True,
+        wait_for_state: bool = True,
+    ) -> None:
+        """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone if anything fails.
+
+        Args:
+            timeout_s: Time for the proxy to answer, to send its first feedback and, as a pilot, for the vehicle to
+                wake up [s].
+            authority: How a pilot asks for the authority; None: ``Authority()``.
+            acquire: Whether a pilot asks for the authority now; if False it does so when it wants.
+            wait_for_state: Whether to wait for feedback.
+
+        Raises:
+            NoAnswerError: If no answer or no feedback comes in time.
+            RefusedError: If the proxy refuses the connection.
+            AuthorityError: If the authority can't be had.
+            LinkError: If the proxy can't be reached.
+        """
+        state = self._state
+
+        def known() -> bool:
+            return state.newest is not None and state.status.application is not LinkState.CONNECTING
+
+        try:
+            deadline = time.monotonic() + timeout_s
+            self._supervisor.start(timeout_s)
+            if wait_for_state and not state.notifier.wait_for(known, max(0.1, deadline - time.monotonic())):
+                raise NoAnswerError(f"{self.name} answered, but reported no vehicle state within {timeout_s:g} s")
+            if acquire and self._commands.role is Role.PILOT:
+                self._connection.check_open()
+                asked = authority or Authority()
+                request = authority_request(asked.priority, asked.for_s, asked.takeover)
+                self._commands.request(request, asked.wait_s, stay=asked.stay)
+                if wait_for_state and not state.scheduler.in_step:
+                    self._wait_until_awake(deadline)
+            state.scheduler.opened()
+        except BaseException:
+            self.close()
+            raise
+
+    def _wait_until_awake(self, deadline_s: float) -> None:
+        """Wait while the vehicle wakes up, as long as there is time; what it waits for goes to the log."""
+
+        def why_asleep() -> str:
+            newest = self._state.newest
+            return newest.link_reason if newest is not None and newest.waking_up and not self.closed else ""
+
+        wait_for = self._state.notifier.wait_for
+        if wait_for(lambda: not why_asleep(), min(_SOON_S, deadline_s - time.monotonic())):
+            return
+        _log.warning("%s is %s; waiting for it", self.name, why_asleep())
+        if not wait_for(lambda: not why_asleep(), deadline_s - time.monotonic()):
+            _log.warning("%s is %s: it can't take off yet", self.name, why_asleep())
 
     # Properties --------------------------------------------------------------------------------------------------
 
     @property
     def name(self) -> str:
         """Name of the proxy; empty before the first connection."""
-        return self._core.name
+        return self._state.name
 
     @property
     def uri(self) -> str:
@@ -180,17 +305,17 @@ class Drone:
     @property
     def clock_offset_ns(self) -> int:
         """Estimate of the proxy's clock minus this process's clock [ns]."""
-        return self._core.connection.offset_ns
+        return self._connection.offset_ns
 
     @property
     def now_ns(self) -> int:
         """Estimate of the time on the proxy's clock [ns]; in a stepped replay, the time of the recorded flight."""
-        return self._core.connection.now_ns
+        return self._connection.now_ns
 
     @property
     def clock_uncertainty_ns(self) -> int:
         """Largest error of :attr:`clock_offset_ns` [ns], and so of each age and delay; 0 where both share one clock."""
-        return self._core.connection.uncertainty_ns
+        return self._connection.uncertainty_ns
 
     @property
     def app_id(self) -> int:
@@ -204,7 +329,7 @@ class Drone:
         ``reason`` is that of the last change or, while the proxy is lost, why the last attempt to reconnect failed.
         """
         status = self._state.status
-        return replace(status, reason=self._core.connection.reason) if status.application is LinkState.LOST else status
+        return replace(status, reason=self._connection.reason) if status.application is LinkState.LOST else status
 
     @property
     def start_position(self) -> Vector | None:
@@ -215,7 +340,7 @@ class Drone:
     @property
     def closed(self) -> bool:
         """Whether :meth:`close` was called."""
-        return self._core.closed
+        return self._connection.why_closed != ""
 
     @property
     def stats(self) -> dict[str, ChannelStats]:
@@ -227,7 +352,7 @@ class Drone:
         found = self._state.stats(self._commands.sends)
         uncertainty_s = self.clock_uncertainty_ns / 1e9
         found = {name: replace(stats, uncertainty_s=uncertainty_s) for name, stats in found.items()}
-        if found["command"].delay_s is None and self._core.connection.connected and not self._core.connection.receiving:
+        if found["command"].delay_s is None and self._connection.connected and not self._connection.receiving:
             found["command"] = _with_delay(found["command"], self._proxy_statistics())
         return found
 
@@ -292,7 +417,7 @@ class Drone:
             UsageError: If ``priority``, ``for_s`` or ``takeover`` is out of range.
             ClosedError: If the drone was closed.
         """
-        self._core.check_open()
+        self._connection.check_open()
         request = authority_request(self._commands.status.priority if priority is None else priority, for_s, takeover)
         return self._commands.request(request, wait_s, stay=stay)
 
@@ -305,7 +430,7 @@ class Drone:
             NoAnswerError: If the proxy does not answer.
             ClosedError: If the drone was closed.
         """
-        self._core.check_open()
+        self._connection.check_open()
         self._commands.release()
 
     def command(self, action: AnyAction) -> bool:
@@ -329,15 +454,16 @@ class Drone:
 
         Raises:
             NoAnswerError: If the vehicle does not hover in time; names its state and, if known, the reason.
-            RefusedError: If the proxy refuses to take off in the present state, a failsafe, a lost link or a new lease
-                ends it before it shows, or the vehicle lands or disarms before it hovers, whoever made it.
+            RefusedError: If the proxy refuses to take off in the present state; a failsafe, a lost link, a new lease or
+                another command of this application ends it before it shows; the application lands the vehicle or stops
+                its motors meanwhile; or it lands or disarms before it hovers, whoever made it.
             UnsupportedError: If the vehicle can't take off.
             LinkError: Without ``wait``, if the link is down; the vehicle does not take off later either.
             AuthorityError: If the authority is not held, or another application takes it over meanwhile.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; nothing is sent.
         """
-        self._core.complete(Takeoff(), lambda feedback: feedback.state in UP, wait, timeout_s)
+        self._piloting.complete(Takeoff(), lambda feedback: feedback.state in UP, wait, timeout_s)
 
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the present position.
@@ -359,7 +485,7 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; the landing is commanded all the same.
         """
-        self._core.complete(Land(), lambda feedback: feedback.state in DOWN, wait, timeout_s)
+        self._piloting.complete(Land(), lambda feedback: feedback.state in DOWN, wait, timeout_s)
 
     def hover(self) -> bool:
         """Stop and hold the position. Returns and raises as every command; see :class:`Drone`."""
@@ -462,7 +588,7 @@ class Drone:
         local = in_world_axes((x, y, z), (latitude_deg, longitude_deg, altitude_m), newest, age_s)
         place = position_action(*local, yaw, speed)
         near_m, near_rad = above_zero("tolerance_m", tolerance_m), above_zero("tolerance_rad", tolerance_rad)
-        self._core.complete(place, lambda feedback: is_there(place, feedback, near_m, near_rad), wait, timeout_s)
+        self._piloting.complete(place, lambda feedback: is_there(place, feedback, near_m, near_rad), wait, timeout_s)
 
     def return_to_start(
         self,
@@ -496,7 +622,7 @@ class Drone:
             UsageError: If an argument makes no sense, or if called with ``wait`` from an inline callback; nothing is
                 sent.
         """
-        self._core.complete(return_action(height_m, land), ReturnWatch(), wait, timeout_s)
+        self._piloting.complete(return_action(height_m, land), ReturnWatch(), wait, timeout_s)
 
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
@@ -553,13 +679,13 @@ class Drone:
             UsageError: If a number is missing or not finite, a standard deviation is negative, the quaternion's length
                 differs from 1 by more than 0.001, or ``at_ns`` is out of range.
         """
-        if self._core.role is not Role.PILOT:
+        if self._commands.role is not Role.PILOT:
             text = 'send_external_pose: this application observes; connect with access="pilot"'
             raise AuthorityError(text, code="observer")
         check_pose(position, quaternion, position_std_m, attitude_std_rad)
         known_ns = self.now_ns if at_ns is None else checked_time(at_ns)
         pose = VehiclePose(known_ns, position, quaternion, position_std_m, attitude_std_rad)
-        return self._core.connection.transmit(encode(pose))
+        return self._connection.transmit(encode(pose))
 
     # Reading ---------------------------------------------------------------------------------------------------
 
@@ -583,7 +709,7 @@ class Drone:
             ClosedError: If the drone was closed.
             UsageError: If ``max_hz`` is out of range.
         """
-        self._core.check_open()
+        self._connection.check_open()
         self._state.demand.keep(_feedback_request(max_hz))
         newest = self._state.newest
         if newest is None:
@@ -609,13 +735,13 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback before there is one.
         """
-        self._core.check_open()
+        self._connection.check_open()
         state = self._state
         if state.overview is None:
-            self._core.check_may_wait()
+            self._connection.check_may_wait()
             state.on_overview.keep()
-            state.notifier.wait_for(lambda: state.overview is not None or self._core.closed, timeout_s)
-            self._core.check_open()
+            state.notifier.wait_for(lambda: state.overview is not None or self.closed, timeout_s)
+            self._connection.check_open()
         state.on_overview.keep()
         if state.overview is None:
             raise NoAnswerError(f"no overview came within {timeout_s:g} s: a proxy of an earlier version sends none")
@@ -637,12 +763,12 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback, or an option is out of range.
         """
-        self._core.check_open()
-        self._core.check_may_wait()
+        self._connection.check_open()
+        self._connection.check_may_wait()
         state = self._state
         state.demand.keep(_feedback_request(max_hz))
-        if not state.notifier.wait_for(lambda: state.newest is not self._read or self._core.closed, timeout_s):
-            link = self._core.connection.state.value
+        if not state.notifier.wait_for(lambda: state.newest is not self._read or self.closed, timeout_s):
+            link = self._connection.state.value
             raise NoAnswerError(f"no feedback came within {timeout_s:g} s: the link is {link}")
         return self.feedback(max_hz=max_hz)
 
@@ -663,7 +789,7 @@ class Drone:
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
         """
-        channel = self._core.channel(camera)
+        channel = self._state.video.channel(camera)
         channel.keep()
         arrival = channel.newest
         if arrival is None or (max_age_s is not None and arrival.age_s > max_age_s):
@@ -688,17 +814,18 @@ class Drone:
         """
         deadline = time.monotonic() + timeout_s
         while True:
-            channel = self._core.channel(camera)  # anew: the proxy may have been started again with another camera
+            # Anew: the proxy may have been started again with another camera.
+            channel = self._state.video.channel(camera)
             channel.keep()
-            self._core.check_may_wait()
+            self._connection.check_may_wait()
             left_s = min(_LOOK_S, deadline - time.monotonic())
-            while channel.notifier.wait_for(lambda: channel.unread or self._core.closed, left_s):  # noqa: B023
-                self._core.check_open()
+            while channel.notifier.wait_for(lambda: channel.unread or self.closed, left_s):  # noqa: B023
+                self._connection.check_open()
                 frame = channel.read()
                 if frame is not None:
                     return frame
             if time.monotonic() >= deadline:
-                raise self._core.no_frame(channel.camera.name, timeout_s)
+                raise self._state.no_frame(channel.camera.name, timeout_s)
 
     def frames(
         self,
@@ -728,12 +855,12 @@ class Drone:
             UsageError: If an option is out of range, or from an inline callback.
             ClosedError: If the drone was closed before.
         """
-        channel = self._core.follow(lambda: self._core.channel(camera, **how))
-        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._state.scheduler.sample_notifier(self._core.connection))
-        self._core.check_may_wait()
+        channel = self._state.follow(lambda: self._state.video.channel(camera, **how))
+        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._state.sample_notifier())
+        self._connection.check_may_wait()
         max_age_s, deadline = how.get("max_age_s"), time.monotonic() + timeout_s
-        with self._core.closing(mailbox), channel.into(mailbox):
-            while not self._core.closed:
+        with self._state.closing(mailbox), channel.into(mailbox):
+            while not self.closed:
                 arrival = mailbox.wait(max(0.0, deadline - time.monotonic()))
                 if arrival is not None:
                     frame = channel.current.picture(arrival, max_age_s)
@@ -741,7 +868,7 @@ class Drone:
                         yield frame
                         deadline = time.monotonic() + timeout_s
                 elif not mailbox.closed:
-                    raise self._core.no_frame(channel.current.camera.name, timeout_s)
+                    raise self._state.no_frame(channel.current.camera.name, timeout_s)
 
     def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
         """Wait until the newest feedback is as wanted.
@@ -760,8 +887,8 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
-        self._core.check_open()
-        self._core.check_may_wait()
+        self._connection.check_open()
+        self._connection.check_may_wait()
         wanted, what = as_predicate(state)
         met: list[Feedback] = []
 
@@ -769,7 +896,7 @@ class Drone:
             newest = self._state.newest
             if newest is not None and wanted(newest):
                 met.append(newest)
-            return bool(met) or self._core.closed
+            return bool(met) or self.closed
 
         with self._state.demand.wanted(PLAIN):
             in_time = self._state.notifier.wait_for(look, timeout_s)
@@ -884,7 +1011,7 @@ class Drone:
         if depth < 1:
             raise UsageError(f"depth is {depth!r} and must be at least 1 frame")
         self._check_listener(function)
-        channel = self._core.follow(lambda: self._core.channel(camera, **how))
+        channel = self._state.follow(lambda: self._state.video.channel(camera, **how))
         max_age_s = how.get("max_age_s")
 
         def call(arrival: Arrival) -> None:
@@ -935,12 +1062,13 @@ class Drone:
         self._check_listener(function)
 
         def find() -> StreamChannel:
-            info = self._core.channel(camera).camera
+            video = self._state.video
+            info = video.channel(camera).camera
             as_it_came = bool(info.stream) and kbit_s is None and max_fps is None and scale == 1.0
-            subscriber = "" if as_it_came or kbit_s is not None else f"{self._state.video.subscriber}-encoded"
-            return self._core.stream(info.name, kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
+            subscriber = "" if as_it_came or kbit_s is not None else f"{video.subscriber}-encoded"
+            return video.stream(info.name, kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
 
-        stream, chain = self._core.follow(find), Chain()
+        stream, chain = self._state.follow(find), Chain()
 
         def call(picture: EncodedFrame) -> None:
             follows = chain.follows(picture.seq, key=picture.key)
@@ -967,13 +1095,13 @@ class Drone:
                 within 0 to 255.
         """
         height, width = frame.shape[:2]
-        fields = (source or self._core.app, frame.camera, frame.captured_ns, width, height, tuple(shapes))
+        fields = (source or self._state.app, frame.camera, frame.captured_ns, width, height, tuple(shapes))
         try:
             annotation = msgspec.convert(msgspec.to_builtins(fields, enc_hook=_from_numpy), Annotation)
             packet = encode(annotation)
         except (msgspec.ValidationError, TypeError, ValueError) as error:
             raise UsageError(f"this can't be drawn on a frame: {error}") from None
-        return self._core.connection.transmit(packet)
+        return self._connection.transmit(packet)
 
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
         """Emit an event of this application's own (number 0), which only its own callbacks get.
@@ -1005,7 +1133,7 @@ class Drone:
             ClosedError: If the drone was closed.
         """
         checked_age(max_age_s)
-        channel = self._core.result_channel(processor)
+        channel = self._state.results.channel(processor)
         channel.keep()
         newest = channel.newest
         return None if newest is None or is_old(newest, max_age_s) else newest
@@ -1027,10 +1155,10 @@ class Drone:
             ClosedError: If the drone was closed before.
         """
         mailbox = ResultMailbox(checked_age(max_age_s), self._state.scheduler.notifier())
-        channel = self._core.result_channel(processor)
-        self._core.check_may_wait()
-        with self._core.closing(mailbox), channel.into(mailbox):
-            while not self._core.closed:
+        channel = self._state.results.channel(processor)
+        self._connection.check_may_wait()
+        with self._state.closing(mailbox), channel.into(mailbox):
+            while not self.closed:
                 result = mailbox.wait(timeout_s)
                 if result is not None:
                     yield result
@@ -1065,19 +1193,13 @@ class Drone:
         """
         if depth is not None and depth < 1:
             raise UsageError(f"depth is {depth!r} and must be at least 1 result")
-        self._check_listener(function)
-        channel = self._state.results.everything if processor is None else self._core.result_channel(processor)
-        listener = ResultListener(
-            function,
-            channel,
-            self._core.report,
-            name="results" if processor is None else f"results of {processor}",
-            depth=depth or (EVENT_DEPTH if processor is None else 1),
-            inline=inline or self._state.scheduler.in_step,
-            on_cancel=self._core.cancelled,
-            max_age_s=checked_age(max_age_s),
-        )
-        self._core.listeners.append(listener)
+        known, make = self._state.results, partial(ResultListener, max_age_s=checked_age(max_age_s))
+        if processor is None:
+            channel, name, usual = known.everything, "results", EVENT_DEPTH
+        else:
+            channel, name, usual = known.channel(processor), f"results of {processor}", 1
+        listener = self._listen(channel, function, name, depth=depth or usual, inline=inline, make=make)
+        assert isinstance(listener, ResultListener)
         return listener
 
     # The end ---------------------------------------------------------------------------------------------------
@@ -1096,8 +1218,8 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
-        self._core.check_open()
-        self._core.check_may_wait()
+        self._connection.check_open()
+        self._connection.check_may_wait()
         state = self._state
         before = None if state.demand.request.is_plain else state.newest
         with state.demand.wanted(PLAIN):
@@ -1111,27 +1233,49 @@ class Drone:
         Does not land, except that a private proxy lands what flies before it ends. Idempotent. Threads that wait for
         this drone get :class:`ClosedError`.
         """
-        self._core.close()
+        if self.closed:
+            return
+        self._piloting.finish_stop()
+        self._connection.why_closed = "this drone was closed: connect again"
+        self._commands.notifier.notify()  # nobody gets the authority any more
+        try:
+            if self._connection.connected:
+                self._commands.release(wait=not self._connection.receiving)
+        except LinkError:
+            pass  # the link is lost already, and the authority with it
+        finally:
+            self._supervisor.close()
+            listeners = list(self._state.listeners)
+            for listener in listeners:
+                listener.cancel(wait=False)
+            deadline_s = time.monotonic() + JOIN_S  # for all of them
+            for listener in listeners:
+                listener.join(max(0.0, deadline_s - time.monotonic()))
+            for one in list(self._state.to_close):
+                one.close()
+            self._state.wake_all()
+            if self._on_close is not None:
+                self._on_close()
 
     def __enter__(self) -> Self:
-        self._core.check_open()
+        self._connection.check_open()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        problem = self._core.end_flight()
+        problem = self._piloting.end_flight()
         if problem is not None:
             _log.warning("%s could not be left as it should: %s", self.name, problem)
 
     def __repr__(self) -> str:
-        return f"<Drone {self.name or '?'} ({self._core.connection.state.value}, authority {self.authority.state})>"
+        return f"<Drone {self.name or '?'} ({self._connection.state.value}, authority {self.authority.state})>"
 
     # Inside ------------------------------------------------------------------------------------------------------
 
     def _proxy_statistics(self) -> Statistics | None:
         try:
-            answer = self._core.connection.call(GetStatistics, 0.2)
+            answer = self._connection.call(GetStatistics, 0.2)
         except LinkError:
             return None
         return answer if isinstance(answer, Statistics) else None
@@ -1144,17 +1288,17 @@ class Drone:
         *,
         depth: int = 1,
         inline: bool = False,
+        make: Callable[..., Listener[T]] = Listener,
     ) -> Listener[T]:
         self._check_listener(function)
-        inline = inline or self._state.scheduler.in_step
-        listener = Listener(
-            function, channel, self._core.report, name=name, depth=depth, inline=inline, on_cancel=self._core.cancelled
-        )
-        self._core.listeners.append(listener)
+        state, report = self._state, self._piloting.report
+        inline = inline or state.scheduler.in_step
+        listener = make(function, channel, report, name=name, depth=depth, inline=inline, on_cancel=state.forget)
+        self._state.listeners.append(listener)
         return listener
 
     def _check_listener(self, function: Callable[[Any], object]) -> None:
-        self._core.check_open()
+        self._connection.check_open()
         if not callable(function):
             raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
 
@@ -1172,16 +1316,16 @@ def open_drone(
     Args:
         dial: Makes a connection to the proxy each time one is needed.
         app: Name of this application, 1 to 64 characters.
-        timeout_s: See :meth:`DroneCore.open`.
-        authority: See :meth:`DroneCore.open`.
-        **options: As for :class:`DroneCore`.
+        timeout_s: Time for the proxy to answer, to send feedback and for the vehicle to wake up [s].
+        authority: As for :func:`skyloop.connect`.
+        **options: See :class:`DroneOptions`.
 
     Raises:
-        SkyloopError: As :class:`DroneCore` and :meth:`DroneCore.open`.
+        SkyloopError: As :func:`skyloop.connect`.
     """
-    core = DroneCore(dial, app=app, **options)
-    core.open(timeout_s=timeout_s, authority=authority)
-    return Drone(core)
+    drone = Drone(dial, app=app, **options)
+    drone._connect(timeout_s=timeout_s, authority=authority)
+    return drone
 
 
 def _feedback_request(max_hz: float | None) -> FeedbackRequest:

@@ -134,14 +134,7 @@ class Frame(_Base):
 
 
 def png(image: NDArray[Any]) -> bytes | None:
-    """Encode an image as PNG.
-
-    Args:
-        image: BGR of shape (height, width, 3), or grey of shape (height, width); uint8.
-
-    Returns:
-        None if it is anything else, or has no pixels.
-    """
+    """Encode an image as PNG: BGR of shape (height, width, 3), or grey of shape (height, width), uint8; else None."""
     grey = image.ndim == 2
     if image.dtype != np.uint8 or not image.size or not (grey or (image.ndim == 3 and image.shape[2] == 3)):
         return None
@@ -181,15 +174,9 @@ class Arrival:
         history: FeedbackHistory,
         clock: Clock = time.monotonic_ns,
     ) -> None:
-        """Keep what was received.
+        """Keep what was received at ``received_ns``, on ``clock``, which is ``offset_ns`` behind the proxy's.
 
-        Args:
-            header: Describes the pixels.
-            pixels: Bytes of the frame, shape (size,), uint8.
-            received_ns: When they came, on this host's clock.
-            offset_ns: The proxy's clock minus ``clock``.
-            history: Looked up for the state at the capture.
-            clock: This host's clock.
+        ``history`` is looked up for the state at the capture.
         """
         self.header = header
         self.received_ns = received_ns
@@ -270,17 +257,7 @@ class SmallArrival(Arrival):
         clock: Clock,
         scale: float,
     ) -> None:
-        """Keep what was received; arguments are those of :class:`Arrival`.
-
-        Args:
-            header: Describes the pixels as received.
-            pixels: Bytes of the frame as received.
-            received_ns: When they came, on this host's clock.
-            offset_ns: The proxy's clock minus ``clock``.
-            history: Looked up for the state at the capture.
-            clock: This host's clock.
-            scale: Factor for width and height, above 0 and up to 1.
-        """
+        """Keep what was received; ``header`` describes it as received, ``scale`` is the factor for width and height."""
         small = msgspec.structs.replace(scaled_header(header, scale), encoding=Encoding.BGR8)
         small = msgspec.structs.replace(small, size=small.width * small.height * 3)
         super().__init__(small, pixels, received_ns, offset_ns, history, clock)
@@ -298,10 +275,6 @@ class SmallArrival(Arrival):
 
 def compressed(frame: Frame, quality: int = 95) -> Arrival:
     """Return a frame as a JPEG, to keep many of them: :meth:`Arrival.frame` makes it a frame again.
-
-    Args:
-        frame: As it was delivered.
-        quality: Of the JPEG, 1 to 100.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -325,14 +298,7 @@ def size_error(header: FrameHeader, size: int) -> str:
 
 
 def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
-    """Convert received pixels to BGR.
-
-    Args:
-        header: Describes the pixels.
-        pixels: Bytes of the frame, shape (size,), uint8.
-
-    Returns:
-        Shape (height, width, 3), uint8; the same memory if the pixels are BGR already.
+    """Convert the bytes of a frame to BGR, shape (height, width, 3), uint8; the same memory if they are BGR already.
 
     Raises:
         DecodeError: If the pixels are no JPEG of the size in the header.

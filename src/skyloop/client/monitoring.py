@@ -74,12 +74,7 @@ class LinkMonitor:
         self._silent_ns += nanoseconds(silence_s)
 
     def expect(self, period_s: float, now_ns: int) -> None:
-        """Judge from now on by the time that may pass between two samples of feedback.
-
-        Args:
-            period_s: As it was asked for [s]; 0: every sample.
-            now_ns: When it was.
-        """
+        """Judge from now on by the time that may pass between two samples of feedback [s]; 0: all are sent."""
         limits, patience_s = self._limits, min(period_s, MAX_PATIENCE_S)
         # A switch loses no sample, but leaves a gap in the numbers, and time passes before the first one comes.
         self._no_gaps_ns = now_ns + nanoseconds(limits.window_s)
@@ -92,12 +87,9 @@ class LinkMonitor:
         self._window_ns = nanoseconds(max(limits.window_s, WINDOW_PERIODS * patience_s))
 
     def feedback(self, seq: int, now_ns: int, skipped: int = 0) -> bool:
-        """Note a sample of feedback; return False if it is repeated or was overtaken by a newer one.
+        """Note a sample of feedback, before which the proxy left out ``skipped``.
 
-        Args:
-            seq: Its number.
-            now_ns: When it came.
-            skipped: How many samples the proxy left out before it.
+        Returns False if it is repeated or was overtaken by a newer one.
         """
         self.received_ns = now_ns
         last = self._last_seq
@@ -158,12 +150,7 @@ class StallWatch:
     """
 
     def __init__(self, patience_s: float, now_ns: int) -> None:
-        """Start watching.
-
-        Args:
-            patience_s: Silence after which a channel counts as stalled [s].
-            now_ns: The present time.
-        """
+        """Start watching a channel that counts as stalled after a silence of ``patience_s``."""
         self._patience_ns = nanoseconds(patience_s)
         self.received_ns = now_ns  #: when something came on this channel last
         self._asked_ns = now_ns
@@ -204,12 +191,7 @@ class OffsetEstimator:
     """
 
     def __init__(self, depth: int = 16, max_drift: float = MAX_DRIFT) -> None:
-        """Start without round trips, with an offset of 0.
-
-        Args:
-            depth: How many round trips are kept.
-            max_drift: Largest relative difference in rate between the two clocks.
-        """
+        """Start with an offset of 0; ``max_drift``: largest relative difference in rate between the clocks."""
         self._trips: deque[_Trip] = deque(maxlen=depth)
         self._max_drift = max_drift
 
@@ -217,13 +199,7 @@ class OffsetEstimator:
         return len(self._trips)
 
     def add(self, sent_ns: int, theirs_ns: int, received_ns: int) -> Offset:
-        """Add a round trip, and return the estimate at its end.
-
-        Args:
-            sent_ns: When the request was sent, on this process's clock.
-            theirs_ns: When it was answered, on the proxy's clock.
-            received_ns: When the answer came, on this process's clock.
-        """
+        """Add a round trip, answered at ``theirs_ns`` on the proxy's clock; return the estimate at its end."""
         received_ns = max(sent_ns, received_ns)
         self._trips.append(_Trip(sent_ns, theirs_ns - received_ns - 1, theirs_ns - sent_ns + 1))
         return self.at(received_ns)
@@ -283,11 +259,7 @@ class ChannelStats:
 
 
 def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:
-    """Return the distribution of delays; None for none.
-
-    Args:
-        delays_ns: In ns, any length.
-    """
+    """Return the distribution of delays [ns]; None for none."""
     if not delays_ns.size:
         return None
     seconds = np.sort(delays_ns) / 1e9
@@ -317,13 +289,7 @@ class ChannelCounter:
         self.last_seq: int | None = None
 
     def add(self, delay_ns: int, captured_ns: int, now_ns: int) -> None:
-        """Count a sample.
-
-        Args:
-            delay_ns: Its delay.
-            captured_ns: When it was captured, on this process's clock.
-            now_ns: When it arrived.
-        """
+        """Count a sample that was captured and arrived at these times on this process's clock."""
         place = self.count & (DEPTH - 1)
         self._arrivals[place] = now_ns
         self._delays[place] = delay_ns
@@ -340,14 +306,9 @@ class ChannelCounter:
     def stats(
         self, now_ns: int, *, lost: int = 0, dropped: int = 0, malformed: int = 0, ages: bool = True
     ) -> ChannelStats:
-        """Return the statistics at ``now_ns``.
+        """Return the statistics at ``now_ns``; what is given is added to what was counted here.
 
-        Args:
-            now_ns: On this process's clock.
-            lost: Added to what was counted here.
-            dropped: Added to what was counted here.
-            malformed: Added to what was counted here.
-            ages: Whether ``age_s`` is meaningful for this channel.
+        ``ages``: whether ``age_s`` is meaningful for this channel.
         """
         filled = min(self.count, DEPTH)
         arrivals = np.frombuffer(bytes(self._arrivals), np.int64)[:filled]

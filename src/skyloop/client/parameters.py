@@ -206,12 +206,7 @@ def _name(name: object) -> str:
 def plain_value(name: str, value: object) -> Value:
     """Return a value that can be sent: bool, int, float, str (up to 4096 characters) or a tuple of up to 256 floats.
 
-    Args:
-        name: Name of the parameter, for the error.
-        value: Such a value, a list or an array of numbers, or a NumPy scalar.
-
-    Raises:
-        UsageError: If it is anything else.
+    It may be given as a list or an array of numbers, or a NumPy scalar. Raises :class:`UsageError` for anything else.
     """
     if isinstance(value, np.ndarray) and not value.ndim:
         value = value.item()

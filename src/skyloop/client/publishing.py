@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skyloop.client.channels import checked_name
 from skyloop.client.connection import ProxyConnection
 from skyloop.client.frame import Frame
 from skyloop.errors import LinkError, NameTakenError, RefusedError, SkyloopError, UsageError
@@ -28,7 +29,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.fields import LATEST_NS
-from skyloop.messages.relayed import MAX_LOG_TEXT, MAX_VALUES, pack
+from skyloop.messages.relayed import MAX_CODE, MAX_LOG_TEXT, MAX_VALUES, pack
 
 if TYPE_CHECKING:
     from skyloop.client.telemetry import ClientState
@@ -103,11 +104,7 @@ class Logbook:
 
 
 def checked_time(at_ns: object) -> int:
-    """Return ``at_ns`` if it can be a time on the proxy's clock [ns].
-
-    Raises:
-        UsageError: If it is no int or out of range.
-    """
+    """Return ``at_ns`` if it can be a time on the proxy's clock [ns], else raise :class:`UsageError`."""
     if not isinstance(at_ns, int) or not -LATEST_NS <= at_ns <= LATEST_NS:
         raise UsageError(
             f"at_ns is {at_ns!r:.80} and must be a time on the proxy's clock, whole ns within ±{LATEST_NS}"
@@ -144,17 +141,11 @@ class Membership:
         *,
         shared: bool,
     ) -> None:
-        """Prepare to join; :meth:`start` does it.
-
-        Args:
-            connection: Sends requests and results.
-            state: Publishes shares and new connections.
-            processor: Name of the processor.
-            code: Identifies the code that runs, the same for all workers.
-            find: Returns the name of the camera, also once the proxy was started again with other ones.
-            shared: Each frame goes to one of the workers; if False, each worker gets all.
-        """
-        self.processor = processor
+        """Prepare to join; :meth:`start` does it. ``find`` returns the camera's name, also of a restarted proxy."""
+        connection.check_may_wait()
+        if not isinstance(code, str) or len(code) > MAX_CODE:
+            raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
+        self.processor = checked_name(processor)
         self.camera = find()
         self._find = find
         self.code = code
@@ -176,13 +167,10 @@ class Membership:
     def start(self, timeout_s: float) -> None:
         """Join, and renew the membership from then on, on a thread of its own.
 
-        Args:
-            timeout_s: How long to wait for the proxy's answer [s].
-
         Raises:
             NameTakenError: If another application runs other code under this name.
             RefusedError: If the proxy refuses for another reason.
-            LinkError: If the proxy does not answer, or the drone is closed.
+            LinkError: If the proxy does not answer within ``timeout_s``, or the drone is closed.
         """
         self._state.on_share.add(self._take_share, lambda: 0)
         self._state.on_welcome.add(self._take_welcome, lambda: 0)
@@ -194,24 +182,16 @@ class Membership:
             self._leave()
             raise
         self._thread.start()
+        self._state.to_close.append(self)
 
     def renew(self) -> None:
         """Tell the proxy now, for example because :attr:`ready` has changed. Any thread."""
         self._wake.set()
 
     def publish(self, frame: Frame, value: Any, took_s: float = 0.0) -> bool:
-        """Publish what was found in a frame.
+        """Publish what was found in a frame (see :func:`skyloop.messages.relayed.pack`) and how long it took [s].
 
-        Args:
-            frame: The frame.
-            value: What was found; see :func:`skyloop.messages.relayed.pack` for what can be sent.
-            took_s: How long it took [s].
-
-        Returns:
-            Whether it was handed to the transport.
-
-        Raises:
-            UsageError: If the value can't be sent.
+        Returns whether it was handed to the transport. Raises :class:`UsageError` if the value can't be sent.
         """
         payload = pack(value)
         result = ProcessorResult(

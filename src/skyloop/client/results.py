@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 
-from skyloop.client.channels import Channel, Listener, Mailbox, Notifier
+from skyloop.client.channels import Channel, Listener, Mailbox, Notifier, checked_name
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.frame import FeedbackHistory
 from skyloop.client.monitoring import ChannelCounter, ChannelStats
@@ -33,14 +33,9 @@ class Result:
     def __init__(
         self, header: ProcessorResult, received_ns: int, offset_ns: int, history: FeedbackHistory, clock: Clock
     ) -> None:
-        """Keep what was received; the value is decoded when it is first read.
+        """Keep what was received at ``received_ns``, on ``clock``, which is ``offset_ns`` behind the proxy's.
 
-        Args:
-            header: The packet.
-            received_ns: When it came, on this host's clock.
-            offset_ns: The proxy's clock minus ``clock``.
-            history: Looked up for the state at the capture.
-            clock: This host's clock.
+        ``history`` is looked up for the state at the capture. The value is decoded when it is first read.
         """
         self.header = header  #: the packet as received
         self.received_ns = received_ns  #: on this host's clock
@@ -130,12 +125,7 @@ class ResultMailbox:
     """Keeps the newest result of each processor for one consumer, and leaves out those that are too old when taken."""
 
     def __init__(self, max_age_s: float | None = None, notifier: Notifier | None = None) -> None:
-        """Make an empty mailbox.
-
-        Args:
-            max_age_s: Oldest age that is accepted [s]; None: any.
-            notifier: Notified with each result; None: an own one.
-        """
+        """Make an empty mailbox, which leaves out what is older than ``max_age_s`` [s] when it is taken."""
         self.notifier = notifier or Notifier()
         self.expired = 0  #: results that were too old when their turn came
         self.closed = False
@@ -278,7 +268,16 @@ class ResultChannels:
         self._sent: Counter[str] = Counter()
 
     def channel(self, processor: str) -> ResultChannel:
-        """Return the channel of this processor, made on the first call."""
+        """Return the channel of a processor's results, whether or not such a processor runs.
+
+        Raises:
+            UsageError: If ``processor`` can't be a name.
+            ClosedError: If the drone was closed.
+        """
+        self._connection.check_open()
+        return self._made(checked_name(processor))
+
+    def _made(self, processor: str) -> ResultChannel:
         with self._lock:
             found = self._channels.get(processor)
             if found is None:
@@ -307,7 +306,7 @@ class ResultChannels:
         channel = self._channels.get(header.processor)
         if channel is None:
             self._make_room()
-            channel = self.channel(header.processor)
+            channel = self._made(header.processor)
         if channel.receive(result):
             channel.counter.add(now_ns + offset_ns - header.made_ns, header.captured_ns - offset_ns, now_ns)
             self.everything.publish(result)
@@ -327,13 +326,7 @@ def _captured_ns(mailbox: Mailbox[Result]) -> int:
 
 
 def silence(processor: str, timeout_s: float, expired: int) -> str:
-    """Return the message of the error when no result came.
-
-    Args:
-        processor: Name of the processor.
-        timeout_s: How long was waited [s].
-        expired: How many results were too old meanwhile.
-    """
+    """Return the message of the error when no result came, with how many were too old meanwhile."""
     if expired:
         return f"no result of {processor} came within {timeout_s:g} s that was new enough; {expired} were too old"
     return (

@@ -58,15 +58,10 @@ class Requests:
         self._failed: LinkError | None = None
 
     def ask(self, body: AnyRequest, done: Done, timeout_s: float, now_ns: int, *, again_s: float = RETRY_S) -> None:
-        """Send a request.
+        """Send a request, and repeat it after ``again_s`` and then each 0.3 s.
 
-        Args:
-            body: The request.
-            done: Called once, on the receiving thread or on the one that calls :meth:`tick` or :meth:`fail`; on this
-                one if the connection has failed already.
-            timeout_s: After which ``done`` gets a :class:`NoAnswerError` [s].
-            now_ns: On this process's clock.
-            again_s: How long until it is repeated [s].
+        ``done`` is called once, on the receiving thread or on the one that calls :meth:`tick` or :meth:`fail`; on this
+        one if the connection has failed already. After ``timeout_s`` it gets a :class:`NoAnswerError`.
         """
         with self._lock:
             failed = self._failed
@@ -129,30 +124,12 @@ _FIRST: Final = 5
 
 
 class ConnectionHandler(Protocol):
-    """Gets all that happens to a connection and all that arrives.
+    """Gets samples, on the receiving thread, and what happens to the connection, on the supervisor's."""
 
-    ``feedback``, ``frame`` and the other samples come on the receiving thread, the rest on the supervisor's.
-    """
-
-    def connected(self, welcome: Welcome) -> None:
-        """A proxy has answered Hello; nothing else was received from it yet."""
-
-    def disconnected(self, reason: str) -> None:
-        """The session has ended."""
-
-    def link_changed(self, state: LinkState, reason: str) -> None:
-        """The state of the hop to the proxy has changed."""
-
-    def tick(self, now_ns: int) -> int:
-        """Do what is due; called while connected.
-
-        Args:
-            now_ns: On this process's clock.
-
-        Returns:
-            When it is called again at the latest [ns].
-        """
-
+    def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello, and sent nothing else yet
+    def disconnected(self) -> None: ...
+    def link_changed(self, state: LinkState, reason: str) -> None: ...
+    def tick(self, now_ns: int) -> int: ...  #: does what is due; returns when to call it again at the latest [ns]
     def feedback(self, sample: Feedback, now_ns: int) -> None: ...
     def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
     @property
@@ -168,14 +145,7 @@ class ProxySession:
     def __init__(
         self, handler: ConnectionHandler, poke: Callable[[], None], thresholds: Thresholds, clock: Clock
     ) -> None:
-        """Make a session that is not connected.
-
-        Args:
-            handler: Gets what arrives.
-            poke: Wakes the supervisor.
-            thresholds: When the link counts as degraded and as lost.
-            clock: This process's clock.
-        """
+        """Make a session that is not connected; ``poke`` wakes the supervisor."""
         self._handler = handler
         self._poke = poke
         self._clock = clock
@@ -208,13 +178,9 @@ class ProxySession:
         self.monitor.excuse(self._end.excused_s)
 
     def welcomed(self, welcome: Welcome, sent_ns: int) -> None:
-        """Take the answer to Hello as the first measure of the offset between the clocks.
+        """Take the answer to Hello, sent at ``sent_ns``, as the first measure of the offset between the clocks.
 
         On one host both are the same clock, unless the two processes are in different time namespaces.
-
-        Args:
-            welcome: The answer.
-            sent_ns: When Hello was sent, on this process's clock.
         """
         if welcome.clock and welcome.clock != clock_identity():
             self._same_clock = False
@@ -267,12 +233,7 @@ class ProxySession:
         return self.receiver == threading.get_ident() or (self._end is not None and self._end.receiving)
 
     def subscribe(self, topic: str, on: bool) -> None:
-        """Subscribe to a topic or unsubscribe. Video that several requests share is subscribed to once.
-
-        Args:
-            topic: Name of the topic.
-            on: False unsubscribes.
-        """
+        """Subscribe to a topic or unsubscribe. Video that several requests share is subscribed to once."""
         end = self._end
         if end is None:
             return
@@ -376,10 +337,7 @@ class ProxySession:
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
         """Check a frame's size and hand it on; on the receiving thread.
 
-        Args:
-            header: Describes the pixels.
-            pixels: Bytes of the frame, shape (size,), uint8.
-            topic: The request that the proxy made it for; empty: a plain frame of the camera.
+        ``topic`` is the request that the proxy made it for; empty: a plain frame of the camera.
         """
         now_ns = self._clock()
         if self._quiet:
@@ -408,10 +366,8 @@ class ProxySession:
 def _carrier(topic: str, *, variants: bool) -> str:
     """Return the topic of the transport on which video comes.
 
-    Args:
-        topic: As it was asked for.
-        variants: Whether the transport carries frames in the form asked for, or all as they are: each channel then
-            filters and scales them itself.
+    ``variants``: whether the transport carries frames in the form asked for, or all as they are: each channel then
+    filters and scales them itself.
     """
     request = VideoRequest.parse(topic)
     if topic.startswith(stream("")):

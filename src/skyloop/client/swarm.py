@@ -452,11 +452,13 @@ class Swarm:
             checked(action)
         active = self.active
         ready = {name: active[name] for name in actions if name in active}
-        _wait_open(ready)
+        # A few milliseconds at most, until every drone sends a new set-point at once, so that none leaves later.
+        open_ns = max((drone._commands.open_ns for drone in ready.values()), default=0)
+        time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
-            action, commands = actions[name], ready[name]._core.commands
+            action, commands = actions[name], ready[name]._commands
             if type(action) is Hover:  # of all, which is no decision to take one from a safety pilot
                 handed = commands.command(action, automatic=type(commands.newest) is not Land)
             else:
@@ -467,10 +469,11 @@ class Swarm:
 
         sent, errors = _try_all({name: name for name in ready}, hand_over)
         if len(stamps) > 1:
-            self._note_spread(stamps[-1] - stamps[0])
+            self._spreads_ns.append(stamps[-1] - stamps[0])
+            del self._spreads_ns[:-DEPTH]
         if self.on_error != "continue":
             errors |= {name: _not_sent(ready[name]) for name, handed in sent.items() if not handed}
-        self.fail(_what(actions), errors)
+        self.fail(", ".join(sorted({action.name for action in actions.values()})), errors)
         return sent
 
     def each(self, function: Callable[[Drone], T], what: str = "") -> dict[str, T]:
@@ -607,8 +610,8 @@ class Swarm:
                 due_s = max(due_s + period_s, time.monotonic())
         finally:  # at a break or an exception in the loop as soon as it drops this generator, which is at once
             for drone in self:
-                if isinstance(drone._core.commands.newest, Velocity | Attitude):
-                    drone._core.let_go("the loop that flew it has ended")
+                if isinstance(drone._commands.newest, Velocity | Attitude):
+                    drone._piloting.let_go("the loop that flew it has ended")
 
     @property
     def spread(self) -> Distribution | None:
@@ -636,17 +639,17 @@ class Swarm:
         if self.on_error == "continue":
             self._aside.update(errors)
             for name in errors:
-                self._drones[name]._core.let_go(f"{what} failed")
+                self._drones[name]._piloting.let_go(f"{what} failed")
             if self.active:
                 return
             errors = dict(self._aside)
         others = {name: drone for name, drone in self._drones.items() if name not in errors}
         if self.on_error == "stop":
             for drone in others.values():
-                drone._core.let_go(f"{what} of another drone failed")
+                drone._piloting.let_go(f"{what} of another drone failed")
         elif self.on_error == "land":
             reason = f"{what} of another drone failed"
-            errors = {**errors, **_problems(others, lambda drone: drone._core.bring_down(reason))}
+            errors = {**errors, **_problems(others, lambda drone: drone._piloting.bring_down(reason))}
         raise SwarmError(what, errors, len(self))
 
     # The end ---------------------------------------------------------------------------------------------------
@@ -664,7 +667,7 @@ class Swarm:
         self._closed = True
         for drone in self._drones.values():
             if not drone.closed:
-                drone._core.commands.bar()  # all before the first lands
+                drone._commands.bar()  # all before the first lands
         return end_flights(self._drones)
 
     def close(self) -> None:
@@ -680,8 +683,8 @@ class Swarm:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        aside = self._still_aside()
-        errors = aside | self._leave()
+        self.active  # noqa: B018  (takes those back that were given back)
+        errors = dict(self._aside) | self._leave()
         if not errors:
             return
         report = SwarmError("the flight", errors, len(self))
@@ -694,15 +697,6 @@ class Swarm:
     def _check_open(self) -> None:
         if self._closed:
             raise ClosedError("this swarm was closed: connect again")
-
-    def _still_aside(self) -> dict[str, Exception]:
-        self.active  # noqa: B018  (takes those back that were given back)
-        return dict(self._aside)
-
-    def _note_spread(self, spread_ns: int) -> None:
-        self._spreads_ns.append(spread_ns)
-        if len(self._spreads_ns) > DEPTH:
-            del self._spreads_ns[0]
 
 
 def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[str, R], dict[str, Exception]]:
@@ -737,12 +731,6 @@ def _place(name: str, numbers: Sequence[float], speed: float | None) -> Position
     return position_action(x, y, z, yaw, speed)
 
 
-def _wait_open(drones: Mapping[str, Drone]) -> None:
-    """Wait, a few milliseconds at most, until every drone sends a new set-point at once, so that none leaves later."""
-    open_ns = max((drone._core.commands.open_ns for drone in drones.values()), default=0)
-    time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
-
-
 def _wait(
     drone: Drone, predicate: Callable[[Feedback], bool], what: str, deadline: float, timeout_s: float
 ) -> Feedback:
@@ -767,7 +755,7 @@ def end_flights(drones: Mapping[str, Drone]) -> dict[str, Exception]:
 
     Ctrl-C meanwhile waits no longer for landings: each is asked for all the same, and goes on without this program.
     """
-    return _problems(drones, lambda drone: drone._core.end_flight())
+    return _problems(drones, lambda drone: drone._piloting.end_flight())
 
 
 def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError | None]) -> dict[str, Exception]:
@@ -790,10 +778,6 @@ def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError |
 def _not_sent(drone: Drone) -> LinkError:
     link = drone.link
     return LinkError(f"the command was not sent: the link is {link.application.value} ({link.reason})")
-
-
-def _what(actions: Mapping[str, AnyAction]) -> str:
-    return ", ".join(sorted({action.name for action in actions.values()}))
 
 
 def in_parallel(

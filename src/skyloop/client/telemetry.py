@@ -9,17 +9,17 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Protocol, Self, TypeVar
 
-from skyloop.client.channels import Channel, FollowingChannel, Mailbox
+from skyloop.client.channels import C, Channel, FollowingChannel, Listener, Mailbox, Notifier, checked_age
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.frame import Arrival, FeedbackHistory, Frame
 from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.client.parameters import Restorer
-from skyloop.client.results import Result, ResultChannels, ResultMailbox
-from skyloop.client.video import VideoChannel, VideoChannels, forget_idle
-from skyloop.errors import UnknownNameError
+from skyloop.client.results import ResultChannels, ResultMailbox
+from skyloop.client.video import VideoChannels, forget_idle
+from skyloop.errors import NoAnswerError, UnknownNameError
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -57,6 +57,12 @@ class LinkStatus:
     remedy: str = ""  #: what a person can do about the vehicle's link while it is not up
 
 
+class Closable(Protocol):
+    """What ends with the drone."""
+
+    def close(self) -> None: ...
+
+
 class Mailboxes:
     """Mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
 
@@ -65,41 +71,39 @@ class Mailboxes:
 
     def __init__(
         self,
-        scheduler: Scheduler,
-        connection: ProxyConnection,
+        state: ClientState,
         *,
-        feedback: Channel[Feedback] | None,
-        frames: FollowingChannel[Arrival, VideoChannel] | None,
-        results: Sequence[Channel[Result]],
-        max_age_s: float | None,
+        feedback: bool = True,
+        frames: bool = True,
+        camera: str | None = None,
+        results: bool = False,
+        processors: Iterable[str] | None = None,
+        max_age_s: float | None = None,
     ) -> None:
-        """Make empty mailboxes.
+        """Make empty mailboxes of what is wanted; see :class:`skyloop.extend.InboxOptions`.
 
-        Args:
-            scheduler: Source of the time and of waiting.
-            connection: What the samples come through.
-            feedback: Channel of feedback, if it is wanted.
-            frames: Channel of frames, if they are wanted.
-            results: Channels of the results that are wanted.
-            max_age_s: Oldest age of a result that is accepted [s]; None: any.
+        Raises what :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel` raise.
         """
-        self.clock = scheduler.clock  #: on which a controller's time runs
-        self.notifier = scheduler.sample_notifier(connection)
+        known = state.results
+        named = [known.everything] if processors is None else [known.channel(one) for one in processors]
+        self.clock = state.scheduler.clock  #: on which a controller's time runs
+        self.notifier = state.sample_notifier()
         self.feedback: Mailbox[Feedback] = Mailbox(1, self.notifier)
         self.frames: Mailbox[Arrival] = Mailbox(1, self.notifier)
-        self.results = ResultMailbox(max_age_s, self.notifier)
-        self._feedback_channel = feedback
-        self._video = frames
-        self._result_channels = results
+        self.results = ResultMailbox(checked_age(max_age_s), self.notifier)
+        self._video = state.follow(lambda: state.video.channel(camera)) if frames else None
+        self._feedback_channel = state.on_feedback if feedback else None
+        self._result_channels = named if results else []
         self._filling = ExitStack()
 
     def __enter__(self) -> Self:
+        fill = self._filling.enter_context
         if self._feedback_channel is not None:
-            self._filling.enter_context(self._feedback_channel.into(self.feedback))
+            fill(self._feedback_channel.into(self.feedback))
         if self._video is not None:
-            self._filling.enter_context(self._video.into(self.frames))
+            fill(self._video.into(self.frames))
         for channel in self._result_channels:
-            self._filling.enter_context(channel.into(self.results))
+            fill(channel.into(self.results))
         return self
 
     def __exit__(
@@ -192,10 +196,13 @@ class ClientState:
     """The newest state of a connected vehicle, and the channels that publish changes of it."""
 
     def __init__(
-        self, name: str, connection: ProxyConnection, scheduler: Scheduler, *, whole_feedback: bool = True
+        self, app: str, connection: ProxyConnection, scheduler: Scheduler, *, whole_feedback: bool = True
     ) -> None:
-        """Make the state of a drone that has not connected yet; ``name`` is the application's."""
+        """Make the state of a drone that has not connected yet; ``app`` is the application's name."""
+        self.app = app
         self.scheduler = scheduler
+        self.listeners: list[Listener[Any]] = []  #: the application's callbacks that were not cancelled
+        self.to_close: list[Closable] = []  #: what ends with the drone
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
         self.received_ns = 0  #: when the newest feedback came, on our clock
@@ -220,10 +227,44 @@ class ClientState:
         self.on_share: Channel[ProcessorShare] = Channel()
         self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; supervisor's thread
         self.results = ResultChannels(connection, scheduler, self.history)
-        self._name = name
         self._clock = scheduler.clock
         self._connection = connection
         self._making = threading.RLock()  # a channel: two threads that ask for the same one get the same
+
+    @property
+    def name(self) -> str:
+        """Name of the proxy; empty before the first connection."""
+        return "" if self.welcome is None else self.welcome.proxy
+
+    def sample_notifier(self) -> Notifier:
+        """Return a notifier for a thread that waits for nothing but samples of this connection."""
+        return self.scheduler.sample_notifier(self._connection)
+
+    def follow(self, find: Callable[[], C]) -> FollowingChannel[Any, C]:
+        """Return the channel that ``find`` returns, also once the proxy was started again with other cameras."""
+        return FollowingChannel(find, self.on_welcome)
+
+    @contextmanager
+    def closing(self, mailbox: Closable) -> Iterator[None]:
+        """Close ``mailbox``, which wakes its consumer, if the drone is closed within the block."""
+        self.to_close.append(mailbox)
+        try:
+            yield
+        finally:
+            self.to_close.remove(mailbox)
+
+    def forget(self, listener: Listener[Any]) -> None:
+        """Forget a listener, which was cancelled."""
+        if listener in self.listeners:
+            self.listeners.remove(listener)
+
+    def no_frame(self, camera: str, timeout_s: float) -> NoAnswerError:
+        """Return the error for a frame that did not come, with what is known of the reason."""
+        link = self.status
+        words = [f"no frame of {camera} came within {timeout_s:g} s"]
+        if link.vehicle is not LinkState.UP:
+            words += [f"the vehicle's link is {link.vehicle.value}", link.reason, link.remedy]
+        return NoAnswerError(": ".join(filter(None, words)))
 
     def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
         """Return the channel of feedback as requested, made on the first call."""
@@ -238,15 +279,8 @@ class ClientState:
         return known[request]
 
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None:
-        """Emit an event of the client's own (number 0).
-
-        Args:
-            kind: Kind of the event.
-            text: What happened, for people.
-            severity: How serious it is.
-            **data: Details, by name.
-        """
-        event = Event(kind, text, self._clock() + self._connection.offset_ns, severity, app=self._name, data=dict(data))
+        """Emit an event of the client's own (number 0); ``data`` are its details, by name."""
+        event = Event(kind, text, self._clock() + self._connection.offset_ns, severity, app=self.app, data=dict(data))
         self.recent.append(event)
         self.on_event.publish(event)
         self.notifier.notify()
@@ -286,18 +320,13 @@ class ClientState:
 
 
 class Receiver:
-    """Handles what arrives from a proxy and changes of the connection.
+    """Gets all that arrives in any session and all that happens to the connection: its handler in every session.
 
-    It is the :class:`skyloop.client.session.ConnectionHandler` of every session. ``feedback``, ``frame`` and the other
-    samples come on the receiving thread, the rest on the supervisor's.
+    ``feedback``, ``frame`` and the other samples come on the receiving thread, the rest on the supervisor's.
     """
 
     def __init__(
-        self,
-        state: ClientState,
-        connection: ProxyConnection,
-        commands: CommandSender,
-        restorer: Restorer,
+        self, state: ClientState, connection: ProxyConnection, commands: CommandSender, restorer: Restorer
     ) -> None:
         self._state = state
         self._connection = connection
@@ -306,6 +335,7 @@ class Receiver:
         self._clock = state.scheduler.clock
         self._overview_pages = OverviewPages()
         self.frame = state.video.receive
+        self.disconnected = commands.disconnected
         self.samples: Mapping[type, Callable[[Any, int], None]] = {
             Event: self._event,
             Applied: self._applied,
@@ -318,7 +348,7 @@ class Receiver:
         }
 
     def connected(self, welcome: Welcome) -> None:
-        """Reset the counters, and take in the vehicle's capabilities; see :class:`ConnectionHandler`."""
+        """Reset the counters, and take in the vehicle's capabilities: a proxy has answered Hello."""
         state = self._state
         state.welcome = welcome
         state.video.connected(welcome.capabilities.cameras, self._clock())
@@ -326,10 +356,6 @@ class Receiver:
         self._restorer.connected(welcome.run_id)
         self._commands.connected(welcome.app_id, welcome.run_id, welcome.capabilities)
         state.on_welcome.publish(welcome)
-
-    def disconnected(self, reason: str) -> None:  # noqa: ARG002  (link_changed publishes it)
-        """Drop the authority and the set-point; ``reason`` is published by :meth:`link_changed`."""
-        self._commands.disconnected()
 
     def link_changed(self, state: LinkState, reason: str) -> None:
         """Publish the state of the hop to the proxy, and an event."""
@@ -339,14 +365,7 @@ class Receiver:
         self._state.emit(EventKind.APPLICATION_LINK, text, severity, state=state.value, reason=reason)
 
     def tick(self, now_ns: int) -> int:
-        """Subscribe again to cameras that have stalled, and send due commands.
-
-        Args:
-            now_ns: On this process's clock.
-
-        Returns:
-            When to call again at the latest [ns].
-        """
+        """Subscribe again to cameras that have stalled, and send what is due; return when to call again [ns]."""
         self._state.video.renew(self._connection.state is LinkState.UP, now_ns)
         return self._commands.tick(now_ns)
 
@@ -370,18 +389,12 @@ class Receiver:
         counter.add(now_ns + offset_ns - sample.published_ns, sample.captured_ns - offset_ns, now_ns)
         if not changed:
             self._commands.feedback(sample, now_ns)
+        status, reason, remedy = state.status, sample.link_reason, sample.link_remedy
         awake = before is not None and before.waking_up and not sample.waking_up
-        if (
-            sample.vehicle_link is not state.status.vehicle
-            or awake
-            or (
-                sample.link_reason
-                and (sample.link_reason, sample.link_remedy) != (state.status.reason, state.status.remedy)
-            )
-        ):
-            reason = sample.link_reason or ("" if awake else _link_reason(state.recent))
-            status = replace(state.status, vehicle=sample.vehicle_link, reason=reason, remedy=sample.link_remedy)
-            state.set_status(status)
+        news = reason and (reason, remedy) != (status.reason, status.remedy)
+        if sample.vehicle_link is not status.vehicle or awake or news:
+            reason = reason or ("" if awake else _link_reason(state.recent))
+            state.set_status(replace(status, vehicle=sample.vehicle_link, reason=reason, remedy=remedy))
 
     def _event(self, event: Event, now_ns: int) -> None:
         """Keep and publish an event."""
@@ -419,9 +432,6 @@ def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
     """Return the predicate for what is waited for, and its name for people.
-
-    Args:
-        wanted: A flight state or its name, several of them, or a predicate on feedback.
 
     Raises:
         UnknownNameError: If there is no flight state of that name.

@@ -71,15 +71,7 @@ class VideoChannel(Channel[Arrival]):
         history: FeedbackHistory,
         request: VideoRequest | None = None,
     ) -> None:
-        """Make a channel without consumers.
-
-        Args:
-            camera: The camera.
-            connection: Where its topics are subscribed to.
-            scheduler: Source of the time and of waiting.
-            history: Looked up for the state at a frame's capture.
-            request: How frames are wanted; None: see :func:`usual`.
-        """
+        """Make a channel without consumers of a camera's frames as requested; None: see :func:`usual`."""
         self.camera = camera
         self.request = request or usual(camera.name)
         super().__init__(lambda on: connection.subscribe(self.request.topic, on))
@@ -108,12 +100,7 @@ class VideoChannel(Channel[Arrival]):
         return None if arrival is None else self.picture(arrival)
 
     def picture(self, arrival: Arrival, max_age_s: float | None = None) -> Frame | None:
-        """Decode the frame; None, and counted, if its pixels can't be decoded, or it is too old.
-
-        Args:
-            arrival: The frame.
-            max_age_s: Oldest age since the capture that is accepted [s]; None: any.
-        """
+        """Decode the frame; None, and counted, if it can't be decoded or is older than ``max_age_s`` [s]."""
         if max_age_s is not None and arrival.age_s > max_age_s:
             self.too_old += 1
             return None
@@ -124,13 +111,9 @@ class VideoChannel(Channel[Arrival]):
             return None
 
     def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, *, as_asked: bool) -> None:
-        """Publish a frame that came; ignores one that is repeated or was overtaken.
+        """Publish a frame that came at ``now_ns``; ignores one that is repeated or was overtaken.
 
-        Args:
-            header: Describes the pixels.
-            pixels: Bytes of the frame, shape (size,), uint8.
-            now_ns: When it came, on this process's clock.
-            as_asked: Whether the proxy made it for this request; if False it is scaled here where needed.
+        ``as_asked``: whether the proxy made it for this request; if False it is scaled here where needed.
         """
         counter = self.counter
         last = counter.last_seq
@@ -169,13 +152,7 @@ class VideoChannel(Channel[Arrival]):
 
 
 class StreamChannel(Channel[EncodedFrame]):
-    """The pictures of one stream, whole, in the order in which they came; some may be missing.
-
-    Args:
-        topic: The stream's.
-        connection: What it comes through.
-        clock: This process's clock [ns].
-    """
+    """The pictures of one stream, whole, in the order in which they came; some may be missing."""
 
     def __init__(self, topic: str, connection: ProxyConnection, clock: Clock) -> None:
         super().__init__(lambda on: connection.subscribe(topic, on))
@@ -197,11 +174,9 @@ class StreamChannel(Channel[EncodedFrame]):
         self.publish(picture)
 
     def report(self, seq: int, *, wants_key: bool = False) -> None:
-        """Tell the proxy what was received, which a rate that follows the path needs. Any thread.
+        """Tell the proxy which picture was the newest, which a rate that follows the path needs. Any thread.
 
-        Args:
-            seq: The newest picture.
-            wants_key: It can't be decoded, as one before it is missing; asked at most some times a second.
+        ``wants_key``: it can't be decoded, as one before it is missing; asked at most some times a second.
         """
         if not self._encoded_here:
             return
@@ -216,12 +191,7 @@ class StreamChannel(Channel[EncodedFrame]):
 class StreamDecoder:
     """Decodes one stream on a thread of its own, in order. What can't be decoded is left out up to a key picture.
 
-    Args:
-        stream: The pictures.
-        deliver: Called with each decoded picture on the decoder's thread: its header, its pixels in BGR, and when it
-            came.
-        clock: This process's clock [ns].
-        name: Of the thread.
+    ``deliver`` is called on that thread with each picture: its header, its pixels in BGR, and when it came [ns].
     """
 
     def __init__(
@@ -334,22 +304,16 @@ class VideoChannels:
     ) -> VideoChannel:
         """Return the channel of a camera whose frames come as requested; see :meth:`skyloop.Drone.frames`.
 
-        Args:
-            camera: Name of the camera; None: the vehicle's first.
-            encoding: ``"jpeg"``, ``"h264"`` or ``"raw"``; None: ``"jpeg"``.
-            quality: Of JPEG, 1 to 100; None: 80.
-            max_fps: Most frames a second; None: all.
-            scale: Factor for width and height, above 0 and up to 1.
-            part: (k, n): only every n-th frame, from k; None: all.
-            kbit_s: Of H.264 [kbit/s]; None: what the path carries.
-            max_age_s: Only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
+        ``max_age_s`` is only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
 
         Raises:
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             UsageError: If an option is out of range, or ``quality`` is given for other frames than JPEG.
             MissingExtraError: If H.264 is asked for and PyAV is not installed.
+            ClosedError: If the drone was closed.
         """
+        self._connection.check_open()
         checked_age(max_age_s)
         channels = self.channels
         if not channels:

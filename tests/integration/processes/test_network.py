@@ -77,8 +77,8 @@ def test_a_proxy_on_the_network_says_that_anyone_can_fly_and_is_flown(far: Calla
     assert (row.name, row.transport, row.host, row.pid) == ("alpha", "fabric", os.uname().nodename, alpha.pid)
     assert (row.vehicle, row.state, row.owner, row.problem) == ("sim", "landed", None, "")
     with skyloop.connect("alpha", network=place) as drone:
-        assert f"(pid {alpha.pid})" in drone._core.connection._session.address  # type: ignore[union-attr]
-        assert drone._core.reach is None, "a process that was not told of the network does not find it"
+        assert f"(pid {alpha.pid})" in drone._connection._session.address  # type: ignore[union-attr]
+        assert drone._reach is None, "a process that was not told of the network does not find it"
         drone.takeoff()
         drone.velocity(forward=0.3)
         drone.wait("flying")

@@ -133,10 +133,10 @@ def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_some
 
 def forge(drone: skyloop.Drone, lease: int, action: Velocity | Land) -> None:
     """Send a command under another lease over this application's own connection."""
-    pilot = drone._core.commands
+    pilot = drone._commands
     packet = encode(Command(pilot._seq + 1, lease, pilot._schedule.intent, time.monotonic_ns(), action))
     pilot._seq += 1
-    assert drone._core.connection.transmit(packet)
+    assert drone._connection.transmit(packet)
 
 
 def count_events(drone: skyloop.Drone, reason: str) -> int:

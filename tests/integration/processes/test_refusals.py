@@ -64,7 +64,7 @@ def test_garbage_does_not_disturb_the_flight(proxy: Callable[..., Process]) -> N
             assert drone.feedback().state is FlightState.FLYING
         events = drone.recent_events()
         assert any(e.kind is EventKind.PACKET_MALFORMED for e in events)
-        assert drone.feedback().owner == drone._core.app
+        assert drone.feedback().owner == drone._state.app
         assert drone.stats["feedback"].lost == 0
         drone.land()
 

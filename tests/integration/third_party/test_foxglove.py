@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 import skyloop
+from skyloop.extend import join_processor
 from skyloop.messages import Polyline
 from tests.integration.third_party.conftest import HERE, PATIENCE_S, absent, node_modules
 from tests.support.processes import Process
@@ -101,7 +102,7 @@ def flown_and_seen(modules: Path, url: str) -> dict[str, Any]:
         environment = {**os.environ, "NODE_PATH": str(modules)}
         node = ["node", str(HERE / "look_foxglove.js"), json.dumps(order)]
         with subprocess.Popen(node, stdout=subprocess.PIPE, text=True, env=environment) as viewer:
-            worker = drone._core.join_processor("detector", code="Detector 1")
+            worker = join_processor(drone, "detector", code="Detector 1")
             for threshold in itertools.cycle((0.1, 0.2)):
                 if viewer.poll() is not None:
                     break

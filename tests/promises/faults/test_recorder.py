@@ -206,7 +206,7 @@ def test_feedback_is_recorded_beside_samples_that_make_no_sense(rig: Rig, tmp_pa
             log_entry(text="late", at_ns=2**64 - 1),
             log_entry(name="mocap", values=[float("nan")] * 7, shape=[7]),
         ):
-            assert rig.other._core.connection.transmit(packet)
+            assert rig.other._connection.transmit(packet)
         files.until(lambda: rig.proxy._counts["packets.malformed"] == 3, "all three are counted")
         assert rig.other.log.text("the last word")
         files.until(lambda: len(files.of(path, "/alpha/logs")) >= 1, "what comes after them is recorded")

@@ -151,7 +151,7 @@ def priority(here: Here, name: str) -> int:
 def watch_numbers(here: Here, name: str) -> None:
     """Write down the number of each packet of feedback, also of one that comes twice."""
     found = here.objects[f"{name} numbers"] = []
-    connection = here.drones[name]._core.connection._session
+    connection = here.drones[name]._connection._session
     assert connection is not None
     monitor = connection.monitor
     original = monitor.feedback

@@ -190,6 +190,7 @@ class Ears:
     offset_ns = 0
 
     def subscribe(self, topic: str, on: bool = True) -> None: ...
+    def check_open(self) -> None: ...
 
 
 def test_a_client_forgets_processors_that_nobody_here_asks_for() -> None:

@@ -207,7 +207,9 @@ def test_from_a_network_frames_come_as_h264_and_in_their_own_form_where_that_can
             viewer.unsubscribe(video)
             # A proxy that can't encode sends nothing: JPEG is shown instead.
             monkeypatch.setattr(taps, "_STREAM_GONE_NS", 1)
-            monkeypatch.setattr(drone._core.stream("front", subscriber="x").__class__, "receive", lambda *_: None)
+            monkeypatch.setattr(
+                drone._state.video.stream("front", subscriber="x").__class__, "receive", lambda *_: None
+            )
             viewer.subscribe(video)
             viewer.until(lambda one: image in one.topics)
 

@@ -1,0 +1,443 @@
+"""What an application has its vehicle do: the wait for a command, letting go, and the end of the flight."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Final, Literal
+
+from skyloop.child_process import leave_to_parent
+from skyloop.client.actions import OUTDONE, OVERRULED
+from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
+from skyloop.client.connection import ProxyConnection
+from skyloop.client.telemetry import ClientState
+from skyloop.errors import (
+    AuthorityError,
+    ClosedError,
+    NoAnswerError,
+    RefusedError,
+    SkyloopError,
+    UnsupportedError,
+)
+from skyloop.messages import (
+    AnyAction,
+    EmergencyStop,
+    EventKind,
+    Failsafe,
+    Fate,
+    Feedback,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    LinkState,
+    Outcome,
+    Refusal,
+    ResetEmergency,
+    ReturnPhase,
+    Severity,
+    Takeoff,
+)
+from skyloop.messages.command import ENDINGS, SET_POINTS
+
+OnExit = Literal["land", "hover"]
+STOP_S: Final = 2.0  #: how long closing waits for an emergency stop to show
+LANDING_S: Final = 20.0  #: how long a landing is waited for
+OTHERS_S: Final = 1.0  #: within which feedback says who took a vehicle whose landing was refused
+RETURN_S: Final = 180.0  #: how long a return that the proxy began is waited for
+AGAIN_NS: Final = 500_000_000  #: between a take-off that is not possible yet and the next attempt
+#: Where the proxy does not tell: feedback received sooner after a command may be older than it.
+_STALE_NS: Final = 100_000_000
+_NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
+_ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
+_SINKING: Final = (*_ENDED_IN, FlightState.LANDING)
+_log = logging.getLogger("skyloop")
+
+
+def _silent(step: str) -> None:
+    """Report nothing."""
+
+
+class Piloting:
+    """What one application has its vehicle do, up to the end of the flight. May be used from any thread."""
+
+    def __init__(
+        self,
+        connection: ProxyConnection,
+        state: ClientState,
+        commands: CommandSender,
+        on_exit: OnExit,
+        close: Callable[[], None],
+    ) -> None:
+        """Prepare to fly; ``close`` ends the connection, after the end of the flight."""
+        self.commands = commands
+        self._connection = connection
+        self._state = state
+        self._on_exit = on_exit
+        self._close = close
+        self._end = threading.Lock()  # one end of the flight, whoever asks for it
+        leave_to_parent(self)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the drone was closed, or belongs to the parent process."""
+        return self._connection.why_closed != ""
+
+    @property
+    def ending(self) -> bool:
+        """Whether the end of the flight has begun, or it is closed."""
+        return self.closed or self.commands.barred
+
+    def forked(self) -> None:
+        """Leave the vehicle and the connection to the parent process; in a child made by ``os.fork``."""
+        if not self.closed:
+            self._connection.forked()
+
+    def complete(
+        self,
+        action: AnyAction,
+        is_done: Callable[[Feedback], bool],
+        wait: bool,
+        timeout_s: float,
+        *,
+        automatic: bool = False,
+    ) -> None:
+        """Send the command and, if ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`.
+
+        A take-off that is not done in time lets the vehicle go. So does a caller that waits no longer, as after Ctrl-C,
+        but for a landing.
+        """
+        if not wait:
+            self.commands.command(action, now=True)
+            return
+        if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
+            self._connection.check_may_wait()
+        deadline_s = time.monotonic() + timeout_s
+        waiting = None
+        try:
+            waiting = ActionWait(action, is_done, self.commands, self._state, self._connection, automatic=automatic)
+            self._connection.check_may_wait()
+            waiting.wait(timeout_s, deadline_s)
+        except SkyloopError as error:
+            if isinstance(error, NoAnswerError) and type(action) is Takeoff:
+                self.let_go("it did not take off in time")
+            raise
+        except BaseException as error:
+            unasked = isinstance(error, GivenUpError) and (waiting is None or waiting.outdone)
+            if type(action) is not Land and not unasked:
+                self.let_go(f"nobody waits for {action.name} any more")
+            raise
+
+    def report(self, where: str, error: Exception | SystemExit) -> None:
+        """Emit an event that a callback of the application raised an exception; ``sys.exit()`` ends the flight."""
+        text = f"{where} raised {type(error).__name__}: {error}"
+        self._state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
+        if isinstance(error, SystemExit) and not self.ending:
+            self.commands.bar()
+            try:  # no daemon: the interpreter waits for the landing
+                threading.Thread(target=self.end_flight, name="skyloop-end").start()
+            except RuntimeError:  # there is none to be had, and this one may not wait
+                self.let_go(f"{where} ended the program", land=True)
+
+    def let_go(self, reason: str, *, land: bool = False) -> bool:
+        """Hover, or land, because the library finds that it has to: the only place where it does so by itself.
+
+        Nobody decided that, so a vehicle that others fly, that lands or that returns is left alone, here and by the
+        proxy, and so is what the application itself has landed or stopped. A take-off that does not show is ended.
+        With ``land`` it lands, rather than hovers. Returns whether something was sent.
+        """
+        commands, feedback, kind = self.commands, self._state.newest, type(self.commands.newest)
+        if self.closed or kind in LANDING or (kind is Hover and not land):
+            return False
+        leave = feedback is None or feedback.others or _returns(feedback)
+        if land or (kind is Takeoff and feedback is not None and feedback.state is FlightState.LANDED):
+            action: AnyAction = Idle() if leave else Land()
+        else:
+            action = Idle() if leave or (feedback is not None and feedback.state in _SINKING) else Hover()
+        try:
+            if commands.status.state != "held":
+                commands.drop()
+                return False
+            sent = commands.command(action, automatic=True)
+        except SkyloopError:
+            return False
+        if type(action) is not Idle:
+            _log.info("%s: %s, because %s", self._state.name, action.name, reason)
+        return sent
+
+    def end_flight(self, report: Callable[[str], object] = _silent) -> SkyloopError | None:
+        """End the flight: land what this application flies, or hover (see ``on_exit``), then close.
+
+        From its first line on commands of the application's other threads raise :class:`ClosedError`; only an emergency
+        stop still passes. Waits until the vehicle has landed. A second call waits for the first. Idempotent. ``report``
+        is called with each step, for people. Returns what went wrong; None if nothing did.
+        """
+        if self.closed:  # also in a fork, where somebody may have held the locks
+            return None
+        self.commands.bar()
+        with self._end:
+            try:
+                land = self._on_exit == "land"
+                return None if self.closed else self.bring_down("its flight ends", report, land=land)
+            finally:
+                self._close()
+
+    def bring_down(
+        self, reason: str, report: Callable[[str], object] = _silent, *, land: bool = True
+    ) -> SkyloopError | None:
+        """Land what this application flies and wait until it has landed, or let it go; see :meth:`end_flight`."""
+        self.finish_stop()
+        feedback = self._state.newest
+        if not self._flies():
+            if feedback is not None and feedback.state.airborne and (whose := self._others_hands()):
+                report(f"{whose}: the drone is left to it")
+            return None
+        try:
+            if not land:
+                self.let_go(reason)
+            elif feedback is not None and _returns(feedback):
+                report("it returns to its start and lands")
+                self._connection.check_may_wait()
+                if not self._state.notifier.wait_for(lambda: self._is_down() or cancelled.get()(), RETURN_S):
+                    return NoAnswerError(f"the vehicle has not returned and landed within {RETURN_S:g} s")
+            else:
+                report("landing")
+                self.complete(Land(), lambda newest: newest.state in _ENDED_IN, True, LANDING_S, automatic=True)
+        except RefusedError as error:
+            if not self._state.notifier.wait_for(lambda: self._others_hands() != "", OTHERS_S):
+                return error
+            report(f"{self._others_hands()}: the drone is left to it")  # who took it a moment ago, too
+        except SkyloopError as error:
+            return error
+        return None
+
+    def finish_stop(self) -> None:
+        """Wait, for 2 s at most, until an emergency stop has shown: it would end with the connection."""
+        if self._connection.connected and not self._connection.receiving:
+            self._state.notifier.wait_for(lambda: not self.commands.stopping, STOP_S)
+
+    def _is_down(self) -> bool:
+        newest = self._state.newest
+        return self.closed or newest is None or newest.state in _ENDED_IN
+
+    def _others_hands(self) -> str:
+        """Return who flies the vehicle in place of this application; empty if nobody took it."""
+        status, newest = self.commands.status, self._state.newest
+        if status.state in ("queued", "preempted"):
+            return f"{status.holder or 'another application'} took over"
+        return "" if newest is None else newest.others or ""
+
+    def _flies(self) -> bool:
+        """Whether this application has the vehicle in the air, or has just commanded a take-off."""
+        newest = self._state.newest
+        if self._state.status.vehicle is LinkState.CLOSED:
+            return False  # a recording that has ended: nothing to land
+        airborne = newest is not None and newest.state.airborne
+        if newest is not None and newest.others:
+            return False  # flown by others too: not ours to land or to stop
+        return self.commands.status.state == "held" and (airborne or self.commands.wants_flight)
+
+
+class ActionWait:
+    """One commanded action, and the wait for feedback that shows that it is done."""
+
+    def __init__(
+        self,
+        action: AnyAction,
+        is_done: Callable[[Feedback], bool],
+        commands: CommandSender,
+        state: ClientState,
+        connection: ProxyConnection,
+        *,
+        automatic: bool,
+    ) -> None:
+        """Send the action as :meth:`CommandSender.ask`; ``is_done`` looks at feedback that is newer than it."""
+        self._action = action
+        self._is_done = is_done
+        self._automatic = automatic
+        self._commands = commands
+        self._state = state
+        self._connection = connection
+        self._problem: Exception | None = None
+        self._why = ""  # it was not done yet, for people
+        self._why_link: LinkState | None = None  # the vehicle's link at that time, of which it may speak
+        self._flew = False  # it was in the air meanwhile
+        self._refused, self._refused_ns = 0, 0  # the newest intent of ours that was not possible yet, and since when
+        self._asked_ns = state.scheduler.clock()
+        # The call may take the vehicle from the pilot who has it now, or when it can first be sent.
+        self._others, self._may_be_sent = self._others_now, commands.may_ask
+        self._intent = commands.ask(action, automatic=automatic)
+
+    @property
+    def outdone(self) -> bool:
+        """Whether the application asked for something else since, which a set-point behind a take-off is not."""
+        commands = self._commands
+        behind = type(self._action) is Takeoff and isinstance(commands.newest, SET_POINTS)
+        return commands.intent != self._intent and not behind
+
+    def wait(self, timeout_s: float, deadline_s: float) -> None:
+        """Wait until the action is done.
+
+        Args:
+            timeout_s: What the caller gave [s], for the error.
+            deadline_s: Until when, on ``time.monotonic``.
+
+        Raises:
+            NoAnswerError: If it is not done in time.
+            ClosedError: If the drone is closed.
+            AuthorityError: If another application takes over.
+            UnsupportedError: If the vehicle does not support it.
+            RefusedError: If the proxy refuses it in the present state, or something ends it.
+        """
+        if not self._state.notifier.wait_for(self._over, deadline_s - time.monotonic()):
+            raise NoAnswerError(self._not_reached(timeout_s))
+        if self._problem is not None:
+            raise self._problem
+
+    def _over(self) -> bool:
+        """Whether it is done, or waiting longer can't help."""
+        if type(self._action) is Land and self._done():  # whoever landed it
+            return True
+        self._problem = self._why_not()
+        return self._problem is not None or self._done()
+
+    def _done(self) -> bool:
+        """Whether feedback from after it shows that it is done."""
+        newest = self._state.newest
+        if newest is None:
+            return False
+        self._flew = self._flew or newest.state.airborne
+        if not self._is_done(newest):
+            return False
+        outcome = newest.outcome
+        if outcome is None:
+            return self._state.received_ns - self._asked_ns > _STALE_NS
+        if outcome.app_id != self._commands.app_id or outcome.intent < self._intent:
+            return False
+        if outcome.intent == self._intent and type(self._action) is Land and not self._flew:
+            return outcome.over  # it stood already: a take-off may have been on its way
+        return True
+
+    def _why_not(self) -> Exception | None:
+        """Why waiting longer can't help; None if it can. Asks again for what may be possible then."""
+        name = self._action.name
+        if self._connection.why_closed or (self._commands.barred and not self._automatic):
+            return ClosedError(f"this drone was closed while {name} was under way")
+        if cancelled.get()():
+            return GivenUpError()
+        status = self._commands.status
+        if status.state in ("queued", "preempted"):
+            return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
+        told = self._commands.told
+        if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
+            self._note(told.text)  # nothing any more, once a repeat is carried out
+            if not told.over:  # carried out: whoever has the vehicle from now on took it since
+                self._others, self._may_be_sent = None, True
+        outcome = self._commands.outcome(self._intent)
+        if outcome is None or not outcome.failed:
+            return None
+        if outcome.reason is Refusal.UNSUPPORTED:
+            return UnsupportedError(outcome.text)
+        if outcome.fate not in OUTDONE:
+            self._note(outcome.text)
+        if type(self._action) is Takeoff:
+            return self._why_no_takeoff(outcome)
+        if type(self._action) is Land:
+            return self._why_no_landing(outcome)
+        if outcome.fate in OUTDONE:
+            return _replaced(self._action)
+        if outcome.fate in OVERRULED:
+            if not self._commands.may_ask:
+                return None
+            return RefusedError(
+                f"{name} was ended on the way, by a failsafe or a lost link: send the command again", code="not_fresh"
+            )
+        return _refused(outcome)
+
+    def _why_no_takeoff(self, outcome: Outcome) -> Exception | None:
+        if outcome.reason in _NOT_YET or outcome.fate is Fate.TIMED_OUT:
+            now_ns, newest = self._state.scheduler.clock(), self._state.newest
+            if self._refused != self._intent:
+                self._refused, self._refused_ns = self._intent, now_ns
+            # Its withdrawal shows as a landing at first, which would end another take-off.
+            # One that still wakes up is asked again when it is awake: until then it can only refuse.
+            stands = newest is not None and not newest.state.airborne and not newest.waking_up
+            if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
+                self._again()
+            return None
+        if outcome.fate in OUTDONE:
+            if self._called_off():
+                return _replaced(self._action)
+            return None  # what has begun ends by itself
+        if outcome.fate in OVERRULED:
+            newest = self._state.newest
+            rose = newest is not None and newest.state.airborne and newest.state is not FlightState.LANDING
+            if rose or not self._commands.may_ask:  # what rose by then hovers in the end, and it is done
+                return None
+            text = f"takeoff was ended on the way, as {ENDINGS[outcome.fate]}: take off again"
+            return RefusedError(text, code=Refusal.NOT_FRESH)
+        return _refused(outcome)
+
+    def _called_off(self) -> bool:
+        """Whether the application asked for something since that ends a take-off, or did before it had begun."""
+        commands, newest = self._commands, self._state.newest
+        if commands.latest(Land, EmergencyStop, ResetEmergency) > self._intent:
+            return True
+        # A hover and idle end one that does not show yet: where the proxy had them and it still stands, it is over.
+        stayed, told = commands.latest(Hover, Idle), commands.told
+        stands = newest is not None and newest.state is FlightState.LANDED
+        return stands and self._intent < stayed and told is not None and told.intent >= stayed
+
+    def _why_no_landing(self, outcome: Outcome) -> Exception | None:
+        """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
+        if outcome.fate in OVERRULED:
+            if self._commands.may_ask:
+                # The caller still asks for it, but a pilot who took the vehicle by hand since then keeps it. While the
+                # application's own link is lost, nothing shows that.
+                taken = self._may_be_sent and self._others_now not in (None, self._others)
+                self._again(automatic=taken or outcome.fate not in (Fate.FAILSAFE, Fate.AUTHORITY))
+            return None
+        return None if outcome.fate in OUTDONE else _refused(outcome)
+
+    def _again(self, *, automatic: bool = True) -> None:
+        self._asked_ns = self._state.scheduler.clock()
+        self._intent = self._commands.ask(self._action, automatic=automatic or self._automatic, again=self._intent)
+
+    @property
+    def _others_now(self) -> str | None:
+        return None if self._state.newest is None else self._state.newest.others
+
+    def _not_reached(self, timeout_s: float) -> str:
+        newest, connection = self._state.newest, self._connection
+        state = "in a state that is not known" if newest is None else newest.state.value
+        text = f"{self._action.name} was not completed within {timeout_s:g} s: the vehicle is {state}"
+        if connection.state.value not in ("up", "degraded"):
+            return f"{text}, and the link is {connection.state.value} ({connection.reason})"
+        if newest is not None and newest.vehicle_link not in (LinkState.UP, LinkState.DEGRADED):
+            return f"{text}, and its own link is {newest.vehicle_link.value} ({newest.link_reason})"
+        if newest is not None and newest.waking_up:
+            return f"{text}; it is {newest.link_reason}"
+        return f"{text}; {self._why}" if self._why and self._why_link is self._vehicle_link else text
+
+    def _note(self, why: str) -> None:
+        if self._why != why:
+            self._why, self._why_link = why, self._vehicle_link
+
+    @property
+    def _vehicle_link(self) -> LinkState | None:
+        return None if self._state.newest is None else self._state.newest.vehicle_link
+
+
+def _replaced(action: AnyAction) -> RefusedError:
+    return RefusedError(f"{action.name} was ended on the way: another command took its place", code="replaced")
+
+
+def _refused(outcome: Outcome) -> RefusedError:
+    return RefusedError(outcome.text, code=str(outcome.reason))
+
+
+def _returns(feedback: Feedback) -> bool:
+    """Whether a failsafe flies the vehicle back to its start."""
+    return feedback.failsafe is Failsafe.LAND and feedback.return_phase is not ReturnPhase.NONE
