@@ -262,20 +262,24 @@ class RobotSession:
         pending = _Pending(state, self._clock())
 
         def answered(success: bool, text: str) -> None:
+            why = f"the robot refused {service}: {text or 'without a reason'}"
             with self._lock:
                 if success:
                     self._up = up
                 elif up:
-                    self._refused = f"the robot refused {service}: {text or 'without a reason'}"
+                    self._refused = why
+                elif self._pending is pending and self._velocity is None:
+                    self._velocity = Velocity()  # it may go on with what was sent last
                 if self._pending is pending:
                     self._pending = None
             if not success:
-                text = f"the robot refused {service}: {text or 'without a reason'}"
-                self._sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, reason="service_failed")
+                self._sink.event(EventKind.VEHICLE_MESSAGE, why, Severity.ERROR, reason="service_failed")
 
         self._refused = ""
+        if not up:
+            self._velocity = Velocity()  # where nobody offers to land it, it stops
         self._robot.call(service, answered)
-        self._pending = pending
+        self._velocity, self._pending = None, pending
 
     def _received(self) -> int:
         """Note that something came, and return the time."""
