@@ -782,6 +782,23 @@ def test_a_hover_is_sent_to_what_falls_silent(stop: AnyAction) -> None:
     assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
 
 
+@pytest.mark.parametrize("wanted", [Velocity(forward=-0.5), Velocity(left=0.3)])
+def test_what_falls_silent_is_stopped_where_another_velocity_is_wanted(wanted: Velocity) -> None:
+    """It flew on for up to 3 s the way that its pilot had turned away from, if it only could not be heard."""
+    bench = Bench(Vehicle(ARDUPILOT), options("mavlink://udpin:127.0.0.1:14540?parameters=no")).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(1.0)
+    bench.go_on(0.7, silent=True)
+    bench.said.clear()
+    bench.apply(wanted)
+    bench.go_on(0.2, silent=True)
+    told = bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
+    assert len(told) >= 3
+    assert {(each.vx, each.vy, each.vz, each.yaw_rate) for each in told} == {(0.0, 0.0, 0.0, 0.0)}
+    bench.go_on(0.1)
+    assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")[-1].vx == pytest.approx(wanted.forward)
+
+
 def test_a_vehicle_whose_only_answer_was_lost_is_asked_again() -> None:
     """It told its version, so nothing more was asked, and no set-point was ever sent again."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")

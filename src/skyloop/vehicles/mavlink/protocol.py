@@ -375,12 +375,11 @@ class MavlinkSession(VehicleSession):
         if self.version is None or not self._heard_by_it:
             self.commands.request(_ASK_VERSION, now_ns, VERSION_PACE_S)
         self._intervals.request_missing(self.telemetry, self.commands, now_ns)
-        messages = (
-            self.setpoints.messages(vehicle, now_ns) if self.setpoints is not None and vehicle is not None else []
-        )
-        holds = self.setpoints is not None and self.setpoints.holds  # harmless late, and needed now
-        if not self._heard_by_it or not (holds or self._is_read(now_ns)):
-            messages = []  # they would wait somewhere, and be followed when somebody reads again
+        messages: list[Message] = []
+        if self.setpoints is not None and vehicle is not None:
+            messages = self.setpoints.messages(vehicle, now_ns, read=self._is_read(now_ns))
+        if not self._heard_by_it:
+            messages = []  # nothing shows that it can be reached at all
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 
     def _is_read(self, now_ns: int) -> bool:

@@ -99,6 +99,7 @@ class SetpointController:
         self._setpoint: Setpoint | None = None
         self._lead_ns: int | None = None  # since when the stream flows
         self._sent_ns = 0
+        self._followed: Velocity | None = None  # the velocity that was sent last where it is read
         self._entered = False  # the mode that is wanted was seen since
         self._strayed_ns: int | None = None  # since when it is another one again
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
@@ -319,8 +320,27 @@ class SetpointController:
         events, self._events = self._events, []
         return events
 
-    def messages(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
-        """Return the set-points that are due now; commands go to the command sender."""
+    def messages(self, vehicle: VehicleState, now_ns: int, *, read: bool = True) -> list[Message]:
+        """Return the set-points that are due now; commands go to the command sender.
+
+        Args:
+            vehicle: What is known of it.
+            now_ns: The present time.
+            read: Whether it reads what is sent soon, as far as what is heard shows. If not, set-points would wait
+                somewhere and be followed late, but for what stops it: that is needed now, and does no harm then. So a
+                vehicle that was sent another velocity than is wanted now is stopped.
+        """
+        due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
+        wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None
+        if not read and not self._holds:
+            if not due or wanted is None or wanted == self._followed:
+                return []
+            wanted, due = Velocity(), [velocity_message(Velocity(), self._commands.target)]
+        if due:
+            self._followed = wanted
+        return due
+
+    def _due_messages(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
         self._stepped_ns = now_ns
         if self.step_stop(vehicle, now_ns):
             return []
@@ -343,7 +363,7 @@ class SetpointController:
         return []
 
     @property
-    def holds(self) -> bool:
+    def _holds(self) -> bool:
         """Whether it is to stay in the air where it is."""
         setpoint = self._setpoint
         stops = isinstance(setpoint, VelocitySetpoint) and setpoint.action == Velocity()
