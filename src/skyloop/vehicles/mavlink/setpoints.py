@@ -55,6 +55,7 @@ DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
 DISARM_NS: Final = nanoseconds(0.5)  #: an arming that is undone is asked about for so long after it was seen last
+IDLES_NS: Final = nanoseconds(12.0)  #: armed on the ground for so long, both autopilots have disarmed it by themselves
 STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
 HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
 
@@ -105,7 +106,7 @@ class SetpointController:
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
         self._stepped_ns = 0  # when what is wanted now had its last step; 0: it has not had one
         self._arms_until_ns: int | None = None  # a take-off that a landing broke off may arm it until then
-        self._disarms_until_ns = 0  # a take-off that was given up may arm it until then, which is undone
+        self._disarms_until_ns = 0  # a take-off that was given up, or cut off, may arm it until then: that is undone
         self._blind_until_ns = 0
         self._events: list[VehicleEvent] = []
 
@@ -189,7 +190,7 @@ class SetpointController:
         elif not vehicle.airborne:
             takeoff = TakeoffSequence(self._autopilot, self.takeoff_m, now_ns, disarms=self.goal is Goal.LAND)
             self._end()
-            self.goal, self._takeoff = Goal.TAKE_OFF, takeoff
+            self.goal, self._takeoff, self._disarms_until_ns = Goal.TAKE_OFF, takeoff, 0
         elif self.goal is not Goal.FOLLOW:
             self._follow(PositionHold(now_ns))
 
@@ -264,10 +265,12 @@ class SetpointController:
         if self.goal is Goal.FOLLOW:
             self._end()
             self.goal = Goal.HOLD
-        elif self.goal is Goal.TAKE_OFF:
-            started = self._takeoff is not None and self._takeoff.started
+        elif self.goal is Goal.TAKE_OFF and self._takeoff is not None:
+            takeoff = self._takeoff
             self._end()
-            self.goal = Goal.HOLD if started else Goal.NOTHING
+            self.goal = Goal.HOLD if takeoff.started else Goal.NOTHING
+            if takeoff.arm_asked_ns is not None and not takeoff.rose:  # it may stand there armed, for nobody
+                self._disarms_until_ns = takeoff.arm_asked_ns + IDLES_NS
         self._entered, self._strayed_ns = False, None  # what it does by itself meanwhile is nobody's decision
         self.ownership.on_link_lost()
 
@@ -428,8 +431,8 @@ class SetpointController:
         return messages
 
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Disarm what a take-off that was given up has armed; what rises, or is in another mode, others have armed."""
-        if vehicle.airborne or vehicle.mode != self._autopilot.ARMING:
+        """Disarm what a take-off that was given up, or cut by a lost link, has armed; what rises, or is in another mode, others have armed."""
+        if vehicle.airborne or vehicle.mode not in (self._autopilot.ARMING, self._autopilot.HOLD):
             self._disarms_until_ns = 0
         elif vehicle.armed and vehicle.airborne is False:
             self._disarms_until_ns = max(self._disarms_until_ns, now_ns + DISARM_NS)
