@@ -830,6 +830,19 @@ def test_an_emergency_stop_goes_before_all_else() -> None:
     assert rank_of(m.MAVLink_command_long_message(1, 1, m.MAV_CMD_COMPONENT_ARM_DISARM, 0, *[0.0] * 7)) is Rank.COMMAND
 
 
+def test_what_can_not_be_encoded_keeps_no_stop_back() -> None:
+    """One pose with a number too large for its field, and nothing that was due with it was sent."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    pose = ExternalPose((1e39, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), bench.clock())
+    bench.session.command(EmergencyStop(), bench.clock())
+    bench.session.send(pose_message(pose, PoseMessage.ODOMETRY))
+    bench.tick()
+    assert [each.param2 for each in bench.heard_of("COMMAND_LONG")] == [21196.0]
+    bench.session.send(pose_message(pose, PoseMessage.ODOMETRY))
+    bench.tick()
+    assert sum("ODOMETRY is not sent" in text for text in bench.texts) == 1, "told once"
+
+
 def test_a_take_off_is_decided_by_one_state_of_the_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
     bench, read = Bench(Vehicle(ARDUPILOT)).found(), list[int]()
     state = MavlinkSession.vehicle_state

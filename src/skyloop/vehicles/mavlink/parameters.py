@@ -143,7 +143,12 @@ class ParameterExchange:
             elif write.sent_ns is None or now_ns - write.sent_ns >= WRITE_NS:
                 write.sent_ns = now_ns
                 kind = self.reported[write.name].kind
-                field = to_field(write.value, kind, bytewise=self.bytewise)
+                try:
+                    field = to_field(write.value, kind, bytewise=self.bytewise)
+                except struct.error as error:  # it has another type since it was asked for
+                    self._writes.remove(write)
+                    write.done(f"{write.value:g} does not fit: {error}")
+                    continue
                 messages.append(m.MAVLink_param_set_message(*self.target, write.name.encode(), field, kind))
         return messages
 

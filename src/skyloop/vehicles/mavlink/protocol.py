@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
@@ -126,6 +127,7 @@ class MavlinkSession(VehicleSession):
         self._unheard = False  # lost while it was armed: our heartbeats would keep its own failsafe from acting
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
+        self._unfit: set[str] = set()  # kinds of messages of which one could not be encoded, as was told
         self._kind: tuple[int, int] | None = None  # autopilot and type, by its heartbeat
         self._known_as: Message | None = None  # the version told before the link was lost, until it is told again
         self._heard_by_it = True  # False: nothing shows yet that it reads what is sent
@@ -355,9 +357,7 @@ class MavlinkSession(VehicleSession):
         elif self._stop.step(None, now_ns):
             self.commands.request(CUT, now_ns, 0.0)
             out += self.commands.pop_messages()
-        packets += [
-            Packet(self._encoded(message), peer, rank_of(message)) for message in out if self._axes.sent(message)
-        ]
+        packets += [packet for message in out if (packet := self._packet(message, peer)) is not None]
         self.due_ns = self._next_ns(now_ns)
         return packets
 
@@ -397,8 +397,19 @@ class MavlinkSession(VehicleSession):
         versions = (1, 2) if self._old and self.options.key is None else (2,)
         return [Packet(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
 
-    def _encoded(self, message: Message) -> bytes:
-        return self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)
+    def _packet(self, message: Message, peer: Peer) -> Packet | None:
+        """Return a message as it is sent; None for one that can't be: it keeps no other back, such as a stop."""
+        if not self._axes.sent(message):
+            return None
+        try:
+            data = self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)
+        except (struct.error, OverflowError) as error:
+            if (kind := message.get_type()) not in self._unfit:
+                self._unfit.add(kind)
+                text = f"{kind} is not sent: it has a number that MAVLink has no room for ({error})"
+                self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "encoding"}))
+            return None
+        return Packet(data, peer, rank_of(message))
 
     def _check_health(self, vehicle: VehicleState | None, now_ns: int) -> None:
         for event in self._health.update(self.telemetry, vehicle, now_ns):
