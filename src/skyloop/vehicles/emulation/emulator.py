@@ -15,7 +15,7 @@ from skyloop.faults import Faults
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence
-from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.emulation.datagrams import Loop
 from skyloop.vehicles.emulation.video import VideoEncoding
 
 _log = logging.getLogger(__name__)

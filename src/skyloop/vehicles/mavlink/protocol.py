@@ -35,9 +35,9 @@ from skyloop.vehicles.mavlink.options import ConnectionKind, MavlinkOptions, Pee
 from skyloop.vehicles.mavlink.parameters import ParameterExchange
 from skyloop.vehicles.mavlink.setpoints import CUT, SetpointController
 from skyloop.vehicles.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
+from skyloop.vehicles.mavlink.wire.axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
 
 TICK_NS: Final = nanoseconds(0.02)
 REST_NS: Final = nanoseconds(0.1)  #: the same while nothing is under way: for silence, heartbeats and requests

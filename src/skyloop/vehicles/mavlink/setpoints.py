@@ -431,7 +431,10 @@ class SetpointController:
         return messages
 
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Disarm what a take-off that was given up, or cut by a lost link, has armed; what rises, or is in another mode, others have armed."""
+        """Disarm what a take-off has armed that is given up, or cut by a lost link.
+
+        What rises, or is in another mode, others have armed.
+        """
         if vehicle.airborne or vehicle.mode not in (self._autopilot.ARMING, self._autopilot.HOLD):
             self._disarms_until_ns = 0
         elif vehicle.armed and vehicle.airborne is False:

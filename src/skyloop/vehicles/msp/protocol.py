@@ -21,9 +21,8 @@ from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.messages.parameter import Diagnostic
-from skyloop.vehicles.msp.firmware import SUPPORTED, Setup, hindrances
-from skyloop.vehicles.msp.identification import Identification
-from skyloop.vehicles.msp.options import MspOptions
+from skyloop.vehicles.msp.firmware import SUPPORTED, Identification, Setup, hindrances
+from skyloop.vehicles.msp.parameters import MspOptions
 from skyloop.vehicles.msp.setpoints import PASSING, Phase, Report, SetpointController
 from skyloop.vehicles.msp.telemetry import MotionEstimate, Questions, Reported, Telemetry, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp

@@ -8,11 +8,11 @@ from typing import Final
 
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
-from skyloop.vehicles.replay.options import SPEEDS
 
 POSITION: Final = "replay.position_s"
 SPEED: Final = "replay.speed"
 PAUSED: Final = "replay.paused"
+SPEEDS: Final = (0.01, 1000.0)  #: slowest and fastest, in seconds of the recording in a second
 NAMES: Final = frozenset({POSITION, SPEED, PAUSED})
 
 _IN_STEP: Final = (

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from skyloop.vehicles.ardrone.wire.navdata import FIRST_SEQUENCE
-from skyloop.vehicles.emulation.datagrams import Address, bound
-from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.emulation.datagrams import Address, Loop, bound
 
 MOST: Final = 8
 

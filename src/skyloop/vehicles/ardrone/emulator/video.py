@@ -45,8 +45,7 @@ from skyloop.vehicles.ardrone.wire.uvlc_codes import (
     UVLC_START,
     PictureType,
 )
-from skyloop.vehicles.emulation.encoders import Encoder, Format
-from skyloop.vehicles.emulation.video import Piece
+from skyloop.vehicles.emulation.video import Encoder, Format, Piece
 
 _NS_PER_US: Final = 1000
 _NS_PER_MS: Final = 1_000_000

@@ -29,11 +29,10 @@ from skyloop.faults import Faults
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.vehicles.emulation.datagrams import Loop
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
-from skyloop.vehicles.emulation.encoders import GROUP
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
-from skyloop.vehicles.emulation.loop import Loop
-from skyloop.vehicles.emulation.video import OneCamera, VideoEncoding
+from skyloop.vehicles.emulation.video import GROUP, OneCamera, VideoEncoding
 from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
 from skyloop.vehicles.mavlink.emulator.autopilot import Autopilot
 from skyloop.vehicles.mavlink.emulator.links import (
