@@ -118,20 +118,7 @@ class ArdroneDriver(Driver):
         return known + [entry.parameter for entry in self._entries().values()]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a key, or give a command that is a parameter. Takes up to 0.9 s: a key is acknowledged and read back.
-
-        Args:
-            name: A name that :meth:`parameters` lists.
-            value: Of the parameter's type.
-
-        Returns:
-            The value in force, as it was read back.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The driver is not open, the configuration was not read yet, the value does not fit, or the
-                drone did not acknowledge or accept it.
-        """
+        """Write a key, which is acknowledged and read back, or give a command. Takes up to 0.9 s."""
         link, commands = self._link, self._commands
         if link is None or commands is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)

@@ -45,15 +45,7 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
             self.session.send(message, times)
 
     def write(self, key: str, text: str) -> str | None:
-        """Write a key and read it back. Takes up to 0.9 s. Any thread but the link's.
-
-        Args:
-            key: As the drone calls it.
-            text: Its value as text.
-
-        Returns:
-            Why it failed, or None.
-        """
+        """Write a key and read it back; return why it failed, or None. Takes up to 0.9 s. Any thread but the link's."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             deadline_ns = self._clock() + nanoseconds(WRITE_S)

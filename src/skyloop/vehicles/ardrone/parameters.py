@@ -135,12 +135,7 @@ def _wrong(parameter: Parameter, what: str) -> ParameterError:
 
 
 def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entry]:
-    """Return all parameters of a configuration, by name. Keys that Skyloop does not know are texts, read-only.
-
-    Args:
-        values: Keys and values as they were read.
-        version: Of the drone; None counts as 2.
-    """
+    """Return all parameters of a configuration, by name. Keys that Skyloop does not know are texts, read-only."""
     found: dict[str, Entry] = {}
     for name, text in values.items():
         entry = _own_entry(name, text, version)
@@ -155,12 +150,7 @@ def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entr
 
 
 def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entry, str]:
-    """Return the entry and the key's text for a new value.
-
-    Raises:
-        UnknownNameError: There is no such parameter.
-        ParameterError: It is read-only, or the value is not of its type.
-    """
+    """Return the entry and the key's text for a new value; raises for a name or a value that does not fit."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the AR.Drone", name, entries)
@@ -170,13 +160,7 @@ def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entr
 
 
 def taken(entry: Entry, wanted: str, reported: str) -> bool:
-    """Return whether the drone reports what was written, apart from its way of writing numbers.
-
-    Args:
-        entry: The parameter.
-        wanted: The text that was written.
-        reported: The text that was read back.
-    """
+    """Return whether the drone reports what was written, apart from its way of writing numbers."""
     try:
         one, other = parse_value(wanted, entry.like), parse_value(reported, entry.like)
     except DecodeError:

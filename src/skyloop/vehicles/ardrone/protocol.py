@@ -119,14 +119,7 @@ class ArdroneSession(VehicleSession):
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action and have it sent soon.
-
-        Returns:
-            What is applied, after the drone's limits.
-
-        Raises:
-            DriverError: It can't be done now; see :meth:`SetpointController.apply`.
-        """
+        """Accept an action and have it sent soon; see :meth:`SetpointController.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
         self._keep(action, now_ns)

@@ -53,12 +53,7 @@ _CAMERAS: Final = {
 
 
 def cameras_of(uri: VehicleUri, version: int | None) -> tuple[CameraInfo, ...]:
-    """Return both cameras, of which the drone shows one at a time.
-
-    Args:
-        uri: The vehicle's address; intrinsics in it are the front camera's.
-        version: Of the drone; None counts as 2.
-    """
+    """Return both cameras, of which the drone shows one at a time. Intrinsics in the address are the front camera's."""
     front, bottom = _CAMERAS[version or 2]
     given = intrinsics_of(uri, front.width, front.height)
     return (msgspec.structs.replace(front, intrinsics=given) if given is not None else front, bottom)
@@ -82,12 +77,7 @@ class DroneStamps:
         self._time_ms = 0  # the same without wraps
 
     def captured_ns(self, stamp_ms: int, arrived_ns: int) -> int:
-        """Return when a picture was captured, never later than it arrived.
-
-        Args:
-            stamp_ms: The PaVE header's, 32 bits.
-            arrived_ns: On this host's clock.
-        """
+        """Return when a picture was captured, by the stamp of its PaVE header: never later than it arrived."""
         step_ms = (stamp_ms - self._stamp_ms + _WRAP // 2) % _WRAP - _WRAP // 2
         self._stamp_ms = stamp_ms
         self._time_ms += step_ms
@@ -256,11 +246,7 @@ class DatagramStream:
 
 
 def open_stream(version: int, host: str, port: int, connection: int, clock: Clock) -> Stream:
-    """Connect to the drone's video. An AR.Drone 1's absence shows only when reading.
-
-    Raises:
-        OSError: The drone can't be reached.
-    """
+    """Connect to the drone's video. An AR.Drone 1's absence shows only when reading."""
     return (PaveStream if version == 2 else DatagramStream)(host, port, connection, clock)
 
 
@@ -362,11 +348,7 @@ class UvlcVideo:
 
 
 def make_decoder(version: int) -> Decoder:
-    """Return the decoder for a version of the drone.
-
-    Raises:
-        MissingExtraError: What it needs is not installed.
-    """
+    """Return the decoder for a version of the drone; raises if what it needs is not installed."""
     return PaveVideo() if version == 2 else UvlcVideo()
 
 

@@ -73,13 +73,7 @@ class Loop:
     def watch(
         self, sock: socket.socket, readable: Callable[[], None], writable: Callable[[], None] | None = None
     ) -> None:
-        """Have a function called when a socket has something to read.
-
-        Args:
-            sock: Replaces an earlier watch of the same socket.
-            readable: Called when there is something to read.
-            writable: Called when there is room to write; None: never.
-        """
+        """Have functions called when a socket has something to read, or room to write, from now on."""
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if writable else 0)
         try:
             self._selector.modify(sock, events, (readable, writable))
@@ -201,18 +195,10 @@ class DatagramPort:
 
 
 def bound(kind: socket.SocketKind, bind: Address, name: str) -> socket.socket:
-    """Return a non-blocking socket that is bound.
+    """Return a non-blocking socket that is bound; raises LinkError, with what to do about it, where that can't be.
 
     A TCP port may be bound again while connections of an earlier firmware are still winding down; a UDP port may not be
     shared, or two firmwares would steal each other's datagrams.
-
-    Args:
-        kind: TCP or UDP.
-        bind: Address and port of this machine.
-        name: Of the port, for the error.
-
-    Raises:
-        LinkError: The port can't be opened; with what to do about it.
     """
     made = socket.socket(socket.AF_INET, kind)
     made.setblocking(False)

@@ -86,13 +86,7 @@ class RunningEmulator(ABC):
         return math.inf if self._video is not None and self._video.wants(camera) else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Encode a picture that is due.
-
-        Args:
-            model: Its camera.
-            pixels: BGR, uint8, shape (height, width, 3); must not change any more.
-            captured_ns: When it was captured, on this host's monotonic clock.
-        """
+        """Encode a picture that is due: BGR, uint8, shape (height, width, 3), which must not change any more."""
         if self._video is not None:
             self._video.show(model.name, pixels, captured_ns)
 
@@ -161,11 +155,7 @@ class Emulator(ABC, Generic[R]):
 
 
 def checked_delay(delay_s: float) -> float:
-    """Return a delay [s] if it is from 0 to :data:`LONGEST_DELAY_S`.
-
-    Raises:
-        UsageError: It is not.
-    """
+    """Return a delay [s] if it is from 0 to :data:`LONGEST_DELAY_S`."""
     if not 0 <= delay_s <= LONGEST_DELAY_S:
         raise UsageError(f"a delay is from 0 to {LONGEST_DELAY_S:g} s, not {delay_s!r}")
     return delay_s

@@ -121,13 +121,7 @@ class VideoEncoding(Generic[S]):
         return camera in self._settings().cameras
 
     def show(self, camera: str, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Hand over a picture. Returns at once.
-
-        Args:
-            camera: Its name.
-            pixels: BGR, uint8, shape (height, width, 3); must not change any more.
-            captured_ns: When it was captured.
-        """
+        """Hand over a picture: BGR, uint8, shape (height, width, 3), which must not change any more."""
         shown = self._settings().cameras
         if camera not in shown:
             return
@@ -258,14 +252,7 @@ class Encoder:
         self._count = 0
 
     def encode(self, picture: NDArray[np.uint8]) -> Encoded | None:
-        """Encode a picture.
-
-        Args:
-            picture: BGR, uint8, shape (height, width, 3), of any size: it is scaled.
-
-        Returns:
-            None if the encoder gave nothing.
-        """
+        """Encode a picture: BGR, uint8, shape (height, width, 3), of any size. None: the encoder gave nothing."""
         import av
 
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
@@ -295,14 +282,7 @@ def as_the_drone_does(stream: bytes) -> Encoded:
 
 
 def require_encoder(what: str = "the video of an emulated AR.Drone 2") -> None:
-    """Check that PyAV is installed.
-
-    Args:
-        what: Needs it, for the error.
-
-    Raises:
-        MissingExtraError: It is not.
-    """
+    """Check that PyAV is installed; ``what`` needs it, for the error."""
     try:
         import av  # noqa: F401
     except ImportError as error:

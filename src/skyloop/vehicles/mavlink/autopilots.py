@@ -187,10 +187,6 @@ class AutopilotProfile(ABC):
         """Return a diagnostic for each safety net that this autopilot has a parameter for.
 
         By default both autopilots only drop the last set-point when this computer or its link dies.
-
-        Args:
-            values: The vehicle's parameters.
-            own_system: The MAVLink system that we are.
         """
         return [net.diagnostic(values[net.name]) for net in self.SAFETY_NETS if net.name in values]
 

@@ -143,20 +143,12 @@ class _Stream(ByteStream):
     whole = False
 
     def receive(self) -> list[tuple[bytes, Peer]]:
-        """Return what came.
-
-        Raises:
-            OSError: The connection ended, or the port was unplugged.
-        """
+        """Return what came; raises OSError where nothing more will come."""
         data = self.read()
         return [(data, None)] if data else []
 
     def send(self, packet: Packet) -> None:
-        """Send a packet, or drop it; see :meth:`ByteStream.write`.
-
-        Raises:
-            OSError: The vehicle no longer reads what is sent.
-        """
+        """Send a packet, or drop it; see :meth:`ByteStream.write`."""
         self.write(packet.data, packet.rank)
 
 
@@ -192,15 +184,7 @@ _KINDS: Final[dict[ConnectionKind, type[UdpListener | TcpClient | SerialPort]]] 
 
 
 def open_connection(address: Address) -> MavlinkConnection:
-    """Open a connection. Takes a second at most.
-
-    Args:
-        address: With a numeric host.
-
-    Raises:
-        OSError: It can't be opened.
-        MissingExtraError: It is a serial port, and pyserial is not installed.
-    """
+    """Open a connection, to a numeric host. Takes a second at most."""
     return _KINDS[address.kind](address)
 
 
@@ -253,15 +237,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
             self._send_due(self._clock())
 
     def write(self, name: str, value: float) -> str | None:
-        """Write a parameter. Takes up to 0.9 s. Any thread but the link's.
-
-        Args:
-            name: The autopilot's.
-            value: In the autopilot's unit.
-
-        Returns:
-            Why it failed, or None.
-        """
+        """Write a parameter; return why it failed, or None. Takes up to 0.9 s. Any thread but the link's."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             now_ns = self._clock()
@@ -305,11 +281,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
         return open_connection(self._address())
 
     def _address(self) -> Address:
-        """Return the address with a numeric host.
-
-        Raises:
-            OSError: The host is not known, or not yet.
-        """
+        """Return the address with a numeric host; raises OSError where that is not known, or not yet."""
         address = self.session.options.address
         if address.kind not in (ConnectionKind.TCP, ConnectionKind.UDP_OUT):
             return address

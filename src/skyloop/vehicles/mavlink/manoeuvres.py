@@ -269,13 +269,7 @@ class TakeoffSequence:
         return self._armed_ns is not None and (self.rose or not self._disarms)
 
     def step(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> list[Message]:
-        """Ask for what is missing, and return the set-points that are due.
-
-        Args:
-            vehicle: What is known of it.
-            commands: Sends what is asked for.
-            now_ns: The present time.
-        """
+        """Ask for what is missing, and return the set-points that are due."""
         self._observe(vehicle, commands, now_ns)
         if self.done or self.given_up or self.taken_over or self._other_ns is not None:
             return []

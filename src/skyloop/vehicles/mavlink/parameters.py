@@ -72,14 +72,7 @@ class ParameterExchange:
             write.done(reason)
 
     def write(self, name: str, value: float, deadline_ns: int, done: Callable[[str | None], None]) -> None:
-        """Write a parameter that the vehicle reported.
-
-        Args:
-            name: The autopilot's.
-            value: In the autopilot's unit.
-            deadline_ns: When it fails if the vehicle did not confirm it.
-            done: Called with why it failed, or None.
-        """
+        """Write a parameter, in the autopilot's unit; by the deadline ``done`` gets why it failed, or None."""
         self._writes.append(_PendingWrite(name, value, deadline_ns, done))
 
     @property
@@ -161,13 +154,7 @@ class ParameterExchange:
 
 
 def is_confirmed(wanted: float, reported: float, *, exact: bool) -> bool:
-    """Return whether the vehicle reports the value that was written.
-
-    Args:
-        wanted: As written.
-        reported: As reported.
-        exact: If not, they are compared in single precision.
-    """
+    """Return whether the vehicle reports the value that was written; unless ``exact``, in single precision."""
     return wanted == reported if exact else math.isclose(wanted, reported, rel_tol=1e-6, abs_tol=1e-9)
 
 
@@ -238,11 +225,7 @@ class VehicleParameter:
     native: str
 
     def to_native(self, value: Value) -> float:
-        """Return a value as the autopilot takes it.
-
-        Raises:
-            ParameterError: It is no finite number, no whole one where one is needed, or out of range.
-        """
+        """Return a value as the autopilot takes it; raises for one that it would not take."""
         name, whole = self.parameter.name, self.parameter.type is ParameterType.INT
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise ParameterError(f"{name} takes a finite number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
@@ -269,12 +252,7 @@ def vehicle_parameters(held: Mapping[str, ReportedParameter]) -> dict[str, Vehic
 
 
 def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> VehicleParameter:
-    """Return a parameter that can be written.
-
-    Raises:
-        UnknownNameError: There is no such parameter.
-        ParameterError: It is read-only.
-    """
+    """Return a parameter that can be written; raises for one that is not known, or read-only."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the vehicle", name, entries)
@@ -284,17 +262,9 @@ def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> Ve
 
 
 def check_exact(name: str, number: int, *, bytewise: bool) -> int:
-    """Return a whole number, if the vehicle would receive exactly that.
+    """Return a whole number, if the vehicle would receive exactly that; raises if it would not.
 
     ArduPilot writes whole numbers as floats of single precision: those beyond 24 bits may come out as others.
-
-    Args:
-        name: Of the parameter.
-        number: To be written.
-        bytewise: Whether the vehicle takes integers as they are.
-
-    Raises:
-        ParameterError: It would receive another number.
     """
     if bytewise:
         return number
@@ -367,11 +337,7 @@ def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
 
 
 def with_limit(values: Mapping[str, float], name: str, value: Value) -> dict[str, float]:
-    """Return the driver's own limits after one was written.
-
-    Raises:
-        ParameterError: It is no finite number, or out of range.
-    """
+    """Return the driver's own limits after one was written; raises for a number that is not finite, or out of range."""
     limit = _LIMITS[name]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ParameterError(f"{name} takes a finite number, not {value!r:.60}", code=Refusal.WRONG_TYPE)

@@ -158,20 +158,7 @@ class MavlinkSession(VehicleSession):
     # From the driver ---------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Accept an action. See :meth:`SetpointController.apply`.
-
-        Args:
-            action: What is asked for.
-            now_ns: The present time.
-            alone: Whether nobody is in command: a failsafe.
-            new: Whether an application newly asked for it; False for the library's repeats.
-
-        Returns:
-            What is applied.
-
-        Raises:
-            DriverError: The vehicle can't be flown, can't do this now, or somebody else has it.
-        """
+        """Accept an action; see :meth:`SetpointController.apply`. Raises for a vehicle that can't be flown, too."""
         if isinstance(action, EmergencyStop) and self._kind is None:  # found in flight, maybe, in a moment
             self._stop.press(now_ns)
             self.due_ns = now_ns
@@ -228,14 +215,7 @@ class MavlinkSession(VehicleSession):
     # From the connection -----------------------------------------------------------------------------------------
 
     def receive(self, data: bytes, peer: Peer, now_ns: int, *, whole: bool) -> None:
-        """Handle bytes that came. Never raises, whatever they hold.
-
-        Args:
-            data: What came.
-            peer: Where a datagram came from.
-            now_ns: When it came.
-            whole: Whether ``data`` is a datagram; if not, it is a piece of a stream.
-        """
+        """Handle bytes that came from a peer: a datagram if ``whole``. Never raises, whatever they hold."""
         for message in self.codec.decode(data, whole=whole, source=peer):
             self._on_message(message, peer, now_ns)
         if self.codec.signed > self._signed:

@@ -384,12 +384,10 @@ class SetpointController:
         return True
 
     def step_blind(self, now_ns: int) -> bool:
-        """Send what an application newly asked for while nothing is received: the vehicle may hear it all the same.
+        """Send what was newly asked for while nothing is heard; return whether a command is under way.
 
-        What a failsafe asks for is not sent so: who flies the vehicle by now can't be seen.
-
-        Returns:
-            Whether a command is under way.
+        The vehicle may hear it all the same. What a failsafe asks for is not sent so: who flies the vehicle by now
+        can't be seen.
         """
         modes = {Goal.HOLD: self._autopilot.HOLD, Goal.LAND: self._autopilot.LAND}
         if self.stop.active or now_ns >= self._blind_until_ns or self.goal not in modes:
@@ -478,11 +476,7 @@ class SetpointController:
         return self._strayed_ns is not None and now_ns - self._strayed_ns >= STRAYED_NS
 
     def _leave(self, vehicle: VehicleState) -> bool:
-        """Leave the vehicle to a mode that was not chosen here.
-
-        Returns:
-            Whether it is still ours to hold and to land.
-        """
+        """Leave the vehicle to a mode that was not chosen here; return whether it is still ours to hold and to land."""
         why = "its own failsafe" if vehicle.failsafe else "not from here"
         self._notify(f"the vehicle went to {vehicle.mode} ({why}): set-points are no longer sent", reason="mode")
         self._end()

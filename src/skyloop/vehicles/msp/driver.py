@@ -109,12 +109,7 @@ class MspDriver(Driver):
             return DriverParameters(self._setpoints).parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The driver is not open, or the value does not fit.
-        """
+        """Write a parameter."""
         link = self._link
         if link is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)

@@ -114,11 +114,9 @@ class Setup:
         return min(MOST_AUX, max(LEAST_AUX, used))
 
     def aux_us(self, *, arm: bool, given: Mapping[int, int]) -> list[int]:
-        """Return the AUX channels that switch on what is wanted, and as little else as can be.
+        """Return the AUX channels [µs] that switch on what is wanted, and as little else as can be.
 
-        Args:
-            arm: Whether it is to be armed.
-            given: Pulse widths [µs] that a person set, by channel from 0; that of the arm switch is left out.
+        ``given`` are those that a person set, by channel from 0; that of the arm switch is left out.
         """
         wanted = {self.number(ANGLE)}
         if arm:
@@ -181,11 +179,7 @@ class Setup:
     # Whether it may be flown -------------------------------------------------------------------------------------
 
     def diagnose(self, *, override: bool) -> list[Diagnostic]:
-        """Return what its settings mean for a flight. What is severe keeps it from being armed.
-
-        Args:
-            override: Whether a pilot keeps a real receiver.
-        """
+        """Return what its settings mean for a flight. What is severe keeps it from being armed."""
         name = Diagnostic("firmware", True, str(self.identity))
         return [name, *self._modes(override), *self._receiver(override), *self._failsafe(override)]
 

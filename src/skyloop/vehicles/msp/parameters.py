@@ -42,12 +42,7 @@ class MspOptions:
 
 
 def options_of(uri: VehicleUri) -> MspOptions:
-    """Parse an address.
-
-    Raises:
-        UnknownNameError: It has an unknown option.
-        UsageError: It names no place, or an option's value makes no sense.
-    """
+    """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     rate = uri.number("rate", DEFAULT_RATE_HZ, minimum=20.0, maximum=250.0)
     override = uri.flag("override", default=False)
@@ -100,12 +95,7 @@ class DriverParameters:
         return [entry.parameter for entry in self._entries().values()]
 
     def write(self, name: str, value: Value) -> Value:
-        """Write a parameter and return the value in force.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The value is no number, or out of range.
-        """
+        """Write a parameter and return the value in force; raises for a name or a value that does not fit."""
         entries = self._entries()
         if name not in entries:
             raise UnknownNameError("parameter of msp://", name, entries)

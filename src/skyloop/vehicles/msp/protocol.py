@@ -100,11 +100,7 @@ class MspSession(VehicleSession):
     # From the driver -----------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action.
-
-        Raises:
-            DriverError: It can't be done now; see :meth:`SetpointController.apply`.
-        """
+        """Accept an action; see :meth:`SetpointController.apply`."""
         self.setpoints.on_motion(self.motion.at(now_ns))
         applied = self.setpoints.apply(action, now_ns)
         self.due_ns = min(self.due_ns, now_ns if isinstance(action, EmergencyStop) else self._sticks_due_ns)
@@ -116,11 +112,7 @@ class MspSession(VehicleSession):
         return self.setpoints.ask_takeoff(now_ns)
 
     def on_pose(self, pose: ExternalPose, now_ns: int) -> None:
-        """Take in a pose from outside.
-
-        Raises:
-            DriverError: It is stamped ahead; see :meth:`ExternalPose.bounded`.
-        """
+        """Take in a pose from outside; see :meth:`ExternalPose.bounded`."""
         self.motion.on_pose(pose.bounded(now_ns))
 
     def close(self) -> None:

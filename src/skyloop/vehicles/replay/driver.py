@@ -84,11 +84,7 @@ class ReplayDriver(Driver):
         return True
 
     def source(self) -> ReplaySource:
-        """Open the recording.
-
-        Raises:
-            UsageError: It is not there, can't be read, or ends before ``start``.
-        """
+        """Open the recording; raises for one that is not there, can't be read, or ends before ``start``."""
         recording, drone = self._read()
         source = ReplaySource(recording, drone, self.options.start_s)
         if source.empty:
@@ -170,12 +166,7 @@ class ReplayOptions:
 
 
 def options_of(uri: VehicleUri) -> ReplayOptions:
-    """Parse an address.
-
-    Raises:
-        UnknownNameError: It has an option that is not in :data:`KNOWN`.
-        UsageError: It names no file, an option's value makes no sense, or options don't go together.
-    """
+    """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(f"{uri} names no file: it looks like replay:///home/me/flight.mcap?speed=2")

@@ -92,14 +92,9 @@ class Playback:
         ]
 
     def set(self, name: str, value: Value) -> Value:
-        """Write a parameter; the player follows at once. To go on from the end is to start over.
+        """Write a parameter, which the player follows at once; return what is in force.
 
-        Returns:
-            The value that is in force.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The value is out of range, or the replay is in step with its application.
+        To go on from the end is to start over.
         """
         if name not in NAMES:
             raise UnknownNameError("parameter of a replay", name, NAMES)

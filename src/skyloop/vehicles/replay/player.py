@@ -72,12 +72,7 @@ class ReplayPublisher:
             self._sink.link(state, reason)
 
     def prepare(self, sample: TimedSample, timeline: Timeline) -> Callable[[], None]:
-        """Do the slow part now and return a function that publishes the sample once it is due.
-
-        Args:
-            sample: What to publish.
-            timeline: Maps its time to the replay's clock.
-        """
+        """Do the slow part now and return a function that publishes the sample once it is due."""
         value = sample.value
         if isinstance(value, Feedback):
             return lambda: self.feedback(value, timeline, sample.at_ns)
@@ -98,10 +93,8 @@ class ReplayPublisher:
     def still(self, moment: Moment) -> Callable[[], None]:
         """Return a function that publishes a moment as it is now: its state and its pictures, with one capture time.
 
-        It may be called again and again, while the replay is paused; each picture is decoded once.
-
-        Args:
-            moment: What to show. Its command and its parameters are those in force from now on.
+        It may be called again and again, while the replay is paused; each picture is decoded once. The moment's command
+        and parameters are those in force from now on.
         """
         self._command = {} if moment.command is None else described(moment.command)
         for parameter in moment.parameters:
@@ -122,13 +115,7 @@ class ReplayPublisher:
         return publish
 
     def feedback(self, feedback: Feedback, timeline: Timeline, at_ns: int) -> None:
-        """Publish the vehicle's block as it was; the recorded proxy's becomes native telemetry.
-
-        Args:
-            feedback: As it was recorded.
-            timeline: Maps its time to the replay's clock.
-            at_ns: The position in the recording, on its own clock.
-        """
+        """Publish the vehicle's block as it was, at this position; the recorded proxy's becomes native telemetry."""
         if feedback.vehicle_link in _LINKS:
             self.link(feedback.vehicle_link, "as recorded")
         playback = self._playback
@@ -261,10 +248,9 @@ class Player:
         self._damaged = 0  # frames, in the passes before
 
     def run(self, wait_for: tuple[str, ...]) -> None:
-        """Play until stopped. At the end the link is closed, and up again if somebody goes back from there.
+        """Play until stopped, from when somebody wants one of these cameras, if any.
 
-        Args:
-            wait_for: Cameras of which one must be wanted before it begins; empty: begin at once.
+        At the end the link is closed, and up again if somebody goes back from there.
         """
         playback = self._playback
         for parameter in self._source.parameters():
@@ -406,11 +392,7 @@ class StepPlayer:
         self._next = next(self._samples, None)
 
     def step(self) -> None:
-        """Publish the next sample; its time is now. After the last one the link is closed.
-
-        Raises:
-            UsageError: The recording is over.
-        """
+        """Publish the next sample; its time is now. After the last one the link is closed."""
         sample = self._next
         if sample is None:
             raise UsageError("the recording is over")

@@ -85,11 +85,7 @@ class ReplaySource:
         return self.first_ns
 
     def moment(self, at_ns: int) -> Moment:
-        """Return what was known at a time, without reading what is far from it.
-
-        Args:
-            at_ns: On the clock of the recorded proxy.
-        """
+        """Return what was known at a time of the recorded proxy's clock, without reading what is far from it."""
         parts = range(len(self._recording.found.pieces))
         part = bisect_right(parts, at_ns, key=self._first_known_ns) - 1
         moment = Moment(at_ns)

@@ -139,11 +139,7 @@ class RobotLink:
         return next((name for name, client in self._clients.items() if not client.service_is_ready()), "")
 
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
-        """Call a ``std_srvs/Trigger``, without waiting for the answer.
-
-        Raises:
-            DriverError: Nobody offers it.
-        """
+        """Call a ``std_srvs/Trigger``, without waiting for the answer; raises DriverError where nobody offers it."""
         from std_srvs.srv import Trigger
 
         client = self._clients[service]

@@ -109,11 +109,7 @@ class Options:
 
 
 def options_of(uri: VehicleUri) -> Options:
-    """Return the options of an address.
-
-    Raises:
-        UsageError: One is unknown or makes no sense, or they name neither images nor odometry.
-    """
+    """Return the options of an address."""
     reject_unknown_options(uri, KNOWN)
     namespace = f"/{uri.place.strip('/')}" if uri.place.strip("/") else ""
     if namespace and not _NAME.match(namespace):

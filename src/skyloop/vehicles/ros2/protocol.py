@@ -329,11 +329,7 @@ class RobotSession:
 
 
 def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
-    """Return the bytes of a ``sensor_msgs/CompressedImage`` as uint8, shape (bytes,), and its width and height.
-
-    Raises:
-        DecodeError: It is no JPEG.
-    """
+    """Return the bytes of a ``sensor_msgs/CompressedImage`` as uint8, shape (bytes,), and its width and height."""
     import numpy as np
 
     from skyloop.messages.frame import image_size
@@ -362,13 +358,7 @@ class CaptureClock:
         self._newest_ns = 0
 
     def captured_ns(self, stamp_ns: int, arrived_ns: int, system_ns: int) -> int:
-        """Return when a message was captured.
-
-        Args:
-            stamp_ns: Its stamp; 0: it has none.
-            arrived_ns: When it came, on the monotonic clock.
-            system_ns: The same on the system's clock.
-        """
+        """Return when a message with this stamp was captured; 0: it has none. It arrived at a time of both clocks."""
         age_ns = system_ns - stamp_ns
         if stamp_ns == 0:
             captured_ns = arrived_ns
@@ -383,9 +373,7 @@ class CaptureClock:
 def state_of(odometry: Any, *, ground: bool) -> dict[str, Any]:
     """Return the fields of a feedback that a ``nav_msgs/Odometry`` holds; what is not finite is left out.
 
-    Args:
-        odometry: Its pose is in world axes, its twist in those of the body.
-        ground: Whether the robot stays on the ground: then its height is none.
+    Its pose is in world axes, its twist in those of the body; a robot that stays on the ground has no height.
     """
     found: dict[str, Any] = {}
     turn, place = odometry.pose.pose.orientation, odometry.pose.pose.position

@@ -303,13 +303,7 @@ class SimDriver(Driver):
         return sink.wanted_fps(camera) if sink is not None and self._link else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Publish an image that is due.
-
-        Args:
-            model: The camera.
-            pixels: BGR, uint8, shape (height, width, 3).
-            captured_ns: When it was captured, on this host's clock.
-        """
+        """Publish an image that is due: BGR, uint8, shape (height, width, 3)."""
         sink = self._sink
         if sink is not None and self._link:
             sink.frame(
@@ -349,11 +343,7 @@ class SetpointController:
         self._setpoint: Attitude | Velocity | None = None
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Command the drone as :meth:`Simulation.command` does, but accept set-points in every state.
-
-        Returns:
-            What is applied.
-        """
+        """Command the drone as :meth:`Simulation.command` does, but accept set-points in every state."""
         with self._lock:
             if not isinstance(action, Attitude | Velocity):
                 self._setpoint = None

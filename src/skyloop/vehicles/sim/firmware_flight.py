@@ -118,11 +118,7 @@ class FirmwareFlight:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, host: SimHost, drone: int, sink: Sink) -> None:
-        """Start the firmware and let it fly the drone; its driver is opened as soon as its process runs.
-
-        Raises:
-            UsageError: Its program is not here, or no port is free for it.
-        """
+        """Start the firmware and let it fly the drone; its driver is opened as soon as its process runs."""
         self._host, self._drone, self._sink = host, drone, sink
         folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
         if folder is not None and host.drones > 1:

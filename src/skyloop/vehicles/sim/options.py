@@ -57,12 +57,7 @@ TRUTH_HZ: Final = 100.0  #: how often the truth is noted that is reported beside
 
 
 def options_of(uri: VehicleUri) -> SimOptions:
-    """Parse an address.
-
-    Raises:
-        UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
-        UsageError: An option's value makes no sense, or options don't go together.
-    """
+    """Parse an address."""
     autopilot = _autopilot(uri)
     if autopilot is None:
         reject_unknown_options(uri, KNOWN)

@@ -107,12 +107,7 @@ class TelloDriver(Driver):
         return [] if self._settings is None else self._settings.parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter. Takes up to 0.95 s: the drone answers.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The driver is not open, the value does not fit, or the drone refused or did not answer.
-        """
+        """Write a parameter. Takes up to 0.95 s: the drone answers."""
         if self._settings is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
         return self._settings.write(name, value)

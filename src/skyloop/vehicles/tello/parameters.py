@@ -118,11 +118,7 @@ def scale_parameters(limits: Scale, full: Scale) -> list[Parameter]:
 
 
 def scaled(scale: Scale, parameter: Parameter, value: Value) -> Scale:
-    """Return a scale with one number changed.
-
-    Raises:
-        ParameterError: The value is no number or out of the parameter's range.
-    """
+    """Return a scale with one number changed; raises for a value that does not fit."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ParameterError(f"{parameter.name} takes a number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
     low, high = parameter.minimum, parameter.maximum
@@ -168,11 +164,7 @@ def known_settings(sdk: Sdk | None) -> dict[str, Setting]:
 
 
 def command_of(setting: Setting, value: Value) -> str:
-    """Return the command that sets a value.
-
-    Raises:
-        ParameterError: The value is of another type, or none of the choices.
-    """
+    """Return the command that sets a value; raises for one of another type, or none of the choices."""
     parameter = setting.parameter
     if type(value) is not type(parameter.value):
         raise ParameterError(
@@ -217,10 +209,8 @@ class DroneSettings:
     def write(self, name: str, value: Value) -> Value:
         """Write a parameter and return the value in force. Takes up to 0.95 s.
 
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: It is read-only, the value does not fit, a flip is asked for on the ground, or the drone
-                refused or did not answer.
+        Raises for a name or a value that does not fit, for a flip on the ground, and where the drone refuses or is
+        silent.
         """
         known = {parameter.name: parameter for parameter in self.parameters()}
         if name not in known:

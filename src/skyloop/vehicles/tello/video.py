@@ -66,10 +66,7 @@ def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
 def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | None:
     """Return a camera's intrinsics for pictures of another width, which the drone makes smaller when asked to.
 
-    Args:
-        front: The front camera, with its intrinsics at full size.
-        camera: The one that is shown; None is known of the other's.
-        width: Of the pictures [px].
+    Known are those of the front camera, at full size.
     """
     known = front.intrinsics
     if camera != FRONT or known is None:

@@ -229,12 +229,7 @@ class VideoOptions:
 
 
 def options_of(uri: VehicleUri) -> VideoOptions:
-    """Parse an address.
-
-    Raises:
-        UnknownNameError: It has an option that is not in :data:`KNOWN`.
-        UsageError: It names no file, or an option's value makes no sense.
-    """
+    """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(
@@ -273,11 +268,7 @@ def _place(uri: VehicleUri) -> tuple[Path, CameraSource | None]:
 
 
 def _check_kind(uri: VehicleUri, source: CameraSource | None) -> None:
-    """Check that options fit what the address names.
-
-    Raises:
-        UsageError: They don't.
-    """
+    """Check that options fit what the address names; raises if they don't."""
     if source is not None and (uri.flag("loop") or uri.number("speed", 1.0) != 1.0):
         raise UsageError(f"{uri}: a live camera has no loop and no speed")
     unfit = {

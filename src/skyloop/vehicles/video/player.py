@@ -317,15 +317,7 @@ class CameraPublisher:
         self.sink.feedback(Feedback(captured_ns=now_ns, native=native))
 
     def show(self, image: DecodedImage, due_ns: int) -> bool:
-        """Convert an image now and publish it when it is due, as captured then.
-
-        Args:
-            image: The image.
-            due_ns: When to publish it.
-
-        Returns:
-            False if the driver is being closed.
-        """
+        """Convert an image now and publish it when it is due, as captured then. False: the driver is being closed."""
         pixels = _bgr(image) if self.wanted else None
         if not self.wait_until(due_ns):
             return False
@@ -365,12 +357,7 @@ class FilePlayer:
         self._speed = speed
 
     def run(self, source: Source, *, wait: bool) -> None:
-        """Play until the end, or until the driver is closed, and close the source.
-
-        Args:
-            source: The first pass over the recording.
-            wait: Whether to wait until somebody wants the images.
-        """
+        """Play until the end, or until the driver is closed; ``wait``: from when somebody wants the images."""
         publisher = self._publisher
         publisher.sink.link(LinkState.UP)
         while wait and not (publisher.wanted or publisher.wanted_encoded):

@@ -152,14 +152,7 @@ class V4l2Device:
         return Control(number, _text(name), minimum, maximum, step, default, value[1])
 
     def set_exposure(self, exposure_ms: float | None) -> str:
-        """Set the exposure.
-
-        Args:
-            exposure_ms: [ms]; None: the camera chooses.
-
-        Returns:
-            Why it could not be set, in words; empty if it was.
-        """
+        """Set the exposure [ms]; None: the camera chooses. Return why it could not be set, in words."""
         if exposure_ms is None:
             problem = self._set(AUTO_EXPOSURE, _APERTURE_FIRST) and self._set(AUTO_EXPOSURE, _AUTO)
             return f"the camera has no automatic exposure: {problem}" if problem else ""
@@ -246,15 +239,7 @@ class V4l2Device:
 
 @contextmanager
 def opened(path: str, ioctl: Ioctl | None = None) -> Iterator[V4l2Device]:
-    """Open a device for its settings.
-
-    Args:
-        path: Such as ``/dev/video0``.
-        ioctl: As for :class:`V4l2Device`.
-
-    Raises:
-        OSError: It can't be opened.
-    """
+    """Open a device, such as ``/dev/video0``, for its settings; ``ioctl`` as for :class:`V4l2Device`."""
     descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     try:
         yield V4l2Device(descriptor, ioctl)
@@ -297,10 +282,6 @@ def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevic
     """Return the cameras of this machine, by number; none where the system has no Video4Linux.
 
     A camera may have several nodes: only the first, which gives pictures, is listed.
-
-    Args:
-        system: Where the kernel lists them.
-        devices: Where their nodes are.
     """
     try:
         nodes = sorted(system.iterdir(), key=lambda node: (len(node.name), node.name))
@@ -323,12 +304,7 @@ def described(found: list[CameraDevice]) -> str:
 
 
 def listed(camera: CameraDevice, ioctl: Ioctl | None = None) -> list[str]:
-    """Return what a camera offers, in lines for people: its address, then formats, sizes, rates, exposure and gain.
-
-    Args:
-        camera: Of this machine.
-        ioctl: The kernel's call, as for :class:`V4l2Device`.
-    """
+    """Return what a camera offers, in lines for people: its address, then formats, sizes, rates, exposure and gain."""
     try:
         with opened(str(camera.path), ioctl) as device:
             told = [*map(str, device.formats()), *device.settings()]

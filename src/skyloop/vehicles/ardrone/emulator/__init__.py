@@ -297,18 +297,10 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     @property
     def ports(self) -> Ports:
-        """The real ports, where 0 was asked for.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The real ports, where 0 was asked for."""
         return self._started.ports
 
     @property
     def logic(self) -> ArdroneLogic:
-        """The state of the running firmware, for tests; it belongs to its thread.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The state of the running firmware, for tests; it belongs to its thread."""
         return self._started.logic

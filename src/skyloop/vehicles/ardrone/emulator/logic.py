@@ -183,11 +183,7 @@ class ArdroneLogic:
     # Telling ---------------------------------------------------------------------------------------------------
 
     def state(self, *, video: bool) -> State:
-        """Return the state bits.
-
-        Args:
-            video: Whether anybody receives pictures.
-        """
+        """Return the state bits; ``video``: whether anybody receives pictures."""
         flight_state = self._vehicle.state
         bits = {
             State.FLYING: flight_state.airborne,

@@ -75,12 +75,7 @@ class Outlet:
         loop.watch(connection, self._read)
 
     def offer(self, piece: bytes, *, starts: bool) -> None:
-        """Send a piece, unless the client is too slow.
-
-        Args:
-            piece: What is sent.
-            starts: Whether a client can begin with it.
-        """
+        """Send a piece, unless the client is too slow; ``starts``: a client can begin with it."""
         if starts:
             self._skipping = False
         if self._skipping or self._backlog > MOST_BACKLOG:

@@ -166,11 +166,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     @property
     def autopilot(self) -> Autopilot:
-        """The running autopilot, for tests; it belongs to its thread.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The running autopilot, for tests; it belongs to its thread."""
         return self._started.autopilot
 
     @property
@@ -180,11 +176,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     @property
     def tcp_address(self) -> str:
-        """Address of a driver on this machine, over TCP.
-
-        Raises:
-            UsageError: This kind has no such port.
-        """
+        """Address of a driver on this machine, over TCP; raises for a kind that has no such port."""
         if self.settings.ports.tcp is None:
             raise UsageError(f"an emulated {self.settings.kind.value} has no TCP port")
         return f"mavlink://tcp:{self.settings.bind}:{self.settings.ports.tcp}"

@@ -279,11 +279,7 @@ class TcpPort:
         return self._server.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the client, if there is one.
-
-        Raises:
-            OSError: The client is gone.
-        """
+        """Send a message to the client, if there is one."""
         self._server.send(self._codec.encode(message, version=self._settings.version))
 
     def close(self) -> None:

@@ -67,12 +67,7 @@ class Mission:
         self._wanted = 0  # of an upload under way; 0: there is none
 
     def answers(self, message: Message, home: tuple[int, int, int]) -> list[Message] | None:
-        """Return the answers to a message; None for one that is not about a mission.
-
-        Args:
-            message: Whatever came.
-            home: Latitude and longitude [1e-7 degrees], altitude above mean sea level [mm].
-        """
+        """Return the answers to a message; None for one that is not about a mission."""
         kind = message.get_type()
         if getattr(message, "mission_type", 0) != 0:
             return None

@@ -90,12 +90,7 @@ class WorldAxes:
             self._shift = None
 
     def received(self, message: Message, radius_m: float) -> bool:
-        """Move a position of the vehicle's into the world's axes; return whether the message is of use.
-
-        Args:
-            message: Of any kind. A local position is changed.
-            radius_m: Of the sphere that the autopilot takes the earth for [m].
-        """
+        """Move a local position of the vehicle's into the world's axes; return whether the message is of use."""
         if self.begin is None:
             return True
         kind = message.get_type()

@@ -116,20 +116,12 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The real port, where 0 was asked for."""
         return self._started.port
 
     @property
     def board(self) -> Board:
-        """The running flight controller, for tests; it belongs to its thread.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The running flight controller, for tests; it belongs to its thread."""
         return self._started.board
 
     @property

@@ -74,15 +74,7 @@ def xor(data: bytes) -> int:
 
 
 def encode(frame: Frame, *, version: int | None = None) -> bytes:
-    """Return the bytes of a frame.
-
-    Args:
-        frame: To be sent.
-        version: 1 or 2; None: the lowest that can say it.
-
-    Raises:
-        ValueError: That version can't say it.
-    """
+    """Return the bytes of a frame, in the lowest version that can say it unless one is given. Raises ``ValueError``."""
     function, payload = frame.function, frame.payload
     if not 0 <= function <= LARGEST or len(payload) > LARGEST:
         raise ValueError(f"function {function} with {len(payload)} bytes does not fit into a frame")

@@ -147,11 +147,7 @@ class Status:
 
     @classmethod
     def of_betaflight(cls, payload: bytes) -> Self:
-        """Read ``STATUS`` or ``STATUS_EX`` of Betaflight, API 1.36 on.
-
-        Raises:
-            DecodeError: It is too short.
-        """
+        """Read ``STATUS`` or ``STATUS_EX`` of Betaflight, API 1.36 on. Raises :class:`DecodeError`."""
         cycle, _, sensors, modes, _, load, _, _ = _unpack(_STATUS, payload, "STATUS")
         if len(payload) <= _STATUS.size:
             return cls(sensors, modes, None, 0, cycle, load)
@@ -165,11 +161,7 @@ class Status:
 
     @classmethod
     def of_inav(cls, payload: bytes) -> Self:
-        """Read ``INAV_STATUS``.
-
-        Raises:
-            DecodeError: It is too short.
-        """
+        """Read ``INAV_STATUS``. Raises :class:`DecodeError`."""
         cycle, _, sensors, load, _, flags = _unpack(_INAV_STATUS, payload, "INAV_STATUS")
         rest = payload[_INAV_STATUS.size : _INAV_STATUS.size + 16]
         if len(rest) % 4 == 1:  # the mixer's profile follows the modes
@@ -363,12 +355,7 @@ def pack_channels(widths_us: Sequence[int]) -> bytes:
 
 
 def multiple(payload: bytes, functions: Sequence[int]) -> list[tuple[int, bytes]]:
-    """Return the replies that ``MULTIPLE`` carries, as far as they fitted into it.
-
-    Args:
-        payload: Of the reply: a size and the payload of each.
-        functions: As they were asked for.
-    """
+    """Return the replies that ``MULTIPLE`` carries, as asked for, as far as they fitted into it."""
     found = []
     at = 0
     for function in functions:
@@ -500,11 +487,7 @@ USUAL_MAP: Final = (0, 1, 3, 2)  #: AETR: where ``SET_RAW_RC`` has roll, pitch, 
 
 
 def rx_map(payload: bytes) -> tuple[int, ...]:
-    """Return where ``SET_RAW_RC`` has roll, pitch, yaw and throttle.
-
-    Raises:
-        DecodeError: These are not the four first channels in some order.
-    """
+    """Return where ``SET_RAW_RC`` has roll, pitch, yaw and throttle, in any order. Raises :class:`DecodeError`."""
     made = tuple(payload[:4])
     if sorted(made) != [0, 1, 2, 3]:
         raise DecodeError(f"RX_MAP {payload[:8].hex()} does not say where the sticks are")

@@ -55,11 +55,7 @@ class CoupledFirmware(ABC):
     def address(self) -> str: ...
 
     def start(self) -> None:
-        """Start the firmware. It may take a while until it answers.
-
-        Raises:
-            UsageError: There is no such program here, or no free port for it.
-        """
+        """Start the firmware. It may take a while until it answers."""
         self._open()
         self.program.start()
 

@@ -283,18 +283,10 @@ class TelloFirmware(Emulator[RunningFirmware]):
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The real port, where 0 was asked for."""
         return self._started.port
 
     @property
     def logic(self) -> TelloLogic:
-        """The state of the running firmware, for tests; it belongs to its thread.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The state of the running firmware, for tests; it belongs to its thread."""
         return self._started.logic
