@@ -55,7 +55,7 @@ DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
 DISARM_NS: Final = nanoseconds(0.5)  #: an arming that is undone is asked about for so long after it was seen last
-IDLES_NS: Final = nanoseconds(12.0)  #: armed on the ground for so long, both autopilots have disarmed it by themselves
+IDLES_NS: Final = nanoseconds(12.0)  #: by then an autopilot that stands armed has disarmed itself
 STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
 HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
 
@@ -100,13 +100,13 @@ class SetpointController:
         self._setpoint: Setpoint | None = None
         self._lead_ns: int | None = None  # since when the stream flows
         self._sent_ns = 0
-        self._followed: Velocity | None = None  # the velocity that was sent last where it is read
+        self._followed: Velocity | None = None  # the last velocity sent to a vehicle that read it
         self._entered = False  # the mode that is wanted was seen since
         self._strayed_ns: int | None = None  # since when it is another one again
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
         self._stepped_ns = 0  # when what is wanted now had its last step; 0: it has not had one
         self._arms_until_ns: int | None = None  # a take-off that a landing broke off may arm it until then
-        self._disarms_until_ns = 0  # a take-off that was given up, or cut off, may arm it until then: that is undone
+        self._disarms_until_ns = 0  # until then a take-off that was given up, or cut off, may still arm it
         self._blind_until_ns = 0
         self._events: list[VehicleEvent] = []
 
@@ -269,7 +269,7 @@ class SetpointController:
             takeoff = self._takeoff
             self._end()
             self.goal = Goal.HOLD if takeoff.started else Goal.NOTHING
-            if takeoff.arm_asked_ns is not None and not takeoff.rose:  # it may stand there armed, for nobody
+            if takeoff.arm_asked_ns is not None and not takeoff.rose:  # it may stand there armed
                 self._disarms_until_ns = takeoff.arm_asked_ns + IDLES_NS
         self._entered, self._strayed_ns = False, None  # what it does by itself meanwhile is nobody's decision
         self.ownership.on_link_lost()
@@ -327,11 +327,11 @@ class SetpointController:
         """Return the set-points that are due now; commands go to the command sender.
 
         Args:
-            vehicle: What is known of it.
+            vehicle: The newest state.
             now_ns: The present time.
-            read: Whether it reads what is sent soon, as far as what is heard shows. If not, set-points would wait
-                somewhere and be followed late, but for what stops it: that is needed now, and does no harm then. So a
-                vehicle that was sent another velocity than is wanted now is stopped.
+            read: Whether the vehicle reads commands soon, judging by its messages. If not, a set-point might wait
+                somewhere and be followed late. Only a stop is sent then, which does no harm late; it replaces a
+                velocity that differs from the last one sent.
         """
         due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
         wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None
@@ -384,7 +384,7 @@ class SetpointController:
         return True
 
     def step_blind(self, now_ns: int) -> bool:
-        """Send what was newly asked for while nothing is heard; return whether a command is under way.
+        """Send a new hover or landing while nothing is heard; return whether a command is under way.
 
         The vehicle may hear it all the same. What a failsafe asks for is not sent so: who flies the vehicle by now
         can't be seen.
@@ -429,9 +429,9 @@ class SetpointController:
         return messages
 
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Disarm what a take-off has armed that is given up, or cut by a lost link.
+        """Disarm a vehicle after a take-off that was given up, or cut by a lost link.
 
-        What rises, or is in another mode, others have armed.
+        One that rises, or is in another mode, was armed by others.
         """
         if vehicle.airborne or vehicle.mode not in (self._autopilot.ARMING, self._autopilot.HOLD):
             self._disarms_until_ns = 0

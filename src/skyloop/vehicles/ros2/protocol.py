@@ -269,7 +269,7 @@ class RobotSession:
                 elif up:
                     self._refused = why
                 elif self._pending is pending and self._velocity is None:
-                    self._velocity = Velocity()  # it may go on with what was sent last
+                    self._velocity = Velocity()  # the last one sent may still be in force
                 if self._pending is pending:
                     self._pending = None
             if not success:
@@ -277,7 +277,7 @@ class RobotSession:
 
         self._refused = ""
         if not up:
-            self._velocity = Velocity()  # where nobody offers to land it, it stops
+            self._velocity = Velocity()  # it stops if nobody offers the service
         self._robot.call(service, answered)
         self._velocity, self._pending = None, pending
 
