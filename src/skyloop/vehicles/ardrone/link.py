@@ -21,13 +21,7 @@ WRITE_S: Final = 0.9  #: a key is written, acknowledged and read back within thi
 
 
 class ArdroneLink(VehicleLink[ArdroneSession]):
-    """Navdata, AT commands and the control port of one drone.
-
-    Args:
-        session: The drone's protocol.
-        deliver: Called on the link's thread with what the session has for the sink.
-        clock: Monotonic, ns.
-    """
+    """Navdata, AT commands and the control port of one drone."""
 
     def __init__(
         self, session: ArdroneSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
@@ -121,13 +115,7 @@ _CHUNK: Final = 1 << 16
 
 
 class DumpClient:
-    """Connects when the configurator wants a dump, feeds it, and closes the connection when it is whole.
-
-    Args:
-        port: TCP port of the drone.
-        selector: Watches the connection.
-        ready: Registered with the connection; must call :meth:`serve`.
-    """
+    """Connects when the configurator wants a dump, feeds it, and closes the connection when it is whole."""
 
     def __init__(self, port: int, selector: selectors.BaseSelector, ready: Callable[[], None]) -> None:
         """Store the arguments. No I/O."""

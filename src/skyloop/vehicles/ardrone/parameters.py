@@ -346,12 +346,7 @@ def _flight_animations(version: int | None) -> Parameter:
 
 
 class Commands:
-    """Commands that are no actions, as parameters, with their values.
-
-    Args:
-        setpoints: Knows the drone's condition, and takes the heading of absolute control.
-        send: Sends a command.
-    """
+    """Commands that are no actions, as parameters, with their values."""
 
     def __init__(self, setpoints: SetpointController, send: Send) -> None:
         self._setpoints = setpoints

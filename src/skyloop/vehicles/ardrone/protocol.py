@@ -72,14 +72,7 @@ _WATCHDOG: Final[AtMessage] = ("COMWDG", ())
 
 
 class ArdroneSession(VehicleSession):
-    """The protocol of one opened driver with its drone. Not thread-safe.
-
-    Args:
-        options: Of the vehicle's address.
-        ids: Ours, for a drone that keeps everybody's settings apart.
-        now_ns: The time of opening.
-        extra: Gives telemetry of others for feedback's ``native``, such as the video's counters.
-    """
+    """The protocol of one opened driver with its drone. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 

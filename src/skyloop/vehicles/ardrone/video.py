@@ -148,11 +148,7 @@ _CHUNK: Final = 1 << 16
 
 
 class PaveStream:
-    """A connection to an AR.Drone 2: PaVE over TCP.
-
-    Raises:
-        OSError: The drone can't be reached within :data:`CONNECT_S`.
-    """
+    """A connection to an AR.Drone 2: PaVE over TCP."""
 
     def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
         self._clock = clock
@@ -172,11 +168,7 @@ class PaveStream:
         return self._assembly.lost_bytes
 
     def read(self) -> list[Coded]:
-        """Return the frames that arrived, after :data:`POLL_S` at most.
-
-        Raises:
-            OSError: The connection ended, or no whole frame came for :data:`SILENT_S`.
-        """
+        """Return the frames that arrived, after :data:`POLL_S` at most."""
         try:
             data = self._socket.recv(_CHUNK)
         except TimeoutError:
@@ -196,11 +188,7 @@ class PaveStream:
 
 
 class DatagramStream:
-    """The video of an AR.Drone 1: one picture in a datagram over UDP, while somebody keeps asking for them.
-
-    Raises:
-        OSError: There is no route to the drone.
-    """
+    """The video of an AR.Drone 1: one picture in a datagram over UDP, while somebody keeps asking for them."""
 
     def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
         self.broken = 0
@@ -222,9 +210,6 @@ class DatagramStream:
         """Return the picture that arrived, after :data:`POLL_S` at most.
 
         A picture has no stamp: it counts as captured when it arrived.
-
-        Raises:
-            OSError: The drone refused, or nothing came for :data:`SILENT_S`.
         """
         try:
             data = self._socket.recv(_CHUNK)
@@ -263,11 +248,7 @@ _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
 
 
 class PaveVideo:
-    """Decodes an AR.Drone 2's video.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
-    """
+    """Decodes an AR.Drone 2's video."""
 
     def __init__(self) -> None:
         try:
@@ -366,11 +347,6 @@ class EncodedStream:
     """Hands H.264 on while somebody wants it; see :class:`StreamRelay`. Used by the thread that reads.
 
     A frame came over TCP, so it is whole, and need not be decoded to know that.
-
-    Args:
-        sink: The proxy's.
-        camera: Returns the name of the camera that the drone shows now.
-        intrinsics: Returns those of that camera for a width and height.
     """
 
     def __init__(
@@ -400,11 +376,7 @@ class EncodedStream:
 
 
 class VideoReceiver(LiveVideo):
-    """The live video of an AR.Drone 1 or 2; see :class:`skyloop.drivers.live_video.LiveVideo` for the callbacks.
-
-    Raises:
-        UsageError: For a version other than 1 and 2.
-    """
+    """The live video of an AR.Drone 1 or 2; see :class:`skyloop.drivers.live_video.LiveVideo` for the callbacks."""
 
     def __init__(
         self,

@@ -30,9 +30,6 @@ class Loop:
 
     Everything but :meth:`post`, :meth:`start` and :meth:`stop` belongs to that thread, or to before its start. What a
     callback raises is logged, and the loop goes on.
-
-    Args:
-        name: Of the thread.
     """
 
     def __init__(self, name: str) -> None:
@@ -124,19 +121,7 @@ _SEND_BUFFER: Final = 1 << 20  # room for pictures of an AR.Drone 1
 
 
 class DatagramPort:
-    """Answers every sender, at the port that the datagram came from. Used on the loop's thread.
-
-    Args:
-        loop: Calls back when something comes.
-        bind: Address and port of this machine; port 0 is any free one.
-        on_datagram: Called with each datagram and its sender.
-        name: For errors, and for the seeds of the faults.
-        faults: Befall the datagrams each way.
-        delay_s: By which all of them are late, each way.
-
-    Raises:
-        LinkError: The port is taken.
-    """
+    """Answers every sender, at the port that the datagram came from. Used on the loop's thread."""
 
     def __init__(
         self,
@@ -223,16 +208,6 @@ class ByteServer:
     """Takes the next client when the last one is gone: until then it waits in the kernel, connected and unanswered.
 
     Used on the loop's thread.
-
-    Args:
-        loop: Calls back when something comes.
-        bind: Address and port of this machine; port 0 is any free one.
-        on_bytes: Called with what came.
-        on_client: Called when another client begins.
-        name: For errors.
-
-    Raises:
-        LinkError: The port is taken.
     """
 
     def __init__(
@@ -258,11 +233,7 @@ class ByteServer:
         return int(self._server.getsockname()[1])
 
     def send(self, data: bytes) -> None:
-        """Send to the client, if there is one; what does not fit is lost, as on a serial line.
-
-        Raises:
-            OSError: The client is gone.
-        """
+        """Send to the client, if there is one; what does not fit is lost, as on a serial line."""
         if self._client is None:
             return
         try:

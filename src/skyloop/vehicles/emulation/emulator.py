@@ -105,12 +105,7 @@ R = TypeVar("R", bound=RunningEmulator)
 
 
 class Emulator(ABC, Generic[R]):
-    """The firmware of one drone of a host's world; a context manager that is on within its block.
-
-    Args:
-        host: The simulated world.
-        drone: Its number in it.
-    """
+    """The firmware of one drone of a host's world; a context manager that is on within its block."""
 
     def __init__(self, host: SimHost, drone: int) -> None:
         self.host = host
@@ -118,12 +113,7 @@ class Emulator(ABC, Generic[R]):
         self._running: R | None = None
 
     def start(self) -> None:
-        """Switch it on: everything is reset, but at the ports that it had before.
-
-        Raises:
-            LinkError: A port is taken.
-            UsageError: It is started already, or somebody else has this drone.
-        """
+        """Switch it on: everything is reset, but at the ports that it had before."""
         if self._running is not None:
             raise UsageError("this firmware is started already")
         self._running = self._switched_on()

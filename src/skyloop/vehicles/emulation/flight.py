@@ -35,12 +35,7 @@ class Vehicle(Protocol):
 
 
 class SimulatedVehicle:
-    """A drone of a simulation; see :class:`Vehicle`.
-
-    Args:
-        simulation: Flies it.
-        drone: Its number.
-    """
+    """A drone of a simulation; see :class:`Vehicle`."""
 
     def __init__(self, simulation: Simulation, drone: int) -> None:
         self._simulation = simulation
@@ -96,9 +91,6 @@ class FlightControl:
 
     World axes are east, north, up from where the vehicle stood when it was made; yaw is counter-clockwise from east.
     What it does must be asked for at every tick.
-
-    Args:
-        vehicle: What it flies.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:

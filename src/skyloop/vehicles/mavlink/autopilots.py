@@ -47,12 +47,7 @@ class ThrustModel(Protocol):
 
 
 class ClimbRateThrust:
-    """ArduCopter: a share of its fastest climb, or of its fastest descent.
-
-    Args:
-        up_m_s: Its fastest climb.
-        down_m_s: Its fastest descent, positive.
-    """
+    """ArduCopter: a share of its fastest climb, or of its fastest descent."""
 
     def __init__(self, up_m_s: float, down_m_s: float) -> None:
         self._up, self._down = up_m_s, down_m_s

@@ -48,11 +48,7 @@ class MavlinkConnection(Protocol):
 
 
 class UdpListener:
-    """Listens on a UDP port, and answers each sender.
-
-    Raises:
-        OSError: The port can't be opened.
-    """
+    """Listens on a UDP port, and answers each sender."""
 
     whole = True
 
@@ -121,11 +117,7 @@ def _peer_of(source: tuple[str, int] | tuple[str, int, int, int]) -> tuple[str, 
 
 
 class UdpSender(UdpListener):
-    """Speaks first over UDP, from a port of its own.
-
-    Raises:
-        OSError: The host is not known, or no port can be opened.
-    """
+    """Speaks first over UDP, from a port of its own."""
 
     def __init__(self, address: Address) -> None:
         family, *_, found = socket.getaddrinfo(address.place, address.number, 0, socket.SOCK_DGRAM)[0]
@@ -153,23 +145,14 @@ class _Stream(ByteStream):
 
 
 class TcpClient(_Stream, TcpStream):
-    """A client of the autopilot's TCP server, which serves one client at a time: connected is not yet served.
-
-    Raises:
-        OSError: It can't be reached within :data:`skyloop.drivers.byte_stream.CONNECT_S`.
-    """
+    """A client of the autopilot's TCP server, which serves one client at a time: connected is not yet served."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number)
 
 
 class SerialPort(_Stream, SerialStream):
-    """A serial port, through pyserial, opened for this process alone.
-
-    Raises:
-        OSError: It can't be opened.
-        MissingExtraError: pyserial is not installed.
-    """
+    """A serial port, through pyserial, opened for this process alone."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number, "mavlink://serial:", "mavlink")
@@ -193,14 +176,7 @@ _CLOSE_S: Final = 3.0
 
 
 class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
-    """Keeps the connection and serves the session, on a thread of its own.
-
-    Args:
-        session: The vehicle's protocol.
-        deliver: Called on the link's thread with what the session has for the sink.
-        clock: Monotonic, ns.
-        serve: Takes the link to a thread that serves several, if it is one over UDP: to open another may take a while.
-    """
+    """Keeps the connection and serves the session, on a thread of its own."""
 
     RETRY_NS = nanoseconds(1.0)
 

@@ -178,9 +178,6 @@ class CommandSender:
     """Sends commands and keeps their results.
 
     Level-triggered: a caller that wants an effect calls :meth:`request` again and again until it shows.
-
-    Args:
-        target: System and component, until the vehicle is found.
     """
 
     def __init__(self, target: tuple[int, int] = (1, 1)) -> None:
@@ -233,11 +230,7 @@ LOOK_NS: Final = nanoseconds(0.2)  #: between two looks at what flows, once all 
 
 
 class MessageIntervals:
-    """Asks for messages at the rates that feedback needs, and again while they do not flow.
-
-    Args:
-        rates: By the message's name [1/s].
-    """
+    """Asks for messages at the rates that feedback needs, and again while they do not flow."""
 
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)

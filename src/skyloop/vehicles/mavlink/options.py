@@ -26,17 +26,7 @@ ALTITUDE: Final = "limits.altitude"
 
 @dataclass(frozen=True, slots=True)
 class OwnLimit:
-    """A limit of the driver's own.
-
-    Args:
-        name: Of its parameter.
-        option: Its name in an address.
-        usual: Default.
-        low: Smallest allowed value.
-        high: Largest allowed value.
-        unit: Of the values.
-        text: For people.
-    """
+    """A limit of the driver's own."""
 
     name: str
     option: str
@@ -93,13 +83,7 @@ class PoseMessage(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where the vehicle is.
-
-    Args:
-        kind: How the bytes travel.
-        place: Host or device.
-        number: Port, or bits a second.
-    """
+    """Where the vehicle is."""
 
     kind: ConnectionKind
     place: str

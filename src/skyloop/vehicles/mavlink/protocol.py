@@ -90,13 +90,7 @@ _ASK_VERSION: Final = VehicleCommand(m.MAV_CMD_REQUEST_MESSAGE, (float(m.MAVLINK
 
 
 class MavlinkSession(VehicleSession):
-    """The protocol of one opened driver with its vehicle. Not thread-safe.
-
-    Args:
-        options: Of the vehicle's address.
-        now_ns: The time of opening.
-        extra: Gives telemetry of others for feedback's ``native``.
-    """
+    """The protocol of one opened driver with its vehicle. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 

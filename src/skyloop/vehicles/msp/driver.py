@@ -126,13 +126,7 @@ EXTRA: Final = "msp"
 
 
 class MspLink(ConnectionLink[MspSession, ByteStream]):
-    """Keeps the connection and serves the session, on a thread of its own.
-
-    Args:
-        session: The vehicle's protocol.
-        deliver: Called on the link's thread with what the session has for the sink.
-        clock: Monotonic, ns.
-    """
+    """Keeps the connection and serves the session, on a thread of its own."""
 
     RETRY_NS = nanoseconds(0.25)
 

@@ -54,13 +54,7 @@ PILOT_HZ: Final = 10.0
 
 
 class MspSession(VehicleSession):
-    """The protocol of one opened driver with its flight controller. Not thread-safe.
-
-    Args:
-        options: Of the vehicle's address.
-        now_ns: The time of opening.
-        setpoints: Kept by the driver from one opening to the next.
-    """
+    """The protocol of one opened driver with its flight controller. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 

@@ -43,14 +43,7 @@ def _nothing(_: int) -> None:
 
 
 class ReplayPublisher:
-    """Publishes samples to a sink, stamped on the replay's clock.
-
-    Args:
-        sink: The proxy's.
-        clock: The replay's.
-        playback: Gets the position of what is published.
-        first_ns: Where the recording begins, on its own clock.
-    """
+    """Publishes samples to a sink, stamped on the replay's clock."""
 
     def __init__(self, sink: Sink, clock: Clock, playback: Playback, first_ns: int) -> None:
         self.frames = 0  #: published so far, those that nobody wanted included
@@ -358,14 +351,7 @@ class Player:
 
 
 class StepPlayer:
-    """Plays sample by sample on the recording's own clock, each when :meth:`step` is called: nothing is left out.
-
-    Args:
-        source: The recording.
-        sink: Receives the samples, in the call of :meth:`step`.
-        clock: The replay's.
-        playback: Gets the position.
-    """
+    """Plays sample by sample on the recording's own clock, each when :meth:`step` is called: nothing is left out."""
 
     def __init__(self, source: ReplaySource, sink: Sink, clock: Clock, playback: Playback) -> None:
         self._source = source

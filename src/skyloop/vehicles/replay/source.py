@@ -243,13 +243,7 @@ def _camera(recording: Recording, drone: str, name: str, known: CameraInfo | Non
 
 
 class Timeline:
-    """Maps the clock of the recording to the clock of its replay, and back. Pure.
-
-    Args:
-        speed: Seconds of the recording in a second.
-        begin_ns: Where the replay begins, on the recording's clock.
-        origin_ns: The same on the replay's clock.
-    """
+    """Maps the clock of the recording to the clock of its replay, and back. Pure."""
 
     def __init__(self, speed: float, begin_ns: int, origin_ns: int) -> None:
         """Store the arguments."""

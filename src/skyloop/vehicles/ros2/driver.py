@@ -65,13 +65,6 @@ class RobotLink:
     """A node that subscribes to what a robot publishes, and publishes its ``cmd_vel``.
 
     Images are subscribed to while somebody wants them, or where nothing else would show that the robot is there.
-
-    Args:
-        options: Of the address.
-        sink: The proxy's.
-
-    Raises:
-        MissingExtraError: rclpy or a package of messages is not installed.
     """
 
     def __init__(self, options: Options, sink: Sink) -> None:

@@ -76,13 +76,6 @@ class RobotSession:
     """One opened driver's session: actions from any thread, all else from the node's own.
 
     The sink is called with the lock free, as the proxy may hold its own while it commands.
-
-    Args:
-        options: Of the address.
-        sink: The proxy's.
-        robot: Commands go there.
-        clock: This host's monotonic clock [ns].
-        system_clock: The system's clock, which stamps are of [ns].
     """
 
     def __init__(self, options: Options, sink: Sink, robot: Robot, clock: Clock, system_clock: Clock) -> None:

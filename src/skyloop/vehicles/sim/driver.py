@@ -330,10 +330,6 @@ class SetpointController:
     """Starts the motors when a set-point climbs, and stops them on the ground when one descends.
 
     The simulated firmware takes set-points in the air only, so its own take-off to the least height stands in between.
-
-    Args:
-        simulation: Flies the drone.
-        drone: Its number.
     """
 
     def __init__(self, simulation: Simulation, drone: int) -> None:

@@ -67,12 +67,7 @@ _LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
 
 
 class FirmwareFlight:
-    """Starts the firmware of one drone, and passes on what its driver reports, with the simulation's truth beside it.
-
-    Args:
-        options: Of the world.
-        inner_options: Of the address of the firmware's own driver, as they were given.
-    """
+    """Starts the firmware of one drone, and passes on its driver's reports, with the simulation's truth beside them."""
 
     def __init__(self, options: SimOptions, inner_options: str) -> None:
         assert options.autopilot is not None
@@ -289,17 +284,7 @@ def make_firmware(
     instruments: InstrumentParameters,
     folder: Path | None = None,
 ) -> CoupledFirmware:
-    """Return a firmware that is not yet started.
-
-    Args:
-        kind: Which.
-        on_event: Called with each event, on the simulation's thread or one of the program; must return quickly.
-        instruments: Of the vehicle that it is to fly.
-        folder: Where it runs and keeps its settings; None: a new one, removed at the end.
-
-    Raises:
-        MissingExtraError: A package that it needs is not installed.
-    """
+    """Return a firmware that is not yet started."""
     if kind is AutopilotKind.ARDUPILOT:
         from skyloop.vehicles.sim.firmware.ardupilot import ArduCopter
 

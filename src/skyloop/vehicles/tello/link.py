@@ -63,13 +63,7 @@ ASK_S: Final = 0.95  #: a command is answered within this, or it failed
 
 
 class TelloLink(VehicleLink[TelloSession]):
-    """Commands with their answers, and state, of one drone.
-
-    Args:
-        session: The drone's protocol.
-        deliver: Called on the link's thread with what the session has for the sink.
-        clock: Monotonic, ns.
-    """
+    """Commands with their answers, and state, of one drone."""
 
     def __init__(
         self, session: TelloSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns

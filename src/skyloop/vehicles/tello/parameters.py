@@ -177,11 +177,7 @@ def command_of(setting: Setting, value: Value) -> str:
 
 
 class DroneSettings:
-    """The values of all parameters. Those of the drone are written through the link.
-
-    Args:
-        link: To the drone.
-    """
+    """The values of all parameters. Those of the drone are written through the link."""
 
     def __init__(self, link: TelloLink) -> None:
         self._link = link

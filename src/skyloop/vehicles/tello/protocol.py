@@ -35,14 +35,7 @@ Done = Callable[[str | None], None]
 
 @dataclass(slots=True)
 class Request:
-    """A command whose answer is waited for.
-
-    Args:
-        text: The command.
-        done: Called with the answer, or None if there was none.
-        tries: How often it is sent at most.
-        sent_ns: When it was sent last.
-    """
+    """A command whose answer is waited for."""
 
     text: str
     done: Done

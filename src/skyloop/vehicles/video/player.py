@@ -75,12 +75,7 @@ def is_device(path: Path) -> bool:
 
 
 def open_file(path: Path) -> Source:
-    """Open a recording, whatever its format.
-
-    Raises:
-        UsageError: It can't be read.
-        FileFormatError: It holds no video that is known here.
-    """
+    """Open a recording, whatever its format."""
     try:
         with path.open("rb") as file:
             head = file.read(SNIFF)
@@ -94,11 +89,7 @@ def open_file(path: Path) -> Source:
 
 
 class ContainerSource:
-    """A file, or files, that PyAV opens.
-
-    Raises:
-        FileFormatError: It can't be opened, or holds no video.
-    """
+    """A file, or files, that PyAV opens."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -180,9 +171,6 @@ class PaveSource:
 
     Pictures before the first key frame (a stream torn open, or the drone's stale first frame) and after damage up to
     the next key frame are left out: they would be smeared.
-
-    Raises:
-        FileFormatError: It holds no frame.
     """
 
     def __init__(self, path: Path) -> None:
@@ -231,10 +219,6 @@ class FilePacer:
     """Maps a recording's own time stamps to the times at which its pictures are shown.
 
     Times never go backwards. A stamp that jumps (a cut, a clock that was set) counts as one usual period.
-
-    Args:
-        speed: Seconds of the recording in a second.
-        period_s: The usual step between two stamps.
     """
 
     def __init__(self, speed: float, period_s: float) -> None:
@@ -259,14 +243,7 @@ class FilePacer:
 
 
 class CameraPublisher:
-    """Publishes images and feedback of one camera to a sink, and waits between them.
-
-    Args:
-        sink: The proxy's.
-        camera: Its name.
-        intrinsics: Returns those for a width and height.
-        stop: Set when the driver is closed.
-    """
+    """Publishes images and feedback of one camera to a sink, and waits between them."""
 
     def __init__(
         self, sink: Sink, camera: str, intrinsics: Callable[[int, int], Intrinsics | None], stop: threading.Event
@@ -339,14 +316,7 @@ class CameraPublisher:
 
 
 class FilePlayer:
-    """Plays a recording once, or with ``loop`` again and again.
-
-    Args:
-        publisher: Publishes the images.
-        open_source: Opens the recording for another pass.
-        loop: Whether it starts over at the end.
-        speed: Seconds of the recording in a second.
-    """
+    """Plays a recording once, or with ``loop`` again and again."""
 
     def __init__(
         self, publisher: CameraPublisher, open_source: Callable[[], Source], *, loop: bool, speed: float

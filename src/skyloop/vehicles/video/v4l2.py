@@ -108,12 +108,7 @@ class Control:
 
 
 class V4l2Device:
-    """An open device.
-
-    Args:
-        descriptor: Of its node.
-        ioctl: The kernel's call; None: ``fcntl.ioctl``.
-    """
+    """An open device."""
 
     def __init__(self, descriptor: int, ioctl: Ioctl | None = None) -> None:
         """Store the arguments. No I/O."""

@@ -112,13 +112,7 @@ class Animation:
 
 
 class FlightControl:
-    """Flies one drone. Times are of the caller's clock [ns].
-
-    Args:
-        vehicle: What is commanded.
-        configuration: Has the limits and thresholds.
-        version: Of the drone, 1 or 2.
-    """
+    """Flies one drone. Times are of the caller's clock [ns]."""
 
     def __init__(self, vehicle: Vehicle, configuration: Configuration, *, version: int) -> None:
         self._vehicle = vehicle

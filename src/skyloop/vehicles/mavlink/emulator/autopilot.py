@@ -51,14 +51,7 @@ PlaceHandler = Callable[[Arguments, int], int]
 
 
 class Autopilot(ABC):
-    """One autopilot. All methods belong to one thread. ``ports``, its links, are set before the first report.
-
-    Args:
-        vehicle: What it flies.
-        system: Its MAVLink system id.
-        boot_s: From the start until it lets itself be armed, in seconds of the simulation.
-        gps: Whether it has GPS; if not, it is not ready before poses come from outside.
-    """
+    """One autopilot. All methods belong to one thread. ``ports``, its links, are set before the first report."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
     CAPABILITIES: ClassVar[int]

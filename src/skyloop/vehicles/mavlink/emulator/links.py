@@ -78,11 +78,7 @@ class Ports:
 
     @classmethod
     def several(cls, kind: Kind, base: int | None, drones: int) -> list[Ports]:
-        """Return the ports of several drones; none of them twice. See :meth:`counted`.
-
-        Raises:
-            UsageError: They don't fit below 65536.
-        """
+        """Return the ports of several drones; none of them twice. See :meth:`counted`."""
         if base != 0:
             return [cls.counted(kind, base, drone) for drone in range(drones)]
         with ExitStack() as held:  # of all of them: the system soon gives a port that was closed to the next who asks
@@ -132,11 +128,7 @@ MAX_INTERVAL_US: Final = 2**31 - 1  #: the greatest that ``MESSAGE_INTERVAL`` ha
 
 
 class Streams:
-    """The messages of one link. Times are the autopilot's [s].
-
-    Args:
-        rates: By message number, from the start [1/s].
-    """
+    """The messages of one link. Times are the autopilot's [s]."""
 
     def __init__(self, rates: Mapping[int, float]) -> None:
         self._usual = dict(rates)
@@ -199,17 +191,7 @@ def _codec(settings: Settings) -> Codec:
 
 
 class UdpPort:
-    """A UDP port: sends to the remote port until a message comes, then to its sender.
-
-    Args:
-        loop: Calls back when something comes.
-        settings: Of the firmware.
-        streams: Rates of the messages.
-        on_message: Called with each message.
-
-    Raises:
-        LinkError: The port is taken.
-    """
+    """A UDP port: sends to the remote port until a message comes, then to its sender."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
@@ -252,17 +234,7 @@ class UdpPort:
 
 
 class TcpPort:
-    """A TCP server for one client at a time: the next one waits in the kernel, connected and without a byte.
-
-    Args:
-        loop: Calls back when something comes.
-        settings: Of the firmware.
-        streams: Rates of the messages.
-        on_message: Called with each message.
-
-    Raises:
-        LinkError: The port is taken.
-    """
+    """A TCP server for one client at a time: the next one waits in the kernel, connected and without a byte."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams

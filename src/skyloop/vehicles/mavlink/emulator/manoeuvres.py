@@ -180,11 +180,7 @@ class Turn:
 
 
 class Manoeuvres:
-    """The manoeuvres of one flight. Heights are above the flight's origin [m].
-
-    Args:
-        flight: What flies them.
-    """
+    """The manoeuvres of one flight. Heights are above the flight's origin [m]."""
 
     def __init__(self, flight: FlightControl) -> None:
         self._flyer = flight

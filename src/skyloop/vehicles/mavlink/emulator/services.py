@@ -240,12 +240,7 @@ PX4: Final[dict[str, tuple[float, int]]] = {
 
 
 class ParameterTable:
-    """The values, and the lists that are being sent.
-
-    Args:
-        standard: Value and ``MAV_PARAM_TYPE`` by name.
-        bytewise: How integers are encoded.
-    """
+    """The values, and the lists that are being sent."""
 
     def __init__(self, standard: Mapping[str, tuple[float, int]], *, bytewise: bool) -> None:
         self._kinds = {name: kind for name, (_, kind) in standard.items()}

@@ -24,10 +24,6 @@ class CoupledFirmware(ABC):
     It is a :class:`~skyloop.sim.instruments.Firmware`: give it to :meth:`~skyloop.sim.simulation.Simulation.fly_by`.
     The simulation's thread never waits long: for an answer up to :data:`WAIT_S`, and once there was none, not at all
     until the firmware answers again. Silence and death stop the rotors; a firmware that died is started again.
-
-    Attributes:
-        program: Its process.
-        address: Of the vehicle, for a driver: where the firmware speaks to ground stations and companions.
     """
 
     NAME: ClassVar[str]  #: for people
