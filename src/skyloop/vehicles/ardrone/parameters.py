@@ -10,6 +10,7 @@ from typing import Final
 
 import msgspec
 
+from skyloop.drivers.base import checked_value
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController
@@ -361,20 +362,13 @@ class Commands:
         return [self._present(parameter) for parameter in known]
 
     def write(self, parameter: Parameter, value: Value) -> Value:
-        """Give a command.
-
-        Args:
-            parameter: One of :meth:`parameters`.
-            value: Of its type.
-
-        Returns:
-            The value that is shown from now on.
+        """Give a command, and return the value that is shown from now on.
 
         Raises:
             ParameterError: The value does not fit, or the drone is not on the ground or in the air as the command
                 needs.
         """
-        value = _checked(parameter, value)
+        value = checked_value(parameter, value)
         name = parameter.name
         if name == _LEDS.name:
             self._light(str(value))
@@ -426,27 +420,6 @@ class Commands:
         if condition is None:
             raise _refused("no data from the drone")
         return condition
-
-
-def _checked(parameter: Parameter, value: Value) -> Value:
-    """Return a value of the parameter's type; an int is accepted for a float."""
-    if parameter.type is ParameterType.FLOAT and isinstance(value, int | float) and not isinstance(value, bool):
-        low, high = parameter.minimum, parameter.maximum
-        assert low is not None
-        assert high is not None
-        if not low <= value <= high:
-            raise ParameterError(
-                f"{parameter.name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE
-            )
-        return float(value)
-    if type(value) is not type(parameter.value):
-        raise ParameterError(
-            f"{parameter.name} takes a {parameter.type.value}, not {value!r:.60}", code=Refusal.WRONG_TYPE
-        )
-    if parameter.choices and value not in parameter.choices:
-        names = [str(choice) for choice in parameter.choices]
-        raise ParameterError(str(UnknownNameError(parameter.name, str(value), names)), code=Refusal.OUT_OF_RANGE)
-    return value
 
 
 def _refused(why: str) -> ParameterError:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds
+from skyloop.drivers.base import checked_value
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.vehicles.mavlink.options import OWN_LIMITS
@@ -226,14 +227,8 @@ class VehicleParameter:
 
     def to_native(self, value: Value) -> float:
         """Return a value as the autopilot takes it; raises for one that it would not take."""
-        name, whole = self.parameter.name, self.parameter.type is ParameterType.INT
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ParameterError(f"{name} takes a finite number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
-        if whole and value != int(value):
-            raise ParameterError(f"{name} takes a whole number, not {value!r}", code=Refusal.WRONG_TYPE)
-        low, high = self.parameter.minimum, self.parameter.maximum
-        if (low is not None and value < low) or (high is not None and value > high):
-            raise ParameterError(f"{name} is from {low} to {high}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+        value = checked_value(self.parameter, value)
+        assert isinstance(value, int | float)
         return value
 
     def from_native(self, number: float) -> Value:
@@ -316,9 +311,6 @@ def _bound(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-_LIMITS: Final = {limit.name: limit for limit in OWN_LIMITS}
-
-
 def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
     """Return the driver's own limits as parameters, with their values in force."""
     return [
@@ -338,10 +330,7 @@ def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
 
 def with_limit(values: Mapping[str, float], name: str, value: Value) -> dict[str, float]:
     """Return the driver's own limits after one was written; raises for a number that is not finite, or out of range."""
-    limit = _LIMITS[name]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ParameterError(f"{name} takes a finite number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
-    if not limit.low <= value <= limit.high:
-        why = f"{name} is from {limit.low:g} to {limit.high:g} {limit.unit}, not {value:g}"
-        raise ParameterError(why, code=Refusal.OUT_OF_RANGE)
-    return {**values, name: float(value)}
+    parameter = next(each for each in limit_parameters(values) if each.name == name)
+    value = checked_value(parameter, value)
+    assert isinstance(value, float)
+    return {**values, name: value}

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
-from skyloop.drivers.base import reject_unknown_options
+from skyloop.drivers.base import checked_value, reject_unknown_options
 from skyloop.drivers.uri import VehicleUri, host_and_port
-from skyloop.errors import ParameterError, UnknownNameError, UsageError
-from skyloop.messages import Parameter, ParameterType, Refusal, Value
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages import Parameter, ParameterType, Value
 from skyloop.vehicles.msp.firmware import MOST_AUX
 from skyloop.vehicles.msp.setpoints import Gains, Limits, SetpointController
 
@@ -99,15 +99,9 @@ class DriverParameters:
         entries = self._entries()
         if name not in entries:
             raise UnknownNameError("parameter of msp://", name, entries)
-        entry = entries[name]
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ParameterError(f"{name} takes a number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
-        low, high = entry.parameter.minimum, entry.parameter.maximum
-        assert low is not None
-        assert high is not None
-        if not low <= value <= high:
-            raise ParameterError(f"{name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
-        entry.write(value)
+        value = checked_value(entries[name].parameter, value)
+        assert isinstance(value, int | float)
+        entries[name].write(value)
         return value
 
     def _entries(self) -> dict[str, _Entry]:
