@@ -28,6 +28,12 @@ _MOST_PORTS: Final = 4  # that are named
 SinkCallback: TypeAlias = Callable[[Sink], None]
 
 
+def deliver(sink: Sink, pending: Iterable[SinkCallback]) -> None:
+    """Give a sink what a session has for it."""
+    for publish in pending:
+        publish(sink)
+
+
 @dataclass(frozen=True, slots=True)
 class LinkTimeouts:
     """How long a vehicle may be silent [ns] before the link is degraded or lost."""

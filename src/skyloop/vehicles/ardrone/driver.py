@@ -10,7 +10,7 @@ from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.camera_options import intrinsics_of
 from skyloop.drivers.live_video import Picture, VideoEvent
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.vehicle_session import SinkCallback
+from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, ParameterError, SkyloopError
 from skyloop.messages import (
     AnyAction,
@@ -80,8 +80,7 @@ class ArdroneDriver(Driver):
 
     def _deliver(self, sink: Sink, pending: list[SinkCallback]) -> None:
         """Run the session's callbacks. On the link's thread."""
-        for publish in pending:
-            publish(sink)
+        deliver(sink, pending)
         session = self._session
         if session is not None and session.ready:
             self._camera = active_camera(session.configurator.values)

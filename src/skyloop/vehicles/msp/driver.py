@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
@@ -12,7 +13,7 @@ from skyloop.drivers.base import Driver, ExternalPose, Sink
 from skyloop.drivers.byte_stream import END_S, ByteStream, Rank, SerialStream, TcpStream
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_link import ConnectionLink
-from skyloop.drivers.vehicle_session import SinkCallback
+from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, MissingExtraError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Parameter, Refusal, Takeoff, Value
 from skyloop.messages.parameter import Diagnostic
@@ -58,7 +59,7 @@ class MspDriver(Driver):
         known.hover, known.full_tilt_rad = self._setpoints.hover, self._setpoints.full_tilt_rad
         self._setpoints = known
         session = MspSession(self.options, monotonic_ns(), known)
-        self._link = MspLink(session, lambda pending: _deliver(sink, pending))
+        self._link = MspLink(session, partial(deliver, sink))
         self._link.start()
 
     def _close(self) -> None:
@@ -115,11 +116,6 @@ class MspDriver(Driver):
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
         with link.lock:
             return DriverParameters(self._setpoints).write(name, value)
-
-
-def _deliver(sink: Sink, pending: list[SinkCallback]) -> None:
-    for publish in pending:
-        publish(sink)
 
 
 EXTRA: Final = "msp"
