@@ -267,15 +267,10 @@ class VehicleSession(ABC):
 
 @dataclass(frozen=True, slots=True)
 class LinkTrouble:
-    """Why a vehicle can't be reached.
+    """Why a vehicle can't be reached."""
 
-    Args:
-        reason: What failed; may be empty.
-        remedy: What to do, as an instruction to a person; may be empty.
-    """
-
-    reason: str
-    remedy: str = ""
+    reason: str  #: what failed; may be empty
+    remedy: str = ""  #: what to do, as an instruction to a person; may be empty
 
 
 def trouble_of(error: OSError, advice: str) -> LinkTrouble:

@@ -45,17 +45,11 @@ Step: TypeAlias = Write | Read
 
 @dataclass(eq=False)
 class Exchange:
-    """Steps in order, and what to call when they are done.
+    """Steps in order, and what to call when they are done."""
 
-    Args:
-        steps: May be a generator: each step is asked for when the one before is done.
-        deadline_ns: When all must be done.
-        done: Called at the end with why it failed, or None.
-    """
-
-    steps: Iterator[Step]
-    deadline_ns: int
-    done: Callable[[str | None], None] = field(default=lambda _: None)
+    steps: Iterator[Step]  #: may be a generator: each step is asked for when the one before is done
+    deadline_ns: int  #: when all must be done
+    done: Callable[[str | None], None] = field(default=lambda _: None)  #: called at the end with why it failed, or None
 
 
 @dataclass(frozen=True, slots=True)

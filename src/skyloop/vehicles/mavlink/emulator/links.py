@@ -29,17 +29,11 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """Ports of one emulated autopilot.
+    """Ports of one emulated autopilot."""
 
-    Args:
-        udp: The autopilot's own, from which it sends to ``remote`` until a message comes.
-        remote: UDP, of the other end.
-        tcp: Its server for one client; None: it has none.
-    """
-
-    udp: int
-    remote: int
-    tcp: int | None = None
+    udp: int  #: the autopilot's own, from which it sends to ``remote`` until a message comes
+    remote: int  #: UDP, of the other end
+    tcp: int | None = None  #: its server for one client; None: it has none
 
     @classmethod
     def standard(cls, kind: Kind, drone: int = 0) -> Ports:

@@ -31,17 +31,11 @@ _V2: Final = struct.Struct("<BHH")
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame.
+    """One frame."""
 
-    Args:
-        function: 0 to 65535; from 255 on only version 2 can say it.
-        payload: At most 65535 bytes.
-        direction: Who speaks.
-    """
-
-    function: int
-    payload: bytes = b""
-    direction: Direction = Direction.REQUEST
+    function: int  #: 0 to 65535; from 255 on only version 2 can say it
+    payload: bytes = b""  #: at most 65535 bytes
+    direction: Direction = Direction.REQUEST  #: who speaks
 
 
 def _crc_table() -> tuple[int, ...]:
