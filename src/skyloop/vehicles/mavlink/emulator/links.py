@@ -209,8 +209,9 @@ class UdpPort:
         return self._port.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the peer."""
-        self._port.send(self._codec.encode(message, version=self._settings.version), self._peer)
+        """Send a message to the peer; MAVLink 1 has no numbers above 255."""
+        if self._settings.version == 2 or message.id < 256:
+            self._port.send(self._codec.encode(message, version=self._settings.version), self._peer)
 
     def close(self) -> None:
         """Close the port."""
@@ -246,7 +247,8 @@ class TcpPort:
 
     def send(self, message: Message) -> None:
         """Send a message to the client, if there is one."""
-        self._server.send(self._codec.encode(message, version=self._settings.version))
+        if self._settings.version == 2 or message.id < 256:
+            self._server.send(self._codec.encode(message, version=self._settings.version))
 
     def close(self) -> None:
         """Close the server and the connection."""
