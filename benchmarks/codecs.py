@@ -29,7 +29,7 @@ from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.options import LAYOUTS
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
-from skyloop.vehicles.emulation.encoders import GROUP, Encoder
+from skyloop.vehicles.emulation.video import GROUP, Encoder
 
 UVLC_PER_S: Final = 15.0  #: what an AR.Drone 1 sends: the target
 PICTURES: Final = 2 * GROUP  #: two groups of H.264 pictures, each with a key frame

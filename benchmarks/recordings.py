@@ -41,7 +41,7 @@ from skyloop.recording.review.video import export_mp4
 from skyloop.recording.translation import Picture, Translator
 from skyloop.sim.camera import FRONT_CAMERA
 from skyloop.vehicles.ardrone.emulator.video import H264_360P
-from skyloop.vehicles.emulation.encoders import Encoded, Encoder
+from skyloop.vehicles.emulation.video import Encoded, Encoder
 from skyloop.vehicles.replay.source import ReplaySource
 
 FPS: Final = 30

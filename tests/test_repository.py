@@ -135,7 +135,7 @@ def test_what_is_measured_of_a_module(gauge: ModuleType) -> None:
         ("errors.py", "(top)"),
         ("proxy/core/flight.py", "proxy"),
         ("drivers/base.py", "drivers"),
-        ("vehicles/msp/link.py", "vehicles/msp"),
+        ("vehicles/msp/driver.py", "vehicles/msp"),
         ("vehicles/msp/wire/frames.py", "vehicles/msp"),
         ("transport/local/client.py", "transport"),
         ("network/keys/lab.py", "network"),

@@ -123,13 +123,13 @@ def test_a_vehicle_that_shows_a_board_calibrates(run: Run, tmp_path: Path, pictu
 
 def test_the_cameras_of_this_machine_are_listed(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     pytest.importorskip("av")
-    from skyloop.vehicles.video import devices
+    from skyloop.vehicles.video import v4l2
 
-    monkeypatch.setattr(devices, "cameras", list)
+    monkeypatch.setattr(v4l2, "cameras", list)
     assert run("camera", "list").out.strip() == "no camera is connected to this machine"
     (tmp_path / "video0").touch()
-    found = [devices.CameraDevice(tmp_path / "video0", "HD Webcam", True)]
-    monkeypatch.setattr(devices, "cameras", lambda: found)
+    found = [v4l2.CameraDevice(tmp_path / "video0", "HD Webcam", True)]
+    monkeypatch.setattr(v4l2, "cameras", lambda: found)
     lines = run("camera", "list").out.splitlines()
     assert lines[0] == f"video://{tmp_path}/video0 (HD Webcam)"
     assert lines[1].startswith("  can't be opened: ")

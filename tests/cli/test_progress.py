@@ -20,7 +20,9 @@ from skyloop.cli.doctor import Health
 from skyloop.cli.install import EXTRAS
 from skyloop.cli.text import console as skyloop_console
 from skyloop.cli.text import named
-from skyloop.vehicles.video.devices import CameraDevice, cameras, described
+from skyloop.vehicles.video.v4l2 import CameraDevice, cameras, described
+from tests.cli.conftest import FAST_SIM, Run
+from tests.processes.conftest import Process, in_terminal
 from tests.support.commands import FAST_SIM, Run
 from tests.support.processes import Process, in_terminal
 
@@ -91,7 +93,7 @@ def test_cameras_are_listed_by_name_and_node(tmp_path: Path) -> None:
 
 def test_video_without_a_camera_says_which_there_are(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     webcam = CameraDevice(Path("/dev/video4"), "HD Webcam", allowed=True)
-    monkeypatch.setattr("skyloop.vehicles.video.options.cameras", lambda: [webcam])
+    monkeypatch.setattr("skyloop.vehicles.video.driver.cameras", lambda: [webcam])
     ended = run("proxy", "video://")
     assert ended.code == 2
     assert ended.err.endswith("cameras of this machine: video:///dev/video4 (HD Webcam)\n")

@@ -19,12 +19,14 @@ from skyloop.transport.local.frame_exchange import MAX_LEASES
 from skyloop.transport.local.server import MAX_CLIENTS
 from skyloop.vehicles.ardrone import options as ardrone_options
 from skyloop.vehicles.mavlink import options as mavlink_options
-from skyloop.vehicles.msp import options as msp_options
-from skyloop.vehicles.replay import options as replay_options
+from skyloop.vehicles.msp import parameters as msp_options
+from skyloop.vehicles.replay import driver as replay_options
 from skyloop.vehicles.ros2 import options as ros2_options
 from skyloop.vehicles.sim import options as sim_options
 from skyloop.vehicles.tello import options as tello_options
+from skyloop.vehicles.video import driver as video_options
 from skyloop.vehicles.video import options as video_options
+from tests.docs.pages import ROOT, rows, section
 from tests.support.pages import ROOT, rows, section
 
 

@@ -16,7 +16,8 @@ from skyloop.drivers.h264 import SPS, START, Inspector, unit_type, units
 from skyloop.drivers.live_container import HOPELESS_S, STRICT_S, LiveDecoder, Piece
 from skyloop.drivers.live_frames import Coded
 from skyloop.errors import UnsupportedError
-from skyloop.vehicles.emulation.encoders import Encoder, Format
+from skyloop.vehicles.emulation.video import Encoder, Format
+from tests.drivers.mavlink.film import FPS, GROUP, HEIGHT, WIDTH, Film
 from tests.support.film import FPS, GROUP, HEIGHT, WIDTH, Film
 
 av = pytest.importorskip("av")

@@ -16,7 +16,7 @@ from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import VERSION, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
 from skyloop.recording.output import RecordingFile
 from skyloop.recording.translation import Picture, Translator
-from skyloop.vehicles.emulation.encoders import Encoder, Format
+from skyloop.vehicles.emulation.video import Encoder, Format
 
 MS = 1_000_000
 BEGIN_NS = 5_000_000_000

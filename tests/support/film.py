@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.vehicles.emulation.encoders import Encoded, Encoder, Format
+from skyloop.vehicles.emulation.video import Encoded, Encoder, Format
 
 BITS, STRIPE, HEIGHT = 12, 16, 64
 WIDTH = BITS * STRIPE

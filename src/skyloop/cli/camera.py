@@ -136,7 +136,7 @@ def calibrate(
 @camera.command("list", short_help="List the cameras of this machine", epilog=f"{_EXAMPLE}list")
 def list_cameras() -> None:
     """List the cameras of this machine: their addresses, formats, sizes, rates, exposure and gain."""
-    from skyloop.vehicles.video.devices import cameras, described, listed
+    from skyloop.vehicles.video.v4l2 import cameras, described, listed
 
     found = cameras()
     if not found:

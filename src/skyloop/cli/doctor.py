@@ -220,7 +220,7 @@ def _compiled_pictures() -> Iterator[Finding]:
 
 
 def _cameras() -> Iterator[Finding]:
-    from skyloop.vehicles.video.devices import cameras
+    from skyloop.vehicles.video.v4l2 import cameras
 
     found = cameras()
     for camera in found:

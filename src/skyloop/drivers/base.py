@@ -7,6 +7,7 @@ class is registered under the entry-point group ``skyloop.drivers`` with its URI
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -30,6 +31,7 @@ from skyloop.messages import (
     Land,
     LinkState,
     Parameter,
+    ParameterType,
     Refusal,
     Severity,
     Value,
@@ -221,11 +223,8 @@ class Driver(ABC):
         UsageError: A subclass raises it for an option that it does not know; see :func:`reject_unknown_options`.
     """
 
-    #: Whether somebody else may fly the vehicle too. If so, a vehicle found in the air is theirs and is left alone.
     shared = True
-    #: Parameters that any pilot may write, whoever holds the authority: those that move nothing that flies.
     parameters_without_authority: frozenset[str] = frozenset()
-    #: Set by a host before :meth:`open`: serves a link that never waits on a thread with those of other vehicles.
     serve_link: Callable[[ServedLink], None] | None = None
 
     def __init__(self, uri: VehicleUri) -> None:
@@ -425,3 +424,27 @@ def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
     for name in uri.options:
         if name not in known:
             raise UnknownNameError(f"option of {uri.scheme}://", name, known)
+
+
+def checked_value(parameter: Parameter, value: Value) -> Value:
+    """Return a new value of a parameter that is no vector, as a float where it is one.
+
+    Raises:
+        ParameterError: It is of another type, out of range, or none of the choices.
+    """
+    name, kind = parameter.name, parameter.type
+    if kind in (ParameterType.FLOAT, ParameterType.INT) and not parameter.choices:
+        whole = kind is ParameterType.INT
+        if isinstance(value, bool) or not isinstance(value, int | float) or (whole and value % 1):
+            raise ParameterError(f"{name} takes a {'whole ' * whole}number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
+        low = -math.inf if parameter.minimum is None else parameter.minimum
+        high = math.inf if parameter.maximum is None else parameter.maximum
+        if not (math.isfinite(value) and low <= value <= high):
+            raise ParameterError(f"{name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+        return value if whole else float(value)
+    if type(value) is not type(parameter.value):
+        raise ParameterError(f"{name} takes a {kind.value}, not {value!r:.60}", code=Refusal.WRONG_TYPE)
+    if parameter.choices and value not in parameter.choices:
+        names = [str(choice) for choice in parameter.choices]
+        raise ParameterError(str(UnknownNameError(name, str(value), names)), code=Refusal.OUT_OF_RANGE)
+    return value

@@ -96,10 +96,6 @@ class ByteStream(ABC):
     ``dropped`` counts the packets that were not sent, because the line was behind or stalled, or had no room. Drivers
     repeat each, or send a newer one. What the far end's own buffer holds is seen by none of this, nor is a
     pseudo-terminal's, whose size the system gives as 0: sessions hold set-points back where nothing is heard.
-
-    Args:
-        pace: Of the line.
-        clock: Monotonic, ns.
     """
 
     def __init__(self, pace: LinePace, clock: Clock) -> None:
@@ -128,10 +124,6 @@ class ByteStream(ABC):
 
     def write(self, data: bytes, rank: Rank = Rank.SETPOINT) -> None:
         """Send a packet, or drop it where there is no room or the line is behind. Never waits.
-
-        Args:
-            data: The packet.
-            rank: Its importance.
 
         Raises:
             OSError: It can't be sent, or no whole packet could be for :data:`STUCK_NS`.
@@ -218,11 +210,6 @@ class ByteStream(ABC):
 class TcpStream(ByteStream):
     """A client of a TCP server. Connected is not yet served.
 
-    Args:
-        host: Numeric.
-        port: TCP.
-        clock: Monotonic, ns.
-
     Raises:
         OSError: It can't be reached within :data:`CONNECT_S`.
     """
@@ -241,11 +228,7 @@ class TcpStream(ByteStream):
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """Return what came, possibly nothing.
-
-        Raises:
-            OSError: The connection ended.
-        """
+        """Return what came, possibly nothing."""
         try:
             data = self._socket.recv(_MOST)
         except BlockingIOError:
@@ -278,13 +261,6 @@ class TcpStream(ByteStream):
 class SerialStream(ByteStream):
     """A serial port, through pyserial, opened for this process alone, with an empty output buffer.
 
-    Args:
-        path: Of the device.
-        baud: Bits a second.
-        what: That needs it, for the error.
-        extra: That installs pyserial, for the error.
-        clock: Monotonic, ns.
-
     Raises:
         OSError: It can't be opened.
         MissingExtraError: pyserial is not installed.
@@ -306,11 +282,7 @@ class SerialStream(ByteStream):
         return number
 
     def read(self) -> bytes:
-        """Return what came, possibly nothing.
-
-        Raises:
-            OSError: It was unplugged.
-        """
+        """Return what came, possibly nothing."""
         if not wait_readable(self, 0.0):
             return b""
         data = os.read(self.fileno(), _MOST)  # pyserial's own waits by select.select, which knows low numbers only
@@ -344,11 +316,6 @@ class SerialStream(ByteStream):
 
 
 def line_speed(path: str, baud: int) -> float | None:
-    """Return how many bytes a second a serial port carries; None for one over USB, whose bit rate means nothing.
-
-    Args:
-        path: Of the device; links are followed.
-        baud: Bits a second.
-    """
+    """Return how many bytes a second a serial port carries; None for one over USB, whose bit rate means nothing."""
     device = Path(path).resolve().name
     return None if re.match(r"ttyACM|(cu|tty)\.usbmodem", device) else baud / _BITS

@@ -89,11 +89,7 @@ class LiveCamera:
         )
 
     def start(self) -> None:
-        """Start to receive. Returns at once.
-
-        Raises:
-            MissingExtraError: PyAV is not installed.
-        """
+        """Start to receive. Returns at once."""
         self._video.start()
 
     def stop(self) -> None:

@@ -124,11 +124,7 @@ class ContainerStream:
         self._captured_newest_ns = 0
 
     def read(self) -> list[Coded]:
-        """Return the next picture, as a list of one.
-
-        Raises:
-            OSError: The stream ended, failed, or gave nothing for ``read_s``.
-        """
+        """Return the next picture, as a list of one."""
         try:
             packet = next(self._packets, None)
         except av.error.ExitError as error:
@@ -184,10 +180,6 @@ class Units:
     """The H.264 of a stream in Annex B form, whatever it comes in.
 
     ``reason`` says why its pictures can't be handed on as they came; empty as long as they can.
-
-    Args:
-        stream: Of an open container.
-        context: Of the stream.
     """
 
     def __init__(self, stream: av.VideoStream, context: VideoCodecContext) -> None:
@@ -262,11 +254,7 @@ class LiveDecoder:
         self._captured: dict[tuple[bool, int | None], int] = {}
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """See :class:`skyloop.drivers.live_video.Decoder`.
-
-        Raises:
-            UnsupportedError: Nothing could be decoded for :data:`HOPELESS_S`.
-        """
+        """See :class:`skyloop.drivers.live_video.Decoder`."""
         piece = coded.data
         if not isinstance(piece, Piece):
             raise TypeError("a piece of a live stream is wanted")

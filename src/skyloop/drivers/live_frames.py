@@ -47,12 +47,7 @@ class FrameBacklog:
         return len(self._frames)
 
     def put(self, frame: Coded, *, wanted: bool) -> None:
-        """Add a frame that arrived.
-
-        Args:
-            frame: The newest.
-            wanted: Whether anybody wants frames now.
-        """
+        """Add a frame that arrived."""
         if frame.is_key and not wanted:
             self._drop(len(self._frames))
         elif len(self._frames) == MAX_FRAMES:
@@ -92,10 +87,6 @@ class StreamRelay:
     """Hands H.264 on while somebody wants it, beginning with a key picture, and after a gap with the next one.
 
     Whether pictures are decoded as well makes no difference. Not thread-safe.
-
-    Args:
-        sink: The proxy's.
-        intrinsics: Returns those of a camera for a width and height.
     """
 
     def __init__(self, sink: Sink, intrinsics: Callable[[str, int, int], Intrinsics | None]) -> None:
@@ -162,12 +153,6 @@ class CheckedRelay:
     """Hands on the H.264 of one camera whose stream is not known beforehand, and reports once why it does not.
 
     Used by one thread at a time.
-
-    Args:
-        relay: Hands it on.
-        sink: The proxy's, for events.
-        camera: Its name.
-        where: What an event is about.
     """
 
     def __init__(self, relay: StreamRelay, sink: Sink, camera: str, where: str) -> None:

@@ -98,13 +98,7 @@ class Picture:
     number: int  #: counts the vehicle's pictures, 32 bits
 
     def show(self, sink: Sink, camera: str, intrinsics: Intrinsics | None) -> None:
-        """Publish it as a frame of a camera.
-
-        Args:
-            sink: The proxy's.
-            camera: Its name.
-            intrinsics: For this size, None if they are not known.
-        """
+        """Publish it as a frame of a camera."""
         sink.frame(camera, self.pixels, self.captured_ns, width=self.width, height=self.height, intrinsics=intrinsics)
 
 
@@ -117,13 +111,7 @@ class VideoEvent(Enum):
     FAULT = "fault"  #: an error of this program, reported once; the video goes on
 
     def publish(self, sink: Sink, where: str, text: str) -> None:
-        """Publish it as an event.
-
-        Args:
-            sink: The proxy's.
-            where: What it is about, such as the video or a camera.
-            text: For people.
-        """
+        """Publish it as an event."""
         kind, severity = _EVENTS[self]
         sink.event(kind, f"{where} {self.value}: {text}", severity, where=where)
 
@@ -215,12 +203,7 @@ class LiveVideo:
         self._threads: list[threading.Thread] = []
 
     def start(self) -> None:
-        """Start both threads. Returns at once.
-
-        Raises:
-            UsageError: It was started before.
-            MissingExtraError: No decoder is installed.
-        """
+        """Start both threads. Returns at once."""
         if self._threads:
             raise UsageError("this receiver was started before")
         self._decoder = self._make_decoder()
@@ -283,11 +266,7 @@ class LiveVideo:
             failures += 1
 
     def _follow(self) -> None:
-        """Serve one connection from beginning to end.
-
-        Raises:
-            OSError: It ended otherwise than by :meth:`stop`.
-        """
+        """Serve one connection from beginning to end."""
         stream = self._connect(self._connections)
         with self._came:
             self._stream = stream

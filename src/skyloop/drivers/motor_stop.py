@@ -26,9 +26,6 @@ class MotorStop:
     is heard, and again every 0.1 s until the vehicle shows it; until then the vehicle is reported as what it does. A
     stop that the vehicle has not shown 10 s after the press is over: it is not sent minutes later, and the vehicle may
     be landed. Not thread-safe.
-
-    Args:
-        give_up: Called with the event to publish when the stop ends without a reset.
     """
 
     def __init__(self, give_up: Callable[[VehicleEvent], None]) -> None:

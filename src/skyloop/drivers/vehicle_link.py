@@ -60,14 +60,7 @@ class NameLookup:
         return self._asking is not None and self._asking.answered.is_set()
 
     def address(self, host: str) -> str:
-        """Return a host's first address. Blocks for ``wait_s`` at most.
-
-        Args:
-            host: A name, or an address, which is returned at once.
-
-        Raises:
-            OSError: It is not known, or not known yet: ask again.
-        """
+        """Return a host's first address. Blocks for ``wait_s`` at most."""
         try:
             return str(ipaddress.ip_address(host))
         except ValueError:
@@ -164,14 +157,7 @@ class VehicleLink(ABC, Generic[S]):
             self.session.close()
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Have the session accept an action, and send it at once if its pace allows. Any thread.
-
-        Returns:
-            What is applied, after the vehicle's limits.
-
-        Raises:
-            DriverError: It can't be done.
-        """
+        """Have the session accept an action, and send it at once if its pace allows. Any thread."""
         return self._decide(partial(self.session.command, action))
 
     # For a kind's methods that the proxy's threads call ----------------------------------------------------------
@@ -190,13 +176,7 @@ class VehicleLink(ABC, Generic[S]):
     def _wait_for_answer(
         self, ask: Callable[[Callable[[str | None], None]], None], within_s: float, otherwise: str | None
     ) -> str | None:
-        """Ask the vehicle and wait for its answer. Any thread but the link's.
-
-        Args:
-            ask: Called with the lock held, with the function that takes the answer.
-            within_s: How long to wait [s].
-            otherwise: Returned if no answer comes in time.
-        """
+        """Ask the vehicle and wait for its answer. Any thread but the link's."""
         done = threading.Event()
         answers: list[str | None] = []
 

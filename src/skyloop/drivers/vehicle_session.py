@@ -28,6 +28,12 @@ _MOST_PORTS: Final = 4  # that are named
 SinkCallback: TypeAlias = Callable[[Sink], None]
 
 
+def deliver(sink: Sink, pending: Iterable[SinkCallback]) -> None:
+    """Give a sink what a session has for it."""
+    for publish in pending:
+        publish(sink)
+
+
 @dataclass(frozen=True, slots=True)
 class LinkTimeouts:
     """How long a vehicle may be silent [ns] before the link is degraded or lost."""
@@ -48,14 +54,7 @@ class VehicleEvent:
 
 
 def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: Value) -> VehicleEvent:
-    """Return a message of the vehicle itself.
-
-    Args:
-        text: For people.
-        reason: One word for programs, in the event's data.
-        severity: For people and for filters.
-        **data: More for programs.
-    """
+    """Return a message of the vehicle itself."""
     return VehicleEvent(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})
 
 
@@ -121,9 +120,6 @@ class VehicleSession(ABC):
     Time comes as an argument; bytes go in and out. Calls of the proxy's sink are collected as callbacks, for
     the caller to run when it holds no lock. A kind of vehicle sets ``_received_ns`` with each valid packet, and calls
     :meth:`_check_silence` with each poll.
-
-    Args:
-        now_ns: The time of opening, on the link's clock.
     """
 
     TIMEOUTS: ClassVar[LinkTimeouts]
@@ -147,29 +143,14 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action.
-
-        Args:
-            action: One that the driver's capabilities name.
-            now_ns: The present time.
-
-        Returns:
-            What is applied, after the vehicle's limits.
-
-        Raises:
-            DriverError: It can't be done.
-        """
+        """Accept an action."""
 
     @abstractmethod
     def close(self) -> None:
         """End the session: every caller that waits for an answer gets a failure."""
 
     def unreachable(self, reason: str) -> None:
-        """Note why the vehicle can't be reached: nobody listens, there is no route to it, or the connection failed.
-
-        Args:
-            reason: Completes what is reported of the silence.
-        """
+        """Note why the vehicle can't be reached: nobody listens, there is no route to it, or the connection failed."""
         self._unreachable, self._remedy = reason, ""
 
     def failed(self, error: OSError) -> None:
@@ -181,12 +162,7 @@ class VehicleSession(ABC):
         """Handle a new connection: nothing of an older one follows."""
 
     def broken(self, error: OSError, now_ns: int) -> None:
-        """Handle that nothing can be sent any more on an open connection: the vehicle is lost, whatever it still sends.
-
-        Args:
-            error: Of the connection, which is opened again.
-            now_ns: The present time.
-        """
+        """Handle an open connection that takes nothing more: the vehicle is lost, whatever it still sends."""
         self.failed(error)
         self.due_ns = now_ns
         if self._received_ns is not None:
@@ -264,11 +240,7 @@ class VehicleSession(ABC):
             self._set_link_state(LinkState.DEGRADED, self._silence_text(silent_ns))
 
     def _silence_seen_ns(self, latest_ns: int) -> int:
-        """Return when :meth:`_check_silence` is to be called next, not after ``latest_ns``, so that it is in time.
-
-        Args:
-            latest_ns: The time of the next poll if the vehicle were not silent.
-        """
+        """Return when :meth:`_check_silence` is to be called next, not after ``latest_ns``, so that it is in time."""
         if self._received_ns is None:
             return latest_ns
         patience = self.TIMEOUTS.degraded_ns if self.link_state is LinkState.UP else self.TIMEOUTS.lost_ns
@@ -295,24 +267,14 @@ class VehicleSession(ABC):
 
 @dataclass(frozen=True, slots=True)
 class LinkTrouble:
-    """Why a vehicle can't be reached.
+    """Why a vehicle can't be reached."""
 
-    Args:
-        reason: What failed; may be empty.
-        remedy: What to do, as an instruction to a person; may be empty.
-    """
-
-    reason: str
-    remedy: str = ""
+    reason: str  #: what failed; may be empty
+    remedy: str = ""  #: what to do, as an instruction to a person; may be empty
 
 
 def trouble_of(error: OSError, advice: str) -> LinkTrouble:
-    """Describe a socket's error.
-
-    Args:
-        error: As the socket raised it.
-        advice: What to do where there is no route to the vehicle, or no answer.
-    """
+    """Describe a socket's error."""
     if isinstance(error, socket.gaierror):
         remedy = "correct the name in the address, or join a network that knows it"
         return LinkTrouble(f"its name is not known: {error.strerror}", remedy)

@@ -122,7 +122,7 @@ def msp(data: bytes) -> None:
     """What a flight controller answers by MSP, and what an emulated one is sent."""
     from skyloop.clock import NS_PER_S
     from skyloop.drivers.uri import parse_uri
-    from skyloop.vehicles.msp.options import options_of
+    from skyloop.vehicles.msp.parameters import options_of
     from skyloop.vehicles.msp.protocol import MspSession
     from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
 

@@ -782,6 +782,23 @@ def test_a_hover_is_sent_to_what_falls_silent(stop: AnyAction) -> None:
     assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
 
 
+@pytest.mark.parametrize("wanted", [Velocity(forward=-0.5), Velocity(left=0.3)])
+def test_what_falls_silent_is_stopped_where_another_velocity_is_wanted(wanted: Velocity) -> None:
+    """It flew on for up to 3 s the way that its pilot had turned away from, if it only could not be heard."""
+    bench = Bench(Vehicle(ARDUPILOT), options("mavlink://udpin:127.0.0.1:14540?parameters=no")).flying("GUIDED")
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(1.0)
+    bench.go_on(0.7, silent=True)
+    bench.said.clear()
+    bench.apply(wanted)
+    bench.go_on(0.2, silent=True)
+    told = bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
+    assert len(told) >= 3
+    assert {(each.vx, each.vy, each.vz, each.yaw_rate) for each in told} == {(0.0, 0.0, 0.0, 0.0)}
+    bench.go_on(0.1)
+    assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")[-1].vx == pytest.approx(wanted.forward)
+
+
 def test_a_vehicle_whose_only_answer_was_lost_is_asked_again() -> None:
     """It told its version, so nothing more was asked, and no set-point was ever sent again."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
@@ -811,6 +828,19 @@ def test_an_emergency_stop_goes_before_all_else() -> None:
     bench.session.command(EmergencyStop(), bench.clock())
     assert [packet.rank for packet in bench.session.poll(bench.clock())].count(Rank.STOP) == 1
     assert rank_of(m.MAVLink_command_long_message(1, 1, m.MAV_CMD_COMPONENT_ARM_DISARM, 0, *[0.0] * 7)) is Rank.COMMAND
+
+
+def test_what_can_not_be_encoded_keeps_no_stop_back() -> None:
+    """One pose with a number too large for its field, and nothing that was due with it was sent."""
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    pose = ExternalPose((1e39, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), bench.clock())
+    bench.session.command(EmergencyStop(), bench.clock())
+    bench.session.send(pose_message(pose, PoseMessage.ODOMETRY))
+    bench.tick()
+    assert [each.param2 for each in bench.heard_of("COMMAND_LONG")] == [21196.0]
+    bench.session.send(pose_message(pose, PoseMessage.ODOMETRY))
+    bench.tick()
+    assert sum("ODOMETRY is not sent" in text for text in bench.texts) == 1, "told once"
 
 
 def test_a_take_off_is_decided_by_one_state_of_the_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -938,6 +938,34 @@ def test_an_arming_that_shows_after_its_take_off_was_given_up_is_undone(autopilo
 
 
 @AUTOPILOTS
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("acknowledged", [False, True])
+def test_what_a_take_off_armed_that_a_lost_link_cut_is_disarmed_again(
+    autopilot: int, acknowledged: bool, held: bool
+) -> None:
+    """Its propellers turned until it disarmed itself, 10 s later: nobody wanted that take-off any more."""
+    bench = arming(autopilot)
+    bench.vehicle.armed = True
+    if acknowledged:
+        bench.answer(ARM)
+    bench.go_on(3.0, silent=True)
+    if held:  # as the proxy asks for, not knowing whether it flies
+        bench.apply(Hover(), alone=True)
+        bench.go_on(0.5, silent=True)
+    bench.commands()
+    bench.hear(bench.vehicle.heartbeat())
+    bench.tick()
+    bench.vehicle.mode = {ARDUPILOT: "BRAKE", PX4: "AUTO.LOITER"}[autopilot] if held else bench.vehicle.mode
+    bench.go_on(1.0)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) in bench.commands()
+    bench.vehicle.armed = False
+    bench.go_on(1.0)
+    bench.commands()
+    bench.go_on(3.0)
+    assert bench.commands() == []
+
+
+@AUTOPILOTS
 @pytest.mark.parametrize("switched", [True, False])
 def test_who_arms_and_flies_it_right_after_a_take_off_was_given_up_is_left(autopilot: int, switched: bool) -> None:
     """A safety pilot takes over what did not start: it was told to land twice a second, for the whole flight."""

@@ -19,7 +19,7 @@ from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.msp.emulator.board import RACER, Board, BoardSettings
-from skyloop.vehicles.msp.options import MspOptions, options_of
+from skyloop.vehicles.msp.parameters import MspOptions, options_of
 from skyloop.vehicles.msp.protocol import MspSession
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 

@@ -15,8 +15,7 @@ from skyloop.errors import DriverError, ParameterError, UnknownNameError, UsageE
 from skyloop.messages import Attitude, EmergencyStop, FlightState, LinkState, ResetEmergency, Takeoff
 from skyloop.vehicles.msp.driver import MspDriver
 from skyloop.vehicles.msp.firmware import Setup, hindrances
-from skyloop.vehicles.msp.options import options_of
-from skyloop.vehicles.msp.parameters import DriverParameters
+from skyloop.vehicles.msp.parameters import DriverParameters, options_of
 from skyloop.vehicles.msp.protocol import MspSession
 from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
 from skyloop.vehicles.msp.telemetry import PATIENCE_NS, MotionEstimate, Questions, Telemetry, charge_left

@@ -19,9 +19,8 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import MissingExtraError
 from skyloop.messages import Attitude, EmergencyStop, Idle, LinkState, ResetEmergency
-from skyloop.vehicles.msp.driver import MspDriver
+from skyloop.vehicles.msp.driver import MspDriver, MspLink
 from skyloop.vehicles.msp.emulator import BetaflightFirmware
-from skyloop.vehicles.msp.link import MspLink
 from skyloop.vehicles.msp.wire.frames import Parser
 from skyloop.vehicles.msp.wire.messages import Function
 from tests.support.betaflight import world

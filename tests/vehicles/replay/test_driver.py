@@ -42,9 +42,8 @@ from skyloop.recording.layout import (
     to_plain,
 )
 from skyloop.recording.reader import Recording
-from skyloop.vehicles.replay.driver import ReplayDriver
-from skyloop.vehicles.replay.options import KNOWN
-from skyloop.vehicles.replay.publisher import ReplayPublisher
+from skyloop.vehicles.replay.driver import KNOWN, ReplayDriver
+from skyloop.vehicles.replay.player import ReplayPublisher
 from skyloop.vehicles.replay.source import ReplaySource, Timeline
 from tests.support.pages import rows, section
 from tests.support.recorded_flights import BEGIN_NS, CAPABILITIES, MS, UNIX_NS, Plan, feedback_at, write_flight

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from skyloop.vehicles.video import v4l2
-from skyloop.vehicles.video.devices import CameraDevice, listed
-from skyloop.vehicles.video.options import DeviceOptions
-from skyloop.vehicles.video.v4l2 import FrameSize, PixelFormat, V4l2Device
+from skyloop.vehicles.video.driver import DeviceOptions
+from skyloop.vehicles.video.v4l2 import CameraDevice, FrameSize, PixelFormat, V4l2Device, listed
 
 MJPG, YUYV, BGR = (int.from_bytes(code, "little") for code in (b"MJPG", b"YUYV", b"BGR3"))
 

@@ -45,17 +45,11 @@ Step: TypeAlias = Write | Read
 
 @dataclass(eq=False)
 class Exchange:
-    """Steps in order, and what to call when they are done.
+    """Steps in order, and what to call when they are done."""
 
-    Args:
-        steps: May be a generator: each step is asked for when the one before is done.
-        deadline_ns: When all must be done.
-        done: Called at the end with why it failed, or None.
-    """
-
-    steps: Iterator[Step]
-    deadline_ns: int
-    done: Callable[[str | None], None] = field(default=lambda _: None)
+    steps: Iterator[Step]  #: may be a generator: each step is asked for when the one before is done
+    deadline_ns: int  #: when all must be done
+    done: Callable[[str | None], None] = field(default=lambda _: None)  #: called at the end with why it failed, or None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +97,7 @@ class Configurator:
             self._next_exchange()
 
     def abandon(self, reason: str) -> None:
-        """Fail all exchanges and forget what was read: the drone is away.
-
-        Args:
-            reason: Given to each exchange's ``done``.
-        """
+        """Fail all exchanges, each with this reason, and forget what was read: the drone is away."""
         self.values = {}
         exchanges = ([self._exchange] if self._exchange is not None else []) + list(self._queue)
         self._queue.clear()
@@ -119,11 +109,7 @@ class Configurator:
     # What is received ---------------------------------------------------------------------------------------------
 
     def on_acknowledge(self, acknowledged: bool) -> bool:
-        """Handle the acknowledge bit of the newest navdata.
-
-        Returns:
-            Whether there is something to send at once.
-        """
+        """Handle the acknowledge bit of the newest navdata; return whether there is something to send at once."""
         self._acknowledged = acknowledged
         if self._phase is _Phase.CLEARING and not acknowledged:
             self._begin_asking()
@@ -140,11 +126,7 @@ class Configurator:
         self._dump, self._asked_ns = bytearray(), 0
 
     def dump_received(self, data: bytes) -> bool:
-        """Handle bytes of the control port.
-
-        Returns:
-            Whether the connection is not needed any longer.
-        """
+        """Handle bytes of the control port; return whether the connection is not needed any longer."""
         if self._dump is None or not isinstance(self._step, Read):
             return True
         self._dump += data
@@ -266,11 +248,7 @@ def version_of(configuration: Mapping[str, str]) -> int | None:
 
 
 def own_ids(session: int) -> Ids:
-    """Return Skyloop's ids.
-
-    Args:
-        session: A number. Settings of application and user persist; those of a session start over with each number.
-    """
+    """Return Skyloop's ids. Settings of application and user persist; those of a session end with its number."""
     return Ids(
         session=f"{session & 0xFFFFFFFF:08x}",
         profile=f"{crc32(b'skyloop user'):08x}",
@@ -310,11 +288,7 @@ class Setup:
         self._remembered = remembered
 
     def steps(self, state: State) -> Iterator[Step]:
-        """Yield the steps. The configurator must do each before it asks for the next.
-
-        Args:
-            state: The state bits as they were first received.
-        """
+        """Yield the steps, by the state bits as first received; each must be done before the next is asked for."""
         options, configurator = self._options, self._configurator
         in_demo = bool(state & State.DEMO)
         if state & State.BOOTSTRAP or in_demo is options.full:

@@ -10,7 +10,7 @@ from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.camera_options import intrinsics_of
 from skyloop.drivers.live_video import Picture, VideoEvent
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.vehicle_session import SinkCallback
+from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, ParameterError, SkyloopError
 from skyloop.messages import (
     AnyAction,
@@ -80,8 +80,7 @@ class ArdroneDriver(Driver):
 
     def _deliver(self, sink: Sink, pending: list[SinkCallback]) -> None:
         """Run the session's callbacks. On the link's thread."""
-        for publish in pending:
-            publish(sink)
+        deliver(sink, pending)
         session = self._session
         if session is not None and session.ready:
             self._camera = active_camera(session.configurator.values)
@@ -118,20 +117,7 @@ class ArdroneDriver(Driver):
         return known + [entry.parameter for entry in self._entries().values()]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a key, or give a command that is a parameter. Takes up to 0.9 s: a key is acknowledged and read back.
-
-        Args:
-            name: A name that :meth:`parameters` lists.
-            value: Of the parameter's type.
-
-        Returns:
-            The value in force, as it was read back.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The driver is not open, the configuration was not read yet, the value does not fit, or the
-                drone did not acknowledge or accept it.
-        """
+        """Write a key, which is acknowledged and read back, or give a command. Takes up to 0.9 s."""
         link, commands = self._link, self._commands
         if link is None or commands is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)

@@ -21,13 +21,7 @@ WRITE_S: Final = 0.9  #: a key is written, acknowledged and read back within thi
 
 
 class ArdroneLink(VehicleLink[ArdroneSession]):
-    """Navdata, AT commands and the control port of one drone.
-
-    Args:
-        session: The drone's protocol.
-        deliver: Called on the link's thread with what the session has for the sink.
-        clock: Monotonic, ns.
-    """
+    """Navdata, AT commands and the control port of one drone."""
 
     def __init__(
         self, session: ArdroneSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
@@ -45,15 +39,7 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
             self.session.send(message, times)
 
     def write(self, key: str, text: str) -> str | None:
-        """Write a key and read it back. Takes up to 0.9 s. Any thread but the link's.
-
-        Args:
-            key: As the drone calls it.
-            text: Its value as text.
-
-        Returns:
-            Why it failed, or None.
-        """
+        """Write a key and read it back; return why it failed, or None. Takes up to 0.9 s. Any thread but the link's."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             deadline_ns = self._clock() + nanoseconds(WRITE_S)
@@ -129,13 +115,7 @@ _CHUNK: Final = 1 << 16
 
 
 class DumpClient:
-    """Connects when the configurator wants a dump, feeds it, and closes the connection when it is whole.
-
-    Args:
-        port: TCP port of the drone.
-        selector: Watches the connection.
-        ready: Registered with the connection; must call :meth:`serve`.
-    """
+    """Connects when the configurator wants a dump, feeds it, and closes the connection when it is whole."""
 
     def __init__(self, port: int, selector: selectors.BaseSelector, ready: Callable[[], None]) -> None:
         """Store the arguments. No I/O."""

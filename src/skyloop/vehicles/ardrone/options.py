@@ -41,12 +41,7 @@ class ArdroneOptions:
 
 
 def options_of(uri: VehicleUri) -> ArdroneOptions:
-    """Parse an address.
-
-    Raises:
-        UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
-        UsageError: It names no host, or an option's value makes no sense.
-    """
+    """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(f"{uri} names no host: it looks like ardrone://192.168.1.1")

@@ -10,6 +10,7 @@ from typing import Final
 
 import msgspec
 
+from skyloop.drivers.base import checked_value
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController
@@ -135,12 +136,7 @@ def _wrong(parameter: Parameter, what: str) -> ParameterError:
 
 
 def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entry]:
-    """Return all parameters of a configuration, by name. Keys that Skyloop does not know are texts, read-only.
-
-    Args:
-        values: Keys and values as they were read.
-        version: Of the drone; None counts as 2.
-    """
+    """Return all parameters of a configuration, by name. Keys that Skyloop does not know are texts, read-only."""
     found: dict[str, Entry] = {}
     for name, text in values.items():
         entry = _own_entry(name, text, version)
@@ -155,12 +151,7 @@ def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entr
 
 
 def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entry, str]:
-    """Return the entry and the key's text for a new value.
-
-    Raises:
-        UnknownNameError: There is no such parameter.
-        ParameterError: It is read-only, or the value is not of its type.
-    """
+    """Return the entry and the key's text for a new value; raises for a name or a value that does not fit."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the AR.Drone", name, entries)
@@ -170,13 +161,7 @@ def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entr
 
 
 def taken(entry: Entry, wanted: str, reported: str) -> bool:
-    """Return whether the drone reports what was written, apart from its way of writing numbers.
-
-    Args:
-        entry: The parameter.
-        wanted: The text that was written.
-        reported: The text that was read back.
-    """
+    """Return whether the drone reports what was written, apart from its way of writing numbers."""
     try:
         one, other = parse_value(wanted, entry.like), parse_value(reported, entry.like)
     except DecodeError:
@@ -362,12 +347,7 @@ def _flight_animations(version: int | None) -> Parameter:
 
 
 class Commands:
-    """Commands that are no actions, as parameters, with their values.
-
-    Args:
-        setpoints: Knows the drone's condition, and takes the heading of absolute control.
-        send: Sends a command.
-    """
+    """Commands that are no actions, as parameters, with their values."""
 
     def __init__(self, setpoints: SetpointController, send: Send) -> None:
         self._setpoints = setpoints
@@ -382,20 +362,13 @@ class Commands:
         return [self._present(parameter) for parameter in known]
 
     def write(self, parameter: Parameter, value: Value) -> Value:
-        """Give a command.
-
-        Args:
-            parameter: One of :meth:`parameters`.
-            value: Of its type.
-
-        Returns:
-            The value that is shown from now on.
+        """Give a command, and return the value that is shown from now on.
 
         Raises:
             ParameterError: The value does not fit, or the drone is not on the ground or in the air as the command
                 needs.
         """
-        value = _checked(parameter, value)
+        value = checked_value(parameter, value)
         name = parameter.name
         if name == _LEDS.name:
             self._light(str(value))
@@ -447,27 +420,6 @@ class Commands:
         if condition is None:
             raise _refused("no data from the drone")
         return condition
-
-
-def _checked(parameter: Parameter, value: Value) -> Value:
-    """Return a value of the parameter's type; an int is accepted for a float."""
-    if parameter.type is ParameterType.FLOAT and isinstance(value, int | float) and not isinstance(value, bool):
-        low, high = parameter.minimum, parameter.maximum
-        assert low is not None
-        assert high is not None
-        if not low <= value <= high:
-            raise ParameterError(
-                f"{parameter.name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE
-            )
-        return float(value)
-    if type(value) is not type(parameter.value):
-        raise ParameterError(
-            f"{parameter.name} takes a {parameter.type.value}, not {value!r:.60}", code=Refusal.WRONG_TYPE
-        )
-    if parameter.choices and value not in parameter.choices:
-        names = [str(choice) for choice in parameter.choices]
-        raise ParameterError(str(UnknownNameError(parameter.name, str(value), names)), code=Refusal.OUT_OF_RANGE)
-    return value
 
 
 def _refused(why: str) -> ParameterError:

@@ -72,14 +72,7 @@ _WATCHDOG: Final[AtMessage] = ("COMWDG", ())
 
 
 class ArdroneSession(VehicleSession):
-    """The protocol of one opened driver with its drone. Not thread-safe.
-
-    Args:
-        options: Of the vehicle's address.
-        ids: Ours, for a drone that keeps everybody's settings apart.
-        now_ns: The time of opening.
-        extra: Gives telemetry of others for feedback's ``native``, such as the video's counters.
-    """
+    """The protocol of one opened driver with its drone. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
@@ -119,14 +112,7 @@ class ArdroneSession(VehicleSession):
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action and have it sent soon.
-
-        Returns:
-            What is applied, after the drone's limits.
-
-        Raises:
-            DriverError: It can't be done now; see :meth:`SetpointController.apply`.
-        """
+        """Accept an action and have it sent soon; see :meth:`SetpointController.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
         self._keep(action, now_ns)

@@ -89,12 +89,10 @@ def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
 
 
 def motion(stick: Stick | None, reference_rad: float | None = None) -> AtMessage:
-    """Return ``PCMD`` for these stick values.
+    """Return ``PCMD`` for these stick values; None: hover.
 
-    Args:
-        stick: None: hover.
-        reference_rad: If given, it is ``PCMD_MAG``: forward and right are then those of somebody who looks along that
-            heading (0 magnetic north, positive counter-clockwise), wherever the drone's nose points.
+    With a reference it is ``PCMD_MAG``: forward and right are then those of somebody who looks along that heading (0
+    magnetic north, positive counter-clockwise), wherever the drone's nose points.
     """
     if stick is None:
         return ("PCMD", (int(Pcmd.HOVER), 0.0, 0.0, 0.0, 0.0))

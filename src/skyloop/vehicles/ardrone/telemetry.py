@@ -174,14 +174,7 @@ def feedback_of(
 ) -> Feedback:
     """Return the drone's state in SI units and our axes.
 
-    What the drone does not report, or reports as an impossible number, is None.
-
-    Args:
-        navdata: The datagram.
-        demo: Its demo option.
-        captured_ns: When the drone was in this state.
-        climb_m_s: Positive up; None if it is not known, and then the velocity isn't either.
-        native: The drone's own telemetry.
+    What the drone does not report, or reports as an impossible number, is None; so is its velocity without a climb.
     """
     measured, raw = navdata.get(PhysMeasures), navdata.get(RawMeasures)
     yaw = _angle(demo.psi)
@@ -236,9 +229,7 @@ _DEMO_FIELDS: Final = len(Demo._fields) - 6
 def native_of(navdata: Navdata, *, everything: bool) -> dict[str, Value]:
     """Return all options of a datagram as telemetry; numbers that are not finite are left out.
 
-    Args:
-        navdata: The datagram.
-        everything: If not, the deprecated matrices of the demo option and an empty list of tags are left out as well.
+    Unless ``everything`` is wanted, so are the deprecated matrices of the demo option and an empty list of tags.
     """
     native: dict[str, Value] = {"state": int(navdata.state), "sequence": navdata.sequence}
     for kind, option in navdata.options.items():
@@ -343,12 +334,7 @@ _BITS: Final = (
 
 
 def diagnose(state: State | None, values: Mapping[str, str]) -> list[Diagnostic]:
-    """Return what is found.
-
-    Args:
-        state: The newest bits; None: none came.
-        values: The configuration by the drone's keys; empty before it was read.
-    """
+    """Return what is found in the newest bits and in the configuration, which is empty before it was read."""
     found = [
         Diagnostic(what, False, detail, advice, severe)
         for bit, what, detail, advice, severe in _BITS

@@ -53,12 +53,7 @@ _CAMERAS: Final = {
 
 
 def cameras_of(uri: VehicleUri, version: int | None) -> tuple[CameraInfo, ...]:
-    """Return both cameras, of which the drone shows one at a time.
-
-    Args:
-        uri: The vehicle's address; intrinsics in it are the front camera's.
-        version: Of the drone; None counts as 2.
-    """
+    """Return both cameras, of which the drone shows one at a time. Intrinsics in the address are the front camera's."""
     front, bottom = _CAMERAS[version or 2]
     given = intrinsics_of(uri, front.width, front.height)
     return (msgspec.structs.replace(front, intrinsics=given) if given is not None else front, bottom)
@@ -82,12 +77,7 @@ class DroneStamps:
         self._time_ms = 0  # the same without wraps
 
     def captured_ns(self, stamp_ms: int, arrived_ns: int) -> int:
-        """Return when a picture was captured, never later than it arrived.
-
-        Args:
-            stamp_ms: The PaVE header's, 32 bits.
-            arrived_ns: On this host's clock.
-        """
+        """Return when a picture was captured, by the stamp of its PaVE header: never later than it arrived."""
         step_ms = (stamp_ms - self._stamp_ms + _WRAP // 2) % _WRAP - _WRAP // 2
         self._stamp_ms = stamp_ms
         self._time_ms += step_ms
@@ -158,11 +148,7 @@ _CHUNK: Final = 1 << 16
 
 
 class PaveStream:
-    """A connection to an AR.Drone 2: PaVE over TCP.
-
-    Raises:
-        OSError: The drone can't be reached within :data:`CONNECT_S`.
-    """
+    """A connection to an AR.Drone 2: PaVE over TCP."""
 
     def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
         self._clock = clock
@@ -182,11 +168,7 @@ class PaveStream:
         return self._assembly.lost_bytes
 
     def read(self) -> list[Coded]:
-        """Return the frames that arrived, after :data:`POLL_S` at most.
-
-        Raises:
-            OSError: The connection ended, or no whole frame came for :data:`SILENT_S`.
-        """
+        """Return the frames that arrived, after :data:`POLL_S` at most."""
         try:
             data = self._socket.recv(_CHUNK)
         except TimeoutError:
@@ -206,11 +188,7 @@ class PaveStream:
 
 
 class DatagramStream:
-    """The video of an AR.Drone 1: one picture in a datagram over UDP, while somebody keeps asking for them.
-
-    Raises:
-        OSError: There is no route to the drone.
-    """
+    """The video of an AR.Drone 1: one picture in a datagram over UDP, while somebody keeps asking for them."""
 
     def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
         self.broken = 0
@@ -232,9 +210,6 @@ class DatagramStream:
         """Return the picture that arrived, after :data:`POLL_S` at most.
 
         A picture has no stamp: it counts as captured when it arrived.
-
-        Raises:
-            OSError: The drone refused, or nothing came for :data:`SILENT_S`.
         """
         try:
             data = self._socket.recv(_CHUNK)
@@ -256,11 +231,7 @@ class DatagramStream:
 
 
 def open_stream(version: int, host: str, port: int, connection: int, clock: Clock) -> Stream:
-    """Connect to the drone's video. An AR.Drone 1's absence shows only when reading.
-
-    Raises:
-        OSError: The drone can't be reached.
-    """
+    """Connect to the drone's video. An AR.Drone 1's absence shows only when reading."""
     return (PaveStream if version == 2 else DatagramStream)(host, port, connection, clock)
 
 
@@ -277,11 +248,7 @@ _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
 
 
 class PaveVideo:
-    """Decodes an AR.Drone 2's video.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
-    """
+    """Decodes an AR.Drone 2's video."""
 
     def __init__(self) -> None:
         try:
@@ -362,11 +329,7 @@ class UvlcVideo:
 
 
 def make_decoder(version: int) -> Decoder:
-    """Return the decoder for a version of the drone.
-
-    Raises:
-        MissingExtraError: What it needs is not installed.
-    """
+    """Return the decoder for a version of the drone; raises if what it needs is not installed."""
     return PaveVideo() if version == 2 else UvlcVideo()
 
 
@@ -384,11 +347,6 @@ class EncodedStream:
     """Hands H.264 on while somebody wants it; see :class:`StreamRelay`. Used by the thread that reads.
 
     A frame came over TCP, so it is whole, and need not be decoded to know that.
-
-    Args:
-        sink: The proxy's.
-        camera: Returns the name of the camera that the drone shows now.
-        intrinsics: Returns those of that camera for a width and height.
     """
 
     def __init__(
@@ -418,11 +376,7 @@ class EncodedStream:
 
 
 class VideoReceiver(LiveVideo):
-    """The live video of an AR.Drone 1 or 2; see :class:`skyloop.drivers.live_video.LiveVideo` for the callbacks.
-
-    Raises:
-        UsageError: For a version other than 1 and 2.
-    """
+    """The live video of an AR.Drone 1 or 2; see :class:`skyloop.drivers.live_video.LiveVideo` for the callbacks."""
 
     def __init__(
         self,

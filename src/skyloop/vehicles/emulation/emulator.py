@@ -15,7 +15,7 @@ from skyloop.faults import Faults
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence
-from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.emulation.datagrams import Loop
 from skyloop.vehicles.emulation.video import VideoEncoding
 
 _log = logging.getLogger(__name__)
@@ -86,13 +86,7 @@ class RunningEmulator(ABC):
         return math.inf if self._video is not None and self._video.wants(camera) else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Encode a picture that is due.
-
-        Args:
-            model: Its camera.
-            pixels: BGR, uint8, shape (height, width, 3); must not change any more.
-            captured_ns: When it was captured, on this host's monotonic clock.
-        """
+        """Encode a picture that is due: BGR, uint8, shape (height, width, 3), which must not change any more."""
         if self._video is not None:
             self._video.show(model.name, pixels, captured_ns)
 
@@ -111,12 +105,7 @@ R = TypeVar("R", bound=RunningEmulator)
 
 
 class Emulator(ABC, Generic[R]):
-    """The firmware of one drone of a host's world; a context manager that is on within its block.
-
-    Args:
-        host: The simulated world.
-        drone: Its number in it.
-    """
+    """The firmware of one drone of a host's world; a context manager that is on within its block."""
 
     def __init__(self, host: SimHost, drone: int) -> None:
         self.host = host
@@ -124,12 +113,7 @@ class Emulator(ABC, Generic[R]):
         self._running: R | None = None
 
     def start(self) -> None:
-        """Switch it on: everything is reset, but at the ports that it had before.
-
-        Raises:
-            LinkError: A port is taken.
-            UsageError: It is started already, or somebody else has this drone.
-        """
+        """Switch it on: everything is reset, but at the ports that it had before."""
         if self._running is not None:
             raise UsageError("this firmware is started already")
         self._running = self._switched_on()
@@ -161,11 +145,7 @@ class Emulator(ABC, Generic[R]):
 
 
 def checked_delay(delay_s: float) -> float:
-    """Return a delay [s] if it is from 0 to :data:`LONGEST_DELAY_S`.
-
-    Raises:
-        UsageError: It is not.
-    """
+    """Return a delay [s] if it is from 0 to :data:`LONGEST_DELAY_S`."""
     if not 0 <= delay_s <= LONGEST_DELAY_S:
         raise UsageError(f"a delay is from 0 to {LONGEST_DELAY_S:g} s, not {delay_s!r}")
     return delay_s

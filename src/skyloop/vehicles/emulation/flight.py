@@ -29,22 +29,13 @@ class Vehicle(Protocol):
         """Height of its world [m]."""
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Command the body.
-
-        Returns:
-            What was applied, :class:`skyloop.messages.Idle` where it was ignored.
-        """
+        """Command the body; return what was applied, :class:`skyloop.messages.Idle` where it was ignored."""
 
     def set_limits(self, limits: Limits) -> None: ...
 
 
 class SimulatedVehicle:
-    """A drone of a simulation; see :class:`Vehicle`.
-
-    Args:
-        simulation: Flies it.
-        drone: Its number.
-    """
+    """A drone of a simulation; see :class:`Vehicle`."""
 
     def __init__(self, simulation: Simulation, drone: int) -> None:
         self._simulation = simulation
@@ -100,9 +91,6 @@ class FlightControl:
 
     World axes are east, north, up from where the vehicle stood when it was made; yaw is counter-clockwise from east.
     What it does must be asked for at every tick.
-
-    Args:
-        vehicle: What it flies.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -178,14 +166,7 @@ class FlightControl:
             self.vehicle.command(ResetEmergency())
 
     def move(self, east: float, north: float, up: float, yaw_rate: float) -> None:
-        """Fly a world velocity.
-
-        Args:
-            east: [m/s]
-            north: [m/s]
-            up: [m/s]
-            yaw_rate: Counter-clockwise [rad/s].
-        """
+        """Fly a world velocity [m/s], with a yaw rate, counter-clockwise [rad/s]."""
         forward, left = turned(east, north, -self.yaw)
         self.move_body(forward, left, up, yaw_rate)
 
@@ -194,13 +175,7 @@ class FlightControl:
         self._fly(VelocityAction(forward, left, up, yaw_rate))
 
     def go(self, place: Vec3, speeds: Speeds = USUAL, *, yaw_rate: float = 0.0) -> None:
-        """Fly towards a position, slower as it comes near.
-
-        Args:
-            place: East, north, up from the origin [m].
-            speeds: The greatest ones.
-            yaw_rate: Counter-clockwise [rad/s].
-        """
+        """Fly towards a position, east, north, up from the origin [m], slower as it comes near."""
         east, north, up = (PLACE_GAIN_PER_S * (to - at) for to, at in zip(place, self.place, strict=True))
         speed = math.hypot(east, north)
         share = min(1.0, speeds.across / speed) if speed > 0 else 1.0

@@ -47,12 +47,7 @@ class ThrustModel(Protocol):
 
 
 class ClimbRateThrust:
-    """ArduCopter: a share of its fastest climb, or of its fastest descent.
-
-    Args:
-        up_m_s: Its fastest climb.
-        down_m_s: Its fastest descent, positive.
-    """
+    """ArduCopter: a share of its fastest climb, or of its fastest descent."""
 
     def __init__(self, up_m_s: float, down_m_s: float) -> None:
         self._up, self._down = up_m_s, down_m_s
@@ -187,10 +182,6 @@ class AutopilotProfile(ABC):
         """Return a diagnostic for each safety net that this autopilot has a parameter for.
 
         By default both autopilots only drop the last set-point when this computer or its link dies.
-
-        Args:
-            values: The vehicle's parameters.
-            own_system: The MAVLink system that we are.
         """
         return [net.diagnostic(values[net.name]) for net in self.SAFETY_NETS if net.name in values]
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, ExternalPose, Sink
 from skyloop.drivers.live_camera import LiveCamera
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.vehicle_session import SinkCallback
+from skyloop.drivers.vehicle_session import deliver
 from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import (
     AnyAction,
@@ -69,7 +70,7 @@ class MavlinkDriver(Driver):
             self._camera.start()
         session = MavlinkSession(self.options, monotonic_ns(), extra=self._camera_telemetry)
         session.limit(self._limits)
-        self._link = MavlinkLink(session, lambda pending: _deliver(sink, pending), serve=self.serve_link)
+        self._link = MavlinkLink(session, partial(deliver, sink), serve=self.serve_link)
         self._link.start()
 
     def _close(self) -> None:
@@ -182,8 +183,3 @@ _ARMING: Final = {
     None: "",
 }
 _PREARM: Final = "its messages say why (events with prearm): wait for GPS or its estimate, calibrate, or unlock it"
-
-
-def _deliver(sink: Sink, pending: list[SinkCallback]) -> None:
-    for publish in pending:
-        publish(sink)

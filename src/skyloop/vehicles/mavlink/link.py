@@ -48,11 +48,7 @@ class MavlinkConnection(Protocol):
 
 
 class UdpListener:
-    """Listens on a UDP port, and answers each sender.
-
-    Raises:
-        OSError: The port can't be opened.
-    """
+    """Listens on a UDP port, and answers each sender."""
 
     whole = True
 
@@ -121,11 +117,7 @@ def _peer_of(source: tuple[str, int] | tuple[str, int, int, int]) -> tuple[str, 
 
 
 class UdpSender(UdpListener):
-    """Speaks first over UDP, from a port of its own.
-
-    Raises:
-        OSError: The host is not known, or no port can be opened.
-    """
+    """Speaks first over UDP, from a port of its own."""
 
     def __init__(self, address: Address) -> None:
         family, *_, found = socket.getaddrinfo(address.place, address.number, 0, socket.SOCK_DGRAM)[0]
@@ -143,41 +135,24 @@ class _Stream(ByteStream):
     whole = False
 
     def receive(self) -> list[tuple[bytes, Peer]]:
-        """Return what came.
-
-        Raises:
-            OSError: The connection ended, or the port was unplugged.
-        """
+        """Return what came; raises OSError where nothing more will come."""
         data = self.read()
         return [(data, None)] if data else []
 
     def send(self, packet: Packet) -> None:
-        """Send a packet, or drop it; see :meth:`ByteStream.write`.
-
-        Raises:
-            OSError: The vehicle no longer reads what is sent.
-        """
+        """Send a packet, or drop it; see :meth:`ByteStream.write`."""
         self.write(packet.data, packet.rank)
 
 
 class TcpClient(_Stream, TcpStream):
-    """A client of the autopilot's TCP server, which serves one client at a time: connected is not yet served.
-
-    Raises:
-        OSError: It can't be reached within :data:`skyloop.drivers.byte_stream.CONNECT_S`.
-    """
+    """A client of the autopilot's TCP server, which serves one client at a time: connected is not yet served."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number)
 
 
 class SerialPort(_Stream, SerialStream):
-    """A serial port, through pyserial, opened for this process alone.
-
-    Raises:
-        OSError: It can't be opened.
-        MissingExtraError: pyserial is not installed.
-    """
+    """A serial port, through pyserial, opened for this process alone."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number, "mavlink://serial:", "mavlink")
@@ -192,15 +167,7 @@ _KINDS: Final[dict[ConnectionKind, type[UdpListener | TcpClient | SerialPort]]] 
 
 
 def open_connection(address: Address) -> MavlinkConnection:
-    """Open a connection. Takes a second at most.
-
-    Args:
-        address: With a numeric host.
-
-    Raises:
-        OSError: It can't be opened.
-        MissingExtraError: It is a serial port, and pyserial is not installed.
-    """
+    """Open a connection, to a numeric host. Takes a second at most."""
     return _KINDS[address.kind](address)
 
 
@@ -209,14 +176,7 @@ _CLOSE_S: Final = 3.0
 
 
 class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
-    """Keeps the connection and serves the session, on a thread of its own.
-
-    Args:
-        session: The vehicle's protocol.
-        deliver: Called on the link's thread with what the session has for the sink.
-        clock: Monotonic, ns.
-        serve: Takes the link to a thread that serves several, if it is one over UDP: to open another may take a while.
-    """
+    """Keeps the connection and serves the session, on a thread of its own."""
 
     RETRY_NS = nanoseconds(1.0)
 
@@ -253,15 +213,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
             self._send_due(self._clock())
 
     def write(self, name: str, value: float) -> str | None:
-        """Write a parameter. Takes up to 0.9 s. Any thread but the link's.
-
-        Args:
-            name: The autopilot's.
-            value: In the autopilot's unit.
-
-        Returns:
-            Why it failed, or None.
-        """
+        """Write a parameter; return why it failed, or None. Takes up to 0.9 s. Any thread but the link's."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             now_ns = self._clock()
@@ -305,11 +257,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
         return open_connection(self._address())
 
     def _address(self) -> Address:
-        """Return the address with a numeric host.
-
-        Raises:
-            OSError: The host is not known, or not yet.
-        """
+        """Return the address with a numeric host; raises OSError where that is not known, or not yet."""
         address = self.session.options.address
         if address.kind not in (ConnectionKind.TCP, ConnectionKind.UDP_OUT):
             return address

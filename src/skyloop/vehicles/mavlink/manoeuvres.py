@@ -54,11 +54,7 @@ def position_message(position: Vector, target: Target) -> Message:
 
 
 class PositionHold:
-    """Stops, then holds the position where it stopped.
-
-    Args:
-        now_ns: When it begins.
-    """
+    """Stops, then holds the position where it stopped."""
 
     period_ns = VELOCITY_PERIOD_NS
 
@@ -78,11 +74,7 @@ class PositionHold:
 
 
 class VelocitySetpoint:
-    """Flies a velocity.
-
-    Args:
-        action: The velocity; may be replaced in flight.
-    """
+    """Flies a velocity."""
 
     period_ns = VELOCITY_PERIOD_NS
 
@@ -99,9 +91,6 @@ class PositionSetpoint:
 
     Autopilots fly to a place as fast as their own parameters let them. So the place that is sent moves to the goal, at
     the speed of the action at most, and stays near the vehicle.
-
-    Args:
-        action: The place; may be replaced in flight.
     """
 
     period_ns = VELOCITY_PERIOD_NS
@@ -165,12 +154,7 @@ def _between(start: Vector, end: Vector, share: float) -> Vector:
 
 
 class AttitudeSetpoint:
-    """Flies an attitude with climb rate and yaw rate; the heading that is asked for turns step by step.
-
-    Args:
-        action: The attitude; may be replaced in flight.
-        thrust: Makes the thrust of a climb rate.
-    """
+    """Flies an attitude with climb rate and yaw rate; the heading that is asked for turns step by step."""
 
     period_ns = ATTITUDE_PERIOD_NS
 
@@ -269,13 +253,7 @@ class TakeoffSequence:
         return self._armed_ns is not None and (self.rose or not self._disarms)
 
     def step(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> list[Message]:
-        """Ask for what is missing, and return the set-points that are due.
-
-        Args:
-            vehicle: What is known of it.
-            commands: Sends what is asked for.
-            now_ns: The present time.
-        """
+        """Ask for what is missing, and return the set-points that are due."""
         self._observe(vehicle, commands, now_ns)
         if self.done or self.given_up or self.taken_over or self._other_ns is not None:
             return []

@@ -178,9 +178,6 @@ class CommandSender:
     """Sends commands and keeps their results.
 
     Level-triggered: a caller that wants an effect calls :meth:`request` again and again until it shows.
-
-    Args:
-        target: System and component, until the vehicle is found.
     """
 
     def __init__(self, target: tuple[int, int] = (1, 1)) -> None:
@@ -190,13 +187,7 @@ class CommandSender:
         self._answers: dict[int, tuple[int, int]] = {}  # command: result, when
 
     def request(self, command: VehicleCommand, now_ns: int, pace_s: float = 0.5) -> None:
-        """Send a command, unless it was sent within ``pace_s``.
-
-        Args:
-            command: Number and arguments.
-            now_ns: The present time.
-            pace_s: Between repeats [s].
-        """
+        """Send a command, unless it was sent within ``pace_s``."""
         last_ns, times = self._sent.get(command, (None, 0))
         if last_ns is not None and now_ns - last_ns < nanoseconds(pace_s):
             return
@@ -239,11 +230,7 @@ LOOK_NS: Final = nanoseconds(0.2)  #: between two looks at what flows, once all 
 
 
 class MessageIntervals:
-    """Asks for messages at the rates that feedback needs, and again while they do not flow.
-
-    Args:
-        rates: By the message's name [1/s].
-    """
+    """Asks for messages at the rates that feedback needs, and again while they do not flow."""
 
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)
@@ -321,12 +308,7 @@ class VehicleClock:
         return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
-        """Return when a state was captured: neither after ``now_ns`` nor before the last one.
-
-        Args:
-            boot_ms: The state's stamp, in milliseconds since the vehicle's start, 32 bits.
-            now_ns: When it arrived.
-        """
+        """Return when a state with this stamp was captured: neither after it arrived nor before the last one."""
         live_ns = self._live.captured_ns(boot_ms / 1000.0, now_ns)
         if self._offset_ns is not None:
             synced_ns = boot_ms * 1_000_000 - self._offset_ns
@@ -352,10 +334,6 @@ def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
 
     The message has north, east, down [m] and the angles of a body whose axes are forward, right, down [rad]. Its time
     is in microseconds of our own clock: ``TIMESYNC`` sends it to the vehicle.
-
-    Args:
-        pose: In our axes.
-        kind: The message that it becomes.
     """
     position = swap(*pose.position_m)
     roll, pitch, yaw = angles_of(pose.quaternion)

@@ -26,17 +26,7 @@ ALTITUDE: Final = "limits.altitude"
 
 @dataclass(frozen=True, slots=True)
 class OwnLimit:
-    """A limit of the driver's own.
-
-    Args:
-        name: Of its parameter.
-        option: Its name in an address.
-        usual: Default.
-        low: Smallest allowed value.
-        high: Largest allowed value.
-        unit: Of the values.
-        text: For people.
-    """
+    """A limit of the driver's own."""
 
     name: str
     option: str
@@ -93,13 +83,7 @@ class PoseMessage(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where the vehicle is.
-
-    Args:
-        kind: How the bytes travel.
-        place: Host or device.
-        number: Port, or bits a second.
-    """
+    """Where the vehicle is."""
 
     kind: ConnectionKind
     place: str
@@ -143,12 +127,7 @@ class MavlinkOptions:
 
 
 def options_of(uri: VehicleUri) -> MavlinkOptions:
-    """Parse an address.
-
-    Raises:
-        UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
-        UsageError: It names no place, an option's value makes no sense, or options don't go together.
-    """
+    """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     check_intrinsics(uri)
     own = uri.whole("own_sysid", 255, minimum=1, maximum=255)
@@ -179,11 +158,7 @@ def options_of(uri: VehicleUri) -> MavlinkOptions:
 
 
 def address_of(uri: VehicleUri) -> Address:
-    """Parse the place of an address.
-
-    Raises:
-        UsageError: It names no known kind of connection, or no host, device or port.
-    """
+    """Parse the place of an address."""
     word, _, rest = uri.place.partition(":")
     if word not in [kind.value for kind in ConnectionKind]:
         raise UsageError(f"{uri}: {word!r} is none of {', '.join(ConnectionKind)}: {_EXAMPLES}")
@@ -299,22 +274,12 @@ def camera_info(uri: VehicleUri, options: CameraOptions) -> CameraInfo:
 
 
 def source(uri: VehicleUri, options: CameraOptions) -> CameraSource:
-    """Return where the camera's video comes from.
-
-    Raises:
-        UsageError: Its address is neither a stream's nor a device.
-    """
+    """Return where the camera's video comes from: a stream or a device, nothing else."""
     return source_of(options.source, f"{uri}: camera")
 
 
 def camera_receiver(uri: VehicleUri, options: CameraOptions, sink: Sink) -> LiveCamera:
-    """Return a receiver of the camera, not started.
-
-    Args:
-        uri: The vehicle's address, with the intrinsics.
-        options: Of the camera.
-        sink: The proxy's.
-    """
+    """Return a receiver of the camera, not started."""
     settings = LiveCameraSettings(
         source(uri, options),
         options.name,

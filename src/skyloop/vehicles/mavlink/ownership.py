@@ -21,11 +21,7 @@ _SET_POINTS: Final = (Velocity, Attitude, Position)
 
 
 class FlightOwnership:
-    """Judges each mode that the vehicle reports by what was asked for here.
-
-    Args:
-        autopilot: Which modes this autopilot has.
-    """
+    """Judges each mode that the vehicle reports by what was asked for here."""
 
     def __init__(self, autopilot: AutopilotProfile) -> None:
         self.left_to = ""  #: the mode that was not chosen here; empty: we are in command, or nobody is

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds
+from skyloop.drivers.base import checked_value
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.vehicles.mavlink.options import OWN_LIMITS
@@ -72,14 +73,7 @@ class ParameterExchange:
             write.done(reason)
 
     def write(self, name: str, value: float, deadline_ns: int, done: Callable[[str | None], None]) -> None:
-        """Write a parameter that the vehicle reported.
-
-        Args:
-            name: The autopilot's.
-            value: In the autopilot's unit.
-            deadline_ns: When it fails if the vehicle did not confirm it.
-            done: Called with why it failed, or None.
-        """
+        """Write a parameter, in the autopilot's unit; by the deadline ``done`` gets why it failed, or None."""
         self._writes.append(_PendingWrite(name, value, deadline_ns, done))
 
     @property
@@ -143,7 +137,12 @@ class ParameterExchange:
             elif write.sent_ns is None or now_ns - write.sent_ns >= WRITE_NS:
                 write.sent_ns = now_ns
                 kind = self.reported[write.name].kind
-                field = to_field(write.value, kind, bytewise=self.bytewise)
+                try:
+                    field = to_field(write.value, kind, bytewise=self.bytewise)
+                except struct.error as error:  # it has another type since it was asked for
+                    self._writes.remove(write)
+                    write.done(f"{write.value:g} does not fit: {error}")
+                    continue
                 messages.append(m.MAVLink_param_set_message(*self.target, write.name.encode(), field, kind))
         return messages
 
@@ -156,13 +155,7 @@ class ParameterExchange:
 
 
 def is_confirmed(wanted: float, reported: float, *, exact: bool) -> bool:
-    """Return whether the vehicle reports the value that was written.
-
-    Args:
-        wanted: As written.
-        reported: As reported.
-        exact: If not, they are compared in single precision.
-    """
+    """Return whether the vehicle reports the value that was written; unless ``exact``, in single precision."""
     return wanted == reported if exact else math.isclose(wanted, reported, rel_tol=1e-6, abs_tol=1e-9)
 
 
@@ -233,19 +226,9 @@ class VehicleParameter:
     native: str
 
     def to_native(self, value: Value) -> float:
-        """Return a value as the autopilot takes it.
-
-        Raises:
-            ParameterError: It is no finite number, no whole one where one is needed, or out of range.
-        """
-        name, whole = self.parameter.name, self.parameter.type is ParameterType.INT
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ParameterError(f"{name} takes a finite number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
-        if whole and value != int(value):
-            raise ParameterError(f"{name} takes a whole number, not {value!r}", code=Refusal.WRONG_TYPE)
-        low, high = self.parameter.minimum, self.parameter.maximum
-        if (low is not None and value < low) or (high is not None and value > high):
-            raise ParameterError(f"{name} is from {low} to {high}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+        """Return a value as the autopilot takes it; raises for one that it would not take."""
+        value = checked_value(self.parameter, value)
+        assert isinstance(value, int | float)
         return value
 
     def from_native(self, number: float) -> Value:
@@ -264,12 +247,7 @@ def vehicle_parameters(held: Mapping[str, ReportedParameter]) -> dict[str, Vehic
 
 
 def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> VehicleParameter:
-    """Return a parameter that can be written.
-
-    Raises:
-        UnknownNameError: There is no such parameter.
-        ParameterError: It is read-only.
-    """
+    """Return a parameter that can be written; raises for one that is not known, or read-only."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the vehicle", name, entries)
@@ -279,17 +257,9 @@ def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> Ve
 
 
 def check_exact(name: str, number: int, *, bytewise: bool) -> int:
-    """Return a whole number, if the vehicle would receive exactly that.
+    """Return a whole number, if the vehicle would receive exactly that; raises if it would not.
 
     ArduPilot writes whole numbers as floats of single precision: those beyond 24 bits may come out as others.
-
-    Args:
-        name: Of the parameter.
-        number: To be written.
-        bytewise: Whether the vehicle takes integers as they are.
-
-    Raises:
-        ParameterError: It would receive another number.
     """
     if bytewise:
         return number
@@ -341,9 +311,6 @@ def _bound(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-_LIMITS: Final = {limit.name: limit for limit in OWN_LIMITS}
-
-
 def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
     """Return the driver's own limits as parameters, with their values in force."""
     return [
@@ -362,15 +329,8 @@ def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
 
 
 def with_limit(values: Mapping[str, float], name: str, value: Value) -> dict[str, float]:
-    """Return the driver's own limits after one was written.
-
-    Raises:
-        ParameterError: It is no finite number, or out of range.
-    """
-    limit = _LIMITS[name]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ParameterError(f"{name} takes a finite number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
-    if not limit.low <= value <= limit.high:
-        why = f"{name} is from {limit.low:g} to {limit.high:g} {limit.unit}, not {value:g}"
-        raise ParameterError(why, code=Refusal.OUT_OF_RANGE)
-    return {**values, name: float(value)}
+    """Return the driver's own limits after one was written; raises for a number that is not finite, or out of range."""
+    parameter = next(each for each in limit_parameters(values) if each.name == name)
+    value = checked_value(parameter, value)
+    assert isinstance(value, float)
+    return {**values, name: value}

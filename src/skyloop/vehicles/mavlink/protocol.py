@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
@@ -34,9 +35,9 @@ from skyloop.vehicles.mavlink.options import ConnectionKind, MavlinkOptions, Pee
 from skyloop.vehicles.mavlink.parameters import ParameterExchange
 from skyloop.vehicles.mavlink.setpoints import CUT, SetpointController
 from skyloop.vehicles.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
+from skyloop.vehicles.mavlink.wire.axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.world_axes import ORIGIN, ORIGIN_HZ, WorldAxes
 
 TICK_NS: Final = nanoseconds(0.02)
 REST_NS: Final = nanoseconds(0.1)  #: the same while nothing is under way: for silence, heartbeats and requests
@@ -89,13 +90,7 @@ _ASK_VERSION: Final = VehicleCommand(m.MAV_CMD_REQUEST_MESSAGE, (float(m.MAVLINK
 
 
 class MavlinkSession(VehicleSession):
-    """The protocol of one opened driver with its vehicle. Not thread-safe.
-
-    Args:
-        options: Of the vehicle's address.
-        now_ns: The time of opening.
-        extra: Gives telemetry of others for feedback's ``native``.
-    """
+    """The protocol of one opened driver with its vehicle. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
@@ -126,6 +121,7 @@ class MavlinkSession(VehicleSession):
         self._unheard = False  # lost while it was armed: our heartbeats would keep its own failsafe from acting
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
+        self._unfit: set[str] = set()  # kinds of messages of which one could not be encoded, as was told
         self._kind: tuple[int, int] | None = None  # autopilot and type, by its heartbeat
         self._known_as: Message | None = None  # the version told before the link was lost, until it is told again
         self._heard_by_it = True  # False: nothing shows yet that it reads what is sent
@@ -156,20 +152,7 @@ class MavlinkSession(VehicleSession):
     # From the driver ---------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Accept an action. See :meth:`SetpointController.apply`.
-
-        Args:
-            action: What is asked for.
-            now_ns: The present time.
-            alone: Whether nobody is in command: a failsafe.
-            new: Whether an application newly asked for it; False for the library's repeats.
-
-        Returns:
-            What is applied.
-
-        Raises:
-            DriverError: The vehicle can't be flown, can't do this now, or somebody else has it.
-        """
+        """Accept an action; see :meth:`SetpointController.apply`. Raises for a vehicle that can't be flown, too."""
         if isinstance(action, EmergencyStop) and self._kind is None:  # found in flight, maybe, in a moment
             self._stop.press(now_ns)
             self.due_ns = now_ns
@@ -226,14 +209,7 @@ class MavlinkSession(VehicleSession):
     # From the connection -----------------------------------------------------------------------------------------
 
     def receive(self, data: bytes, peer: Peer, now_ns: int, *, whole: bool) -> None:
-        """Handle bytes that came. Never raises, whatever they hold.
-
-        Args:
-            data: What came.
-            peer: Where a datagram came from.
-            now_ns: When it came.
-            whole: Whether ``data`` is a datagram; if not, it is a piece of a stream.
-        """
+        """Handle bytes that came from a peer: a datagram if ``whole``. Never raises, whatever they hold."""
         for message in self.codec.decode(data, whole=whole, source=peer):
             self._on_message(message, peer, now_ns)
         if self.codec.signed > self._signed:
@@ -355,9 +331,7 @@ class MavlinkSession(VehicleSession):
         elif self._stop.step(None, now_ns):
             self.commands.request(CUT, now_ns, 0.0)
             out += self.commands.pop_messages()
-        packets += [
-            Packet(self._encoded(message), peer, rank_of(message)) for message in out if self._axes.sent(message)
-        ]
+        packets += [packet for message in out if (packet := self._packet(message, peer)) is not None]
         self.due_ns = self._next_ns(now_ns)
         return packets
 
@@ -375,12 +349,11 @@ class MavlinkSession(VehicleSession):
         if self.version is None or not self._heard_by_it:
             self.commands.request(_ASK_VERSION, now_ns, VERSION_PACE_S)
         self._intervals.request_missing(self.telemetry, self.commands, now_ns)
-        messages = (
-            self.setpoints.messages(vehicle, now_ns) if self.setpoints is not None and vehicle is not None else []
-        )
-        holds = self.setpoints is not None and self.setpoints.holds  # harmless late, and needed now
-        if not self._heard_by_it or not (holds or self._is_read(now_ns)):
-            messages = []  # they would wait somewhere, and be followed when somebody reads again
+        messages: list[Message] = []
+        if self.setpoints is not None and vehicle is not None:
+            messages = self.setpoints.messages(vehicle, now_ns, read=self._is_read(now_ns))
+        if not self._heard_by_it:
+            messages = []  # nothing shows that it can be reached at all
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 
     def _is_read(self, now_ns: int) -> bool:
@@ -398,8 +371,19 @@ class MavlinkSession(VehicleSession):
         versions = (1, 2) if self._old and self.options.key is None else (2,)
         return [Packet(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
 
-    def _encoded(self, message: Message) -> bytes:
-        return self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)
+    def _packet(self, message: Message, peer: Peer) -> Packet | None:
+        """Return a message as it is sent; None for one that can't be: it keeps no other back, such as a stop."""
+        if not self._axes.sent(message):
+            return None
+        try:
+            data = self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)
+        except (struct.error, OverflowError) as error:
+            if (kind := message.get_type()) not in self._unfit:
+                self._unfit.add(kind)
+                text = f"{kind} is not sent: it has a number that MAVLink has no room for ({error})"
+                self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "encoding"}))
+            return None
+        return Packet(data, peer, rank_of(message))
 
     def _check_health(self, vehicle: VehicleState | None, now_ns: int) -> None:
         for event in self._health.update(self.telemetry, vehicle, now_ns):

@@ -55,6 +55,7 @@ DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
 DISARM_NS: Final = nanoseconds(0.5)  #: an arming that is undone is asked about for so long after it was seen last
+IDLES_NS: Final = nanoseconds(12.0)  #: by then an autopilot that stands armed has disarmed itself
 STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
 HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
 
@@ -99,12 +100,13 @@ class SetpointController:
         self._setpoint: Setpoint | None = None
         self._lead_ns: int | None = None  # since when the stream flows
         self._sent_ns = 0
+        self._followed: Velocity | None = None  # the last velocity sent to a vehicle that read it
         self._entered = False  # the mode that is wanted was seen since
         self._strayed_ns: int | None = None  # since when it is another one again
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
         self._stepped_ns = 0  # when what is wanted now had its last step; 0: it has not had one
         self._arms_until_ns: int | None = None  # a take-off that a landing broke off may arm it until then
-        self._disarms_until_ns = 0  # a take-off that was given up may arm it until then, which is undone
+        self._disarms_until_ns = 0  # until then a take-off that was given up, or cut off, may still arm it
         self._blind_until_ns = 0
         self._events: list[VehicleEvent] = []
 
@@ -188,7 +190,7 @@ class SetpointController:
         elif not vehicle.airborne:
             takeoff = TakeoffSequence(self._autopilot, self.takeoff_m, now_ns, disarms=self.goal is Goal.LAND)
             self._end()
-            self.goal, self._takeoff = Goal.TAKE_OFF, takeoff
+            self.goal, self._takeoff, self._disarms_until_ns = Goal.TAKE_OFF, takeoff, 0
         elif self.goal is not Goal.FOLLOW:
             self._follow(PositionHold(now_ns))
 
@@ -263,10 +265,12 @@ class SetpointController:
         if self.goal is Goal.FOLLOW:
             self._end()
             self.goal = Goal.HOLD
-        elif self.goal is Goal.TAKE_OFF:
-            started = self._takeoff is not None and self._takeoff.started
+        elif self.goal is Goal.TAKE_OFF and self._takeoff is not None:
+            takeoff = self._takeoff
             self._end()
-            self.goal = Goal.HOLD if started else Goal.NOTHING
+            self.goal = Goal.HOLD if takeoff.started else Goal.NOTHING
+            if takeoff.arm_asked_ns is not None and not takeoff.rose:  # it may stand there armed
+                self._disarms_until_ns = takeoff.arm_asked_ns + IDLES_NS
         self._entered, self._strayed_ns = False, None  # what it does by itself meanwhile is nobody's decision
         self.ownership.on_link_lost()
 
@@ -319,8 +323,27 @@ class SetpointController:
         events, self._events = self._events, []
         return events
 
-    def messages(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
-        """Return the set-points that are due now; commands go to the command sender."""
+    def messages(self, vehicle: VehicleState, now_ns: int, *, read: bool = True) -> list[Message]:
+        """Return the set-points that are due now; commands go to the command sender.
+
+        Args:
+            vehicle: The newest state.
+            now_ns: The present time.
+            read: Whether the vehicle reads commands soon, judging by its messages. If not, a set-point might wait
+                somewhere and be followed late. Only a stop is sent then, which does no harm late; it replaces a
+                velocity that differs from the last one sent.
+        """
+        due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
+        wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None
+        if not read and not self._holds:
+            if not due or wanted is None or wanted == self._followed:
+                return []
+            wanted, due = Velocity(), [velocity_message(Velocity(), self._commands.target)]
+        if due:
+            self._followed = wanted
+        return due
+
+    def _due_messages(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
         self._stepped_ns = now_ns
         if self.step_stop(vehicle, now_ns):
             return []
@@ -343,7 +366,7 @@ class SetpointController:
         return []
 
     @property
-    def holds(self) -> bool:
+    def _holds(self) -> bool:
         """Whether it is to stay in the air where it is."""
         setpoint = self._setpoint
         stops = isinstance(setpoint, VelocitySetpoint) and setpoint.action == Velocity()
@@ -361,12 +384,10 @@ class SetpointController:
         return True
 
     def step_blind(self, now_ns: int) -> bool:
-        """Send what an application newly asked for while nothing is received: the vehicle may hear it all the same.
+        """Send a new hover or landing while nothing is heard; return whether a command is under way.
 
-        What a failsafe asks for is not sent so: who flies the vehicle by now can't be seen.
-
-        Returns:
-            Whether a command is under way.
+        The vehicle may hear it all the same. What a failsafe asks for is not sent so: who flies the vehicle by now
+        can't be seen.
         """
         modes = {Goal.HOLD: self._autopilot.HOLD, Goal.LAND: self._autopilot.LAND}
         if self.stop.active or now_ns >= self._blind_until_ns or self.goal not in modes:
@@ -408,8 +429,11 @@ class SetpointController:
         return messages
 
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Disarm what a take-off that was given up has armed; what rises, or is in another mode, others have armed."""
-        if vehicle.airborne or vehicle.mode != self._autopilot.ARMING:
+        """Disarm a vehicle after a take-off that was given up, or cut by a lost link.
+
+        One that rises, or is in another mode, was armed by others.
+        """
+        if vehicle.airborne or vehicle.mode not in (self._autopilot.ARMING, self._autopilot.HOLD):
             self._disarms_until_ns = 0
         elif vehicle.armed and vehicle.airborne is False:
             self._disarms_until_ns = max(self._disarms_until_ns, now_ns + DISARM_NS)
@@ -452,11 +476,7 @@ class SetpointController:
         return self._strayed_ns is not None and now_ns - self._strayed_ns >= STRAYED_NS
 
     def _leave(self, vehicle: VehicleState) -> bool:
-        """Leave the vehicle to a mode that was not chosen here.
-
-        Returns:
-            Whether it is still ours to hold and to land.
-        """
+        """Leave the vehicle to a mode that was not chosen here; return whether it is still ours to hold and to land."""
         why = "its own failsafe" if vehicle.failsafe else "not from here"
         self._notify(f"the vehicle went to {vehicle.mode} ({why}): set-points are no longer sent", reason="mode")
         self._end()

@@ -85,26 +85,14 @@ class Telemetry:
                 self._on_earth = _at_the_same_time(local, message) or self._on_earth
 
     def newest(self, kind: str, now_ns: int, max_age_s: float = math.inf) -> Message | None:
-        """Return the newest message of a kind.
-
-        Args:
-            kind: The message's name.
-            now_ns: The present time.
-            max_age_s: None is returned for an older one [s].
-        """
+        """Return the newest message of a kind; None if it is older than ``max_age_s``."""
         found = self._newest.get(kind)
         if found is None or now_ns - found[1] > max_age_s * NS_PER_S:
             return None
         return found[0]
 
     def instances(self, kind: str, now_ns: int, max_age_s: float = math.inf) -> Iterator[Message]:
-        """Yield the newest message of each instance, such as each of several batteries, the lowest number first.
-
-        Args:
-            kind: The message's name.
-            now_ns: The present time.
-            max_age_s: Older ones are left out [s].
-        """
+        """Yield the newest message of each instance, such as each of several batteries, the lowest number first."""
         return (message for message, _ in self._by_number(kind, now_ns, max_age_s))
 
     def _by_number(self, kind: str, now_ns: int, max_age_s: float) -> Iterator[tuple[Message, int]]:
@@ -177,10 +165,6 @@ class Telemetry:
         """Return where its axes begin on the earth; None without a 3-D fix by satellites, and before both places came.
 
         Without a fix an autopilot may have been given an origin that is anywhere, as for motion capture.
-
-        Args:
-            radius_m: The earth's, as this autopilot has it [m].
-            now_ns: The present time.
         """
         gps = self.newest("GPS_RAW_INT", now_ns, SLOW_S)
         if gps is None or gps.fix_type < GOOD_FIX or self._on_earth is None:
@@ -198,12 +182,7 @@ class Telemetry:
         return None if message is None else (message.vx / 100.0, message.vy / 100.0, message.vz / 100.0)
 
     def altitude_m(self, position: Vector | None, now_ns: int) -> float | None:
-        """Return the height [m] above the ground by a downward sensor, else above home, else above the origin.
-
-        Args:
-            position: As :meth:`position` returns it.
-            now_ns: The present time.
-        """
+        """Return the height [m] above the ground by a downward sensor, else above home, else above the origin."""
         for sensor in self.instances("DISTANCE_SENSOR", now_ns, FLOWING_S):
             if sensor.orientation == _DOWN and _in_range(sensor):
                 return float(sensor.current_distance) / 100.0
@@ -218,13 +197,7 @@ class Telemetry:
         return None if message is None else message.alt / 1000.0
 
     def state(self, mode: str, ready: bool | None, now_ns: int) -> VehicleState:
-        """Return all that is known of the vehicle.
-
-        Args:
-            mode: Its mode's name.
-            ready: Whether it may be armed; None: unknown.
-            now_ns: The present time.
-        """
+        """Return all that is known of the vehicle; ``ready``: whether it may be armed, None: unknown."""
         attitude, position = self.attitude(now_ns), self.position(now_ns)
         return VehicleState(
             mode=mode,
@@ -286,15 +259,7 @@ _OTHERS: Final = (3, 4)  #: MAV_BATTERY_FUNCTION: of avionics and of a payload
 def feedback_of(
     telemetry: Telemetry, state: FlightState, captured_ns: int, now_ns: int, native: Mapping[str, Value]
 ) -> Feedback:
-    """Return the vehicle's state in our units and axes. What does not flow, or is not finite, is None.
-
-    Args:
-        telemetry: The newest messages.
-        state: The flight state.
-        captured_ns: When the vehicle was in this state.
-        now_ns: The present time.
-        native: Telemetry besides the vehicle's own.
-    """
+    """Return the vehicle's state in our units and axes. What does not flow, or is not finite, is None."""
     attitude = telemetry.attitude(now_ns)
     position = telemetry.position(now_ns)
     roll, pitch, yaw = (None, None, None) if attitude is None else _turned_over(attitude)
@@ -414,9 +379,7 @@ class HealthMonitor:
     def on_text(self, message: Message, *, quiet: bool = False) -> list[VehicleEvent]:
         """Handle a ``STATUSTEXT``; return whole texts, marked where they say why it can't be armed.
 
-        Args:
-            message: The text, or a chunk of it.
-            quiet: Whether a reason why it can't be armed is told once only: the vehicle repeats it as it wakes up.
+        While it wakes up (``quiet``) the vehicle repeats such a reason, which is told once.
         """
         events = []
         for severity, text in self._texts.on_message(message):

@@ -1,21 +1,26 @@
-"""The driver of ``msp://``: what the proxy calls."""
+"""The driver of ``msp://``: what the proxy calls, and the connection to the flight controller, reopened for ever."""
 
 from __future__ import annotations
 
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from typing import Final
 
-from skyloop.clock import monotonic_ns
+from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import Driver, ExternalPose, Sink
+from skyloop.drivers.byte_stream import END_S, ByteStream, Rank, SerialStream, TcpStream
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.vehicle_session import SinkCallback
+from skyloop.drivers.vehicle_link import ConnectionLink
+from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, MissingExtraError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Parameter, Refusal, Takeoff, Value
 from skyloop.messages.parameter import Diagnostic
-from skyloop.vehicles.msp.link import EXTRA, MspLink
-from skyloop.vehicles.msp.options import options_of
-from skyloop.vehicles.msp.parameters import DriverParameters
+from skyloop.vehicles.msp.parameters import DriverParameters, options_of
 from skyloop.vehicles.msp.protocol import MspSession
 from skyloop.vehicles.msp.setpoints import SetpointController
+from skyloop.vehicles.msp.wire.frames import whole_frames
 
 ACTIONS: Final = frozenset({"idle", "attitude", "emergency_stop", "reset_emergency"})
 
@@ -54,7 +59,7 @@ class MspDriver(Driver):
         known.hover, known.full_tilt_rad = self._setpoints.hover, self._setpoints.full_tilt_rad
         self._setpoints = known
         session = MspSession(self.options, monotonic_ns(), known)
-        self._link = MspLink(session, lambda pending: _deliver(sink, pending))
+        self._link = MspLink(session, partial(deliver, sink))
         self._link.start()
 
     def _close(self) -> None:
@@ -105,12 +110,7 @@ class MspDriver(Driver):
             return DriverParameters(self._setpoints).parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The driver is not open, or the value does not fit.
-        """
+        """Write a parameter."""
         link = self._link
         if link is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
@@ -118,6 +118,60 @@ class MspDriver(Driver):
             return DriverParameters(self._setpoints).write(name, value)
 
 
-def _deliver(sink: Sink, pending: list[SinkCallback]) -> None:
-    for publish in pending:
-        publish(sink)
+EXTRA: Final = "msp"
+
+
+class MspLink(ConnectionLink[MspSession, ByteStream]):
+    """Keeps the connection and serves the session, on a thread of its own."""
+
+    RETRY_NS = nanoseconds(0.25)
+
+    _silent_ns = nanoseconds(3.0)
+
+    def __init__(
+        self, session: MspSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
+    ) -> None:
+        super().__init__("skyloop-msp", session, deliver, clock, family=socket.AF_UNSPEC, close_s=3.0)
+
+    # From the proxy's threads ------------------------------------------------------------------------------------
+
+    def pose(self, pose: ExternalPose) -> None:
+        """Take in a pose from outside. Any thread. See :meth:`MspSession.on_pose`."""
+        with self.lock:
+            self.session.on_pose(pose, self._clock())
+
+    def ask_takeoff(self) -> str:
+        """See :meth:`MspSession.ask_takeoff`. Any thread."""
+        with self.lock:
+            return self.session.ask_takeoff(self._clock())
+
+    # On the link's thread ----------------------------------------------------------------------------------------
+
+    def _connect(self) -> ByteStream:
+        options = self.session.options
+        if options.port is not None:
+            return TcpStream(self._lookup.address(options.place), options.port)
+        return SerialStream(options.place, options.baud, f"msp://{options.place}", EXTRA)
+
+    def _read(self, connection: ByteStream) -> None:
+        data = connection.read()
+        with self.lock:
+            now_ns = self._clock()
+            self.session.receive(data, now_ns)
+            if self.session.due_ns <= now_ns:
+                self._send_due(now_ns)
+
+    def _send_due(self, now_ns: int) -> None:
+        data = self.session.poll(now_ns)
+        if self._connection is None or self._broken or not data:
+            return
+        try:
+            for frame in whole_frames(data):  # what a full port cuts is one frame, and none behind it is sent late
+                self._connection.write(frame, Rank.STOP if self.session.urgent else Rank.SETPOINT)
+        except OSError as error:
+            self._on_broken(error, now_ns)
+
+    def _on_end(self, connection: ByteStream) -> None:
+        connection.drain_s = END_S
+        with suppress(OSError):
+            connection.write(self.session.last_words(self._clock()), Rank.COMMAND)

@@ -1,4 +1,7 @@
-"""Parameters of the driver: limits, scales, gains and AUX channels. Pure; they are the driver's own."""
+"""What is set of the driver: options of an ``msp://`` address, and parameters (limits, scales, gains, AUX). Pure.
+
+``docs/msp.md`` has both as tables.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,54 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
-from skyloop.errors import ParameterError, UnknownNameError
-from skyloop.messages import Parameter, ParameterType, Refusal, Value
+from skyloop.drivers.base import checked_value, reject_unknown_options
+from skyloop.drivers.uri import VehicleUri, host_and_port
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages import Parameter, ParameterType, Value
 from skyloop.vehicles.msp.firmware import MOST_AUX
 from skyloop.vehicles.msp.setpoints import Gains, Limits, SetpointController
+
+DEFAULT_BAUD: Final = 115_200
+DEFAULT_RATE_HZ: Final = 50.0
+KNOWN: Final = {"baud", "rate", "override"}
+_EXAMPLES: Final = "it looks like msp:///dev/ttyACM0?baud=115200 or msp://tcp:127.0.0.1:5761"
+
+
+@dataclass(frozen=True, slots=True)
+class MspOptions:
+    """A parsed address. Either ``port`` is a TCP port of the host ``place``, or ``place`` is a serial port's path."""
+
+    place: str
+    port: int | None = None
+    baud: int = DEFAULT_BAUD
+    rate_hz: float = DEFAULT_RATE_HZ  #: of the sticks
+    override: bool = False  #: a pilot keeps a real receiver, and lets the sticks be overridden by a switch
+
+    @property
+    def serial(self) -> bool:
+        """Whether it is a serial port."""
+        return self.port is None
+
+    def __str__(self) -> str:
+        return f"{self.place} at {self.baud} baud" if self.port is None else f"{self.place}, TCP port {self.port}"
+
+
+def options_of(uri: VehicleUri) -> MspOptions:
+    """Parse an address."""
+    reject_unknown_options(uri, KNOWN)
+    rate = uri.number("rate", DEFAULT_RATE_HZ, minimum=20.0, maximum=250.0)
+    override = uri.flag("override", default=False)
+    if uri.place.startswith("/"):
+        baud = uri.whole("baud", DEFAULT_BAUD, minimum=9600, maximum=10_000_000)
+        return MspOptions(uri.place, None, baud, rate, override)
+    if "baud" in uri.options:
+        raise UsageError(f"{uri}: baud is for a serial port, such as msp:///dev/ttyACM0?baud=115200")
+    word, _, rest = uri.place.partition(":")
+    found = host_and_port(rest)
+    if word != "tcp" or found is None:
+        raise UsageError(f"{uri} names no place: {_EXAMPLES}")
+    return MspOptions(*found, rate_hz=rate, override=override)
+
 
 AUTOMATIC: Final = 0  #: of an AUX channel: as the modes need it
 _LIMITS: Final = (
@@ -48,24 +95,13 @@ class DriverParameters:
         return [entry.parameter for entry in self._entries().values()]
 
     def write(self, name: str, value: Value) -> Value:
-        """Write a parameter and return the value in force.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The value is no number, or out of range.
-        """
+        """Write a parameter and return the value in force; raises for a name or a value that does not fit."""
         entries = self._entries()
         if name not in entries:
             raise UnknownNameError("parameter of msp://", name, entries)
-        entry = entries[name]
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ParameterError(f"{name} takes a number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
-        low, high = entry.parameter.minimum, entry.parameter.maximum
-        assert low is not None
-        assert high is not None
-        if not low <= value <= high:
-            raise ParameterError(f"{name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
-        entry.write(value)
+        value = checked_value(entries[name].parameter, value)
+        assert isinstance(value, int | float)
+        entries[name].write(value)
         return value
 
     def _entries(self) -> dict[str, _Entry]:

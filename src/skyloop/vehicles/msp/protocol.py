@@ -21,9 +21,8 @@ from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.messages.parameter import Diagnostic
-from skyloop.vehicles.msp.firmware import SUPPORTED, Setup, hindrances
-from skyloop.vehicles.msp.identification import Identification
-from skyloop.vehicles.msp.options import MspOptions
+from skyloop.vehicles.msp.firmware import SUPPORTED, Identification, Setup, hindrances
+from skyloop.vehicles.msp.parameters import MspOptions
 from skyloop.vehicles.msp.setpoints import PASSING, Phase, Report, SetpointController
 from skyloop.vehicles.msp.telemetry import MotionEstimate, Questions, Reported, Telemetry, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
@@ -55,13 +54,7 @@ PILOT_HZ: Final = 10.0
 
 
 class MspSession(VehicleSession):
-    """The protocol of one opened driver with its flight controller. Not thread-safe.
-
-    Args:
-        options: Of the vehicle's address.
-        now_ns: The time of opening.
-        setpoints: Kept by the driver from one opening to the next.
-    """
+    """The protocol of one opened driver with its flight controller. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
@@ -101,11 +94,7 @@ class MspSession(VehicleSession):
     # From the driver -----------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action.
-
-        Raises:
-            DriverError: It can't be done now; see :meth:`SetpointController.apply`.
-        """
+        """Accept an action; see :meth:`SetpointController.apply`."""
         self.setpoints.on_motion(self.motion.at(now_ns))
         applied = self.setpoints.apply(action, now_ns)
         self.due_ns = min(self.due_ns, now_ns if isinstance(action, EmergencyStop) else self._sticks_due_ns)
@@ -117,11 +106,7 @@ class MspSession(VehicleSession):
         return self.setpoints.ask_takeoff(now_ns)
 
     def on_pose(self, pose: ExternalPose, now_ns: int) -> None:
-        """Take in a pose from outside.
-
-        Raises:
-            DriverError: It is stamped ahead; see :meth:`ExternalPose.bounded`.
-        """
+        """Take in a pose from outside; see :meth:`ExternalPose.bounded`."""
         self.motion.on_pose(pose.bounded(now_ns))
 
     def close(self) -> None:

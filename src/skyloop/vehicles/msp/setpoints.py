@@ -296,12 +296,7 @@ class SetpointController:
                 self._enter(Phase.FLYING, now_ns)
 
     def adopt(self, throttle: float, now_ns: int) -> None:
-        """Go on with a vehicle that was found armed.
-
-        Args:
-            throttle: That it was sent last, 0 to 1.
-            now_ns: The present time.
-        """
+        """Go on with a vehicle that was found armed, from the throttle that it was sent last, 0 to 1."""
         if throttle > IDLE and not self.stop.active:
             self.hover = self.throttle = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
             self._enter(Phase.FLYING, now_ns)

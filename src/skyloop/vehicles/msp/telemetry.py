@@ -361,15 +361,7 @@ def charge_left(battery: Battery, cells: CellVoltages) -> float | None:
 def feedback_of(
     reported: Reported, motion: Motion, flight: FlightState, captured_ns: int, native: dict[str, Value]
 ) -> Feedback:
-    """Return the vehicle's state. What is not known is None.
-
-    Args:
-        reported: By the flight controller.
-        motion: As it was estimated.
-        flight: The flight state.
-        captured_ns: When the attitude came.
-        native: The vehicle's own telemetry.
-    """
+    """Return the vehicle's state. What is not known is None."""
     attitude, battery = reported.attitude, reported.battery
     velocity = None
     if motion.velocity_m_s is not None and motion.yaw_rad is not None:

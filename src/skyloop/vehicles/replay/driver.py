@@ -1,15 +1,18 @@
-"""The driver of ``replay://FLIGHT.mcap``: life cycle and the thread that plays."""
+"""The driver of ``replay://FLIGHT.mcap``: life cycle, the thread that plays, and options (``docs/replay.md``)."""
 
 from __future__ import annotations
 
 import logging
 import threading
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from skyloop.clock import Clock
-from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.base import Driver, Sink, reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError, UsageError
+from skyloop.files import expand
 from skyloop.messages import (
     AnyAction,
     Capabilities,
@@ -23,10 +26,8 @@ from skyloop.messages import (
 )
 from skyloop.recording.layout import DroneRecord
 from skyloop.recording.reader import Recording
-from skyloop.vehicles.replay.options import options_of
-from skyloop.vehicles.replay.playback import NAMES, Playback
-from skyloop.vehicles.replay.player import Player, StepPlayer
-from skyloop.vehicles.replay.publisher import PREFIX, ReplayPublisher
+from skyloop.vehicles.replay.playback import NAMES, SPEEDS, Playback
+from skyloop.vehicles.replay.player import PREFIX, Player, ReplayPublisher, StepPlayer
 from skyloop.vehicles.replay.source import ReplaySource, capabilities_of
 
 _log = logging.getLogger(__name__)
@@ -83,11 +84,7 @@ class ReplayDriver(Driver):
         return True
 
     def source(self) -> ReplaySource:
-        """Open the recording.
-
-        Raises:
-            UsageError: It is not there, can't be read, or ends before ``start``.
-        """
+        """Open the recording; raises for one that is not there, can't be read, or ends before ``start``."""
         recording, drone = self._read()
         source = ReplaySource(recording, drone, self.options.start_s)
         if source.empty:
@@ -149,3 +146,40 @@ class ReplayDriver(Driver):
     def _read(self) -> tuple[Recording, DroneRecord]:
         recording = Recording.open(self.options.path)
         return recording, recording.drone(self.options.drone)
+
+
+KNOWN: Final = {"speed", "loop", "drone", "start", "wait"}
+MAX: Final = "max"
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayOptions:
+    """A parsed address."""
+
+    path: Path
+    drone: str | None  #: its name in the recording; None: the first
+    start_s: float  #: where to begin, after the recording's own begin
+    speed: float  #: seconds of the recording in a second
+    stepped: bool  #: ``speed=max``: in step with one application, see :mod:`skyloop.stepping.replay`
+    loop: bool  #: start over at the end
+    wait: bool  #: begin when somebody wants a camera's frames
+
+
+def options_of(uri: VehicleUri) -> ReplayOptions:
+    """Parse an address."""
+    reject_unknown_options(uri, KNOWN)
+    if not uri.place:
+        raise UsageError(f"{uri} names no file: it looks like replay:///home/me/flight.mcap?speed=2")
+    stepped = uri.options.get("speed") == MAX
+    options = ReplayOptions(
+        path=expand(uri.reveal_place()),
+        drone=uri.options.get("drone"),
+        speed=1.0 if stepped else uri.number("speed", 1.0, minimum=SPEEDS[0], maximum=SPEEDS[1]),
+        stepped=stepped,
+        loop=uri.flag("loop"),
+        start_s=uri.number("start", 0.0, minimum=0.0, maximum=1e6),
+        wait=uri.flag("wait"),
+    )
+    if stepped and (options.loop or options.wait):
+        raise UsageError(f"{uri}: speed=max goes neither with loop nor with wait: it is through when it is through")
+    return options

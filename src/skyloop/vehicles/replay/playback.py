@@ -8,11 +8,11 @@ from typing import Final
 
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
-from skyloop.vehicles.replay.options import SPEEDS
 
 POSITION: Final = "replay.position_s"
 SPEED: Final = "replay.speed"
 PAUSED: Final = "replay.paused"
+SPEEDS: Final = (0.01, 1000.0)  #: slowest and fastest, in seconds of the recording in a second
 NAMES: Final = frozenset({POSITION, SPEED, PAUSED})
 
 _IN_STEP: Final = (
@@ -92,14 +92,9 @@ class Playback:
         ]
 
     def set(self, name: str, value: Value) -> Value:
-        """Write a parameter; the player follows at once. To go on from the end is to start over.
+        """Write a parameter, which the player follows at once; return what is in force.
 
-        Returns:
-            The value that is in force.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The value is out of range, or the replay is in step with its application.
+        To go on from the end is to start over.
         """
         if name not in NAMES:
             raise UnknownNameError("parameter of a replay", name, NAMES)

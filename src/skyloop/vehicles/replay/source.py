@@ -85,11 +85,7 @@ class ReplaySource:
         return self.first_ns
 
     def moment(self, at_ns: int) -> Moment:
-        """Return what was known at a time, without reading what is far from it.
-
-        Args:
-            at_ns: On the clock of the recorded proxy.
-        """
+        """Return what was known at a time of the recorded proxy's clock, without reading what is far from it."""
         parts = range(len(self._recording.found.pieces))
         part = bisect_right(parts, at_ns, key=self._first_known_ns) - 1
         moment = Moment(at_ns)
@@ -247,13 +243,7 @@ def _camera(recording: Recording, drone: str, name: str, known: CameraInfo | Non
 
 
 class Timeline:
-    """Maps the clock of the recording to the clock of its replay, and back. Pure.
-
-    Args:
-        speed: Seconds of the recording in a second.
-        begin_ns: Where the replay begins, on the recording's clock.
-        origin_ns: The same on the replay's clock.
-    """
+    """Maps the clock of the recording to the clock of its replay, and back. Pure."""
 
     def __init__(self, speed: float, begin_ns: int, origin_ns: int) -> None:
         """Store the arguments."""

@@ -65,13 +65,6 @@ class RobotLink:
     """A node that subscribes to what a robot publishes, and publishes its ``cmd_vel``.
 
     Images are subscribed to while somebody wants them, or where nothing else would show that the robot is there.
-
-    Args:
-        options: Of the address.
-        sink: The proxy's.
-
-    Raises:
-        MissingExtraError: rclpy or a package of messages is not installed.
     """
 
     def __init__(self, options: Options, sink: Sink) -> None:
@@ -139,11 +132,7 @@ class RobotLink:
         return next((name for name, client in self._clients.items() if not client.service_is_ready()), "")
 
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
-        """Call a ``std_srvs/Trigger``, without waiting for the answer.
-
-        Raises:
-            DriverError: Nobody offers it.
-        """
+        """Call a ``std_srvs/Trigger``, without waiting for the answer; raises DriverError where nobody offers it."""
         from std_srvs.srv import Trigger
 
         client = self._clients[service]

@@ -64,15 +64,7 @@ LOOPBACK_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8"?>
 
 
 def require_rclpy(purpose: str, *packages: str) -> Any:
-    """Import rclpy, and return it.
-
-    Args:
-        purpose: What it is needed for, as the error says it.
-        *packages: Packages of messages that are needed besides, such as ``nav_msgs.msg``.
-
-    Raises:
-        MissingExtraError: It, or one of the packages, is not installed.
-    """
+    """Import rclpy, and packages of messages, for a purpose that the error names; return rclpy."""
     from importlib import import_module
 
     try:
@@ -86,13 +78,8 @@ def require_rclpy(purpose: str, *packages: str) -> Any:
 def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> bool:
     """Let nodes of this process be found on this machine only, unless the environment says who may find them.
 
-    To be called before the first node is made. The profile is a file in a directory of its own, removed at the end.
-
-    Args:
-        environment: Where the variables of ROS 2 are looked up and set.
-
-    Returns:
-        Whether it was left to this.
+    To be called before the first node is made; returns whether it was left to this. The profile is a file in a
+    directory of its own, removed at the end.
     """
     if any(environment.get(variable) for variable in DISCOVERY_VARIABLES):
         return bool(_profile) and _profile["path"] in map(environment.get, DISCOVERY_VARIABLES[:2])
@@ -119,11 +106,7 @@ def _has_fast_dds_2(environment: Mapping[str, str]) -> bool:
 
 
 def domain_of(text: str | None) -> int | None:
-    """Return the domain that a text names; None without one: ROS 2 then reads ``ROS_DOMAIN_ID``.
-
-    Raises:
-        UsageError: It is no number from 0 to :data:`MOST_DOMAIN`.
-    """
+    """Return the domain that a text names; None without one: ROS 2 then reads ``ROS_DOMAIN_ID``."""
     if text is None:
         return None
     if not (text.isascii() and text.isdigit() and int(text) <= MOST_DOMAIN):
@@ -163,13 +146,7 @@ class RosContext:
         self._executors: list[tuple[Any, threading.Thread]] = []
 
     def node(self, name: str, namespace: str = "", parameters: Mapping[str, bool | int | float | str] = {}) -> Any:
-        """Return a new node.
-
-        Args:
-            name: Of the node.
-            namespace: Its namespace.
-            parameters: Values of its parameters from the beginning.
-        """
+        """Return a new node, with these values of its parameters from the beginning."""
         overrides = [self._rclpy.Parameter(key, value=value) for key, value in parameters.items()]
         node = self._rclpy.create_node(
             name, namespace=namespace, context=self._context, parameter_overrides=overrides, enable_logger_service=False
@@ -178,13 +155,7 @@ class RosContext:
         return node
 
     def spin(self, nodes: Iterable[Any], name: str, threads: int = 1) -> None:
-        """Run the callbacks of nodes on threads of their own, until :meth:`close`.
-
-        Args:
-            nodes: Of this context.
-            name: Of the thread.
-            threads: How many callbacks may run at a time.
-        """
+        """Run the callbacks of nodes on threads of their own, so many at a time, until :meth:`close`."""
         from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 
         executor: Any = (

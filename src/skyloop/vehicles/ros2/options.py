@@ -41,47 +41,26 @@ MOUNTS: Final[dict[str, Rotation | None]] = {
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Where a robot's topics and services are, as whole names; empty: it has none.
+    """Where a robot's topics and services are, as whole names; empty: it has none."""
 
-    Attributes:
-        namespace: With a slash in front.
-        image: ``sensor_msgs/Image``, or ``CompressedImage`` if ``compressed``.
-        info: ``sensor_msgs/CameraInfo``.
-        cmd_vel: ``geometry_msgs/Twist``, or ``TwistStamped`` if ``stamped``.
-        odom: ``nav_msgs/Odometry``.
-        battery: ``sensor_msgs/BatteryState``.
-        takeoff: ``std_srvs/Trigger``.
-        land: ``std_srvs/Trigger``.
-        camera: Name of the camera.
-        mount: How it is mounted, of :data:`MOUNTS`.
-        width: Of its images [px].
-        height: [px]
-        fps: Of its images [1/s].
-        compressed: Whether its images are JPEG.
-        stamped: Whether velocities carry a stamp.
-        ground: Whether it stays on the ground: then take-off and landing begin and end the drive.
-        timeout_s: Silence after which the link is lost [s].
-        domain: Of DDS; None: from ``ROS_DOMAIN_ID``.
-    """
-
-    namespace: str
-    image: str
-    info: str
-    cmd_vel: str
-    odom: str
-    battery: str
-    takeoff: str
-    land: str
-    camera: str
-    mount: str
-    width: int
-    height: int
-    fps: float
-    compressed: bool
-    stamped: bool
-    ground: bool
-    timeout_s: float
-    domain: int | None
+    namespace: str  #: with a slash in front
+    image: str  #: ``sensor_msgs/Image``, or ``CompressedImage`` if ``compressed``
+    info: str  #: ``sensor_msgs/CameraInfo``
+    cmd_vel: str  #: ``geometry_msgs/Twist``, or ``TwistStamped`` if ``stamped``
+    odom: str  #: ``nav_msgs/Odometry``
+    battery: str  #: ``sensor_msgs/BatteryState``
+    takeoff: str  #: ``std_srvs/Trigger``
+    land: str  #: ``std_srvs/Trigger``
+    camera: str  #: name of the camera
+    mount: str  #: how it is mounted, of :data:`MOUNTS`
+    width: int  #: of its images [px]
+    height: int  #: [px]
+    fps: float  #: of its images [1/s]
+    compressed: bool  #: whether its images are JPEG
+    stamped: bool  #: whether velocities carry a stamp
+    ground: bool  #: whether it stays on the ground: then take-off and landing begin and end the drive
+    timeout_s: float  #: silence after which the link is lost [s]
+    domain: int | None  #: of DDS; None: from ``ROS_DOMAIN_ID``
 
     def capabilities(self) -> Capabilities:
         """Return what the robot can do, by the topics and services that it is said to have."""
@@ -109,11 +88,7 @@ class Options:
 
 
 def options_of(uri: VehicleUri) -> Options:
-    """Return the options of an address.
-
-    Raises:
-        UsageError: One is unknown or makes no sense, or they name neither images nor odometry.
-    """
+    """Return the options of an address."""
     reject_unknown_options(uri, KNOWN)
     namespace = f"/{uri.place.strip('/')}" if uri.place.strip("/") else ""
     if namespace and not _NAME.match(namespace):

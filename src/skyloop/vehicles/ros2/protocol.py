@@ -76,13 +76,6 @@ class RobotSession:
     """One opened driver's session: actions from any thread, all else from the node's own.
 
     The sink is called with the lock free, as the proxy may hold its own while it commands.
-
-    Args:
-        options: Of the address.
-        sink: The proxy's.
-        robot: Commands go there.
-        clock: This host's monotonic clock [ns].
-        system_clock: The system's clock, which stamps are of [ns].
     """
 
     def __init__(self, options: Options, sink: Sink, robot: Robot, clock: Clock, system_clock: Clock) -> None:
@@ -262,20 +255,24 @@ class RobotSession:
         pending = _Pending(state, self._clock())
 
         def answered(success: bool, text: str) -> None:
+            why = f"the robot refused {service}: {text or 'without a reason'}"
             with self._lock:
                 if success:
                     self._up = up
                 elif up:
-                    self._refused = f"the robot refused {service}: {text or 'without a reason'}"
+                    self._refused = why
+                elif self._pending is pending and self._velocity is None:
+                    self._velocity = Velocity()  # the last one sent may still be in force
                 if self._pending is pending:
                     self._pending = None
             if not success:
-                text = f"the robot refused {service}: {text or 'without a reason'}"
-                self._sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, reason="service_failed")
+                self._sink.event(EventKind.VEHICLE_MESSAGE, why, Severity.ERROR, reason="service_failed")
 
         self._refused = ""
+        if not up:
+            self._velocity = Velocity()  # it stops if nobody offers the service
         self._robot.call(service, answered)
-        self._pending = pending
+        self._velocity, self._pending = None, pending
 
     def _received(self) -> int:
         """Note that something came, and return the time."""
@@ -325,11 +322,7 @@ class RobotSession:
 
 
 def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
-    """Return the bytes of a ``sensor_msgs/CompressedImage`` as uint8, shape (bytes,), and its width and height.
-
-    Raises:
-        DecodeError: It is no JPEG.
-    """
+    """Return the bytes of a ``sensor_msgs/CompressedImage`` as uint8, shape (bytes,), and its width and height."""
     import numpy as np
 
     from skyloop.messages.frame import image_size
@@ -358,13 +351,7 @@ class CaptureClock:
         self._newest_ns = 0
 
     def captured_ns(self, stamp_ns: int, arrived_ns: int, system_ns: int) -> int:
-        """Return when a message was captured.
-
-        Args:
-            stamp_ns: Its stamp; 0: it has none.
-            arrived_ns: When it came, on the monotonic clock.
-            system_ns: The same on the system's clock.
-        """
+        """Return when a message with this stamp was captured; 0: it has none. It arrived at a time of both clocks."""
         age_ns = system_ns - stamp_ns
         if stamp_ns == 0:
             captured_ns = arrived_ns
@@ -379,9 +366,7 @@ class CaptureClock:
 def state_of(odometry: Any, *, ground: bool) -> dict[str, Any]:
     """Return the fields of a feedback that a ``nav_msgs/Odometry`` holds; what is not finite is left out.
 
-    Args:
-        odometry: Its pose is in world axes, its twist in those of the body.
-        ground: Whether the robot stays on the ground: then its height is none.
+    Its pose is in world axes, its twist in those of the body; a robot that stays on the ground has no height.
     """
     found: dict[str, Any] = {}
     turn, place = odometry.pose.pose.orientation, odometry.pose.pose.position

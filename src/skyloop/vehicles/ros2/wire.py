@@ -72,16 +72,7 @@ class ClockMap:
         self._offset_ns: int | None = None
 
     def to_ros(self, captured_ns: int, now_ns: int, ros_now_ns: int) -> int | None:
-        """Return the time of a capture as ROS time [ns].
-
-        Args:
-            captured_ns: On the proxy's clock.
-            now_ns: The present time on it.
-            ros_now_ns: The present ROS time; 0 while a simulation's clock is not known.
-
-        Returns:
-            None while ROS time is not known, or the capture was before its beginning.
-        """
+        """Return the time of a capture as ROS time [ns]; None while that is not known, or had not begun."""
         if ros_now_ns <= 0:
             return None
         offset_ns = ros_now_ns - now_ns
@@ -207,11 +198,7 @@ _PINHOLES: Final = ("", "plumb_bob", "rational_polynomial", "thin_prism", "pinho
 
 
 def intrinsics_of(info: Any) -> Intrinsics | None:
-    """Return the intrinsics of a ``sensor_msgs/CameraInfo``; None for a camera that is not calibrated.
-
-    Raises:
-        DecodeError: Its distortion is none that is known here.
-    """
+    """Return the intrinsics of a ``sensor_msgs/CameraInfo``; None for a camera that is not calibrated."""
     k = [float(each) for each in info.k]
     d = [float(each) for each in info.d]
     if not (all(map(math.isfinite, (*k, *d))) and k[0] > 0.0 and k[4] > 0.0):

@@ -303,13 +303,7 @@ class SimDriver(Driver):
         return sink.wanted_fps(camera) if sink is not None and self._link else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Publish an image that is due.
-
-        Args:
-            model: The camera.
-            pixels: BGR, uint8, shape (height, width, 3).
-            captured_ns: When it was captured, on this host's clock.
-        """
+        """Publish an image that is due: BGR, uint8, shape (height, width, 3)."""
         sink = self._sink
         if sink is not None and self._link:
             sink.frame(
@@ -336,10 +330,6 @@ class SetpointController:
     """Starts the motors when a set-point climbs, and stops them on the ground when one descends.
 
     The simulated firmware takes set-points in the air only, so its own take-off to the least height stands in between.
-
-    Args:
-        simulation: Flies the drone.
-        drone: Its number.
     """
 
     def __init__(self, simulation: Simulation, drone: int) -> None:
@@ -349,11 +339,7 @@ class SetpointController:
         self._setpoint: Attitude | Velocity | None = None
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Command the drone as :meth:`Simulation.command` does, but accept set-points in every state.
-
-        Returns:
-            What is applied.
-        """
+        """Command the drone as :meth:`Simulation.command` does, but accept set-points in every state."""
         with self._lock:
             if not isinstance(action, Attitude | Velocity):
                 self._setpoint = None

@@ -34,8 +34,8 @@ from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import InstrumentParameters
 from skyloop.sim.rotor_dynamics import rotors_of
 from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
-from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
 from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind
+from skyloop.vehicles.sim.options import AutopilotKind
 from skyloop.vehicles.sim.telemetry import native_of as truth_of
 from skyloop.vehicles.sim.telemetry import truth_at
 
@@ -67,12 +67,7 @@ _LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
 
 
 class FirmwareFlight:
-    """Starts the firmware of one drone, and passes on what its driver reports, with the simulation's truth beside it.
-
-    Args:
-        options: Of the world.
-        inner_options: Of the address of the firmware's own driver, as they were given.
-    """
+    """Starts the firmware of one drone, and passes on its driver's reports, with the simulation's truth beside them."""
 
     def __init__(self, options: SimOptions, inner_options: str) -> None:
         assert options.autopilot is not None
@@ -118,11 +113,7 @@ class FirmwareFlight:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, host: SimHost, drone: int, sink: Sink) -> None:
-        """Start the firmware and let it fly the drone; its driver is opened as soon as its process runs.
-
-        Raises:
-            UsageError: Its program is not here, or no port is free for it.
-        """
+        """Start the firmware and let it fly the drone; its driver is opened as soon as its process runs."""
         self._host, self._drone, self._sink = host, drone, sink
         folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
         if folder is not None and host.drones > 1:
@@ -293,17 +284,7 @@ def make_firmware(
     instruments: InstrumentParameters,
     folder: Path | None = None,
 ) -> CoupledFirmware:
-    """Return a firmware that is not yet started.
-
-    Args:
-        kind: Which.
-        on_event: Called with each event, on the simulation's thread or one of the program; must return quickly.
-        instruments: Of the vehicle that it is to fly.
-        folder: Where it runs and keeps its settings; None: a new one, removed at the end.
-
-    Raises:
-        MissingExtraError: A package that it needs is not installed.
-    """
+    """Return a firmware that is not yet started."""
     if kind is AutopilotKind.ARDUPILOT:
         from skyloop.vehicles.sim.firmware.ardupilot import ArduCopter
 

@@ -18,6 +18,7 @@ that speaks to the firmware, ``mavlink://`` or ``msp://``.
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import StrEnum
 from typing import Final
 from urllib.parse import urlencode
 
@@ -27,7 +28,15 @@ from skyloop.errors import UnknownNameError, UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FPV_CAMERA, FRONT_CAMERA, CameraModel
 from skyloop.sim.options import EVERY_ACTION, MOST_LAG_S, SimOptions
 from skyloop.sim.vehicles import VEHICLES
-from skyloop.vehicles.sim.firmware.kinds import AutopilotKind
+
+
+class AutopilotKind(StrEnum):
+    """Firmware that can fly a simulated drone, by its name in an address."""
+
+    ARDUPILOT = "ardupilot"
+    BETAFLIGHT = "betaflight"
+    PX4 = "px4"
+
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA, FPV_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
@@ -48,12 +57,7 @@ TRUTH_HZ: Final = 100.0  #: how often the truth is noted that is reported beside
 
 
 def options_of(uri: VehicleUri) -> SimOptions:
-    """Parse an address.
-
-    Raises:
-        UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
-        UsageError: An option's value makes no sense, or options don't go together.
-    """
+    """Parse an address."""
     autopilot = _autopilot(uri)
     if autopilot is None:
         reject_unknown_options(uri, KNOWN)

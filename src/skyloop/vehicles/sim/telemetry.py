@@ -64,9 +64,7 @@ def native_of(report: Report, options: SimOptions) -> dict[str, Value]:
 def truth_at(reports: Sequence[Report], captured_ns: int) -> Report:
     """Return the report of a time, with the drone's true motion interpolated between the two around it.
 
-    Args:
-        reports: At least one, oldest first.
-        captured_ns: The time; before the first and after the last, those count.
+    There is at least one, oldest first; before the first and after the last, those count.
     """
     after = bisect_right(reports, captured_ns, key=lambda report: report.captured_ns)
     if after == 0:

@@ -10,7 +10,7 @@ from skyloop.drivers.h264 import Unit
 from skyloop.drivers.live_frames import Coded, StreamRelay
 from skyloop.drivers.live_video import LiveVideo, Picture, VideoEvent
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.vehicle_session import SinkCallback
+from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Hover, Intrinsics, Land, Parameter, Refusal, Value
 from skyloop.messages.parameter import Diagnostic
@@ -71,8 +71,7 @@ class TelloDriver(Driver):
 
     def _deliver(self, sink: Sink, pending: list[SinkCallback]) -> None:
         """Run the session's callbacks. On the link's thread."""
-        for publish in pending:
-            publish(sink)
+        deliver(sink, pending)
         link, settings = self._link, self._settings
         if self._video is not None or not self.options.video or link is None or settings is None:
             return
@@ -107,12 +106,7 @@ class TelloDriver(Driver):
         return [] if self._settings is None else self._settings.parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter. Takes up to 0.95 s: the drone answers.
-
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: The driver is not open, the value does not fit, or the drone refused or did not answer.
-        """
+        """Write a parameter. Takes up to 0.95 s: the drone answers."""
         if self._settings is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
         return self._settings.write(name, value)

@@ -19,15 +19,7 @@ _BUFFER: Final = 1 << 20  # half a second of video
 
 
 def command_socket(options: TelloOptions, address: str) -> socket.socket:
-    """Return a socket that sends commands and receives their answers, from the drone's port alone.
-
-    Args:
-        options: Of the vehicle's address.
-        address: The drone's.
-
-    Raises:
-        OSError: It can't be opened.
-    """
+    """Return a socket that sends commands and receives their answers, from the drone's port alone."""
     made = _through(options)
     try:
         made.bind((options.local or "", 0))
@@ -39,16 +31,7 @@ def command_socket(options: TelloOptions, address: str) -> socket.socket:
 
 
 def receiving_socket(options: TelloOptions, local: str, port: int) -> socket.socket:
-    """Return a socket that receives what comes to a port of this host, from anybody: check the sender.
-
-    Args:
-        options: Of the vehicle's address.
-        local: This host's address.
-        port: UDP.
-
-    Raises:
-        OSError: The port is in use, or can't be opened.
-    """
+    """Return a socket that receives what comes to a UDP port of this host, from anybody: check the sender."""
     made = _through(options)
     try:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
@@ -80,13 +63,7 @@ ASK_S: Final = 0.95  #: a command is answered within this, or it failed
 
 
 class TelloLink(VehicleLink[TelloSession]):
-    """Commands with their answers, and state, of one drone.
-
-    Args:
-        session: The drone's protocol.
-        deliver: Called on the link's thread with what the session has for the sink.
-        clock: Monotonic, ns.
-    """
+    """Commands with their answers, and state, of one drone."""
 
     def __init__(
         self, session: TelloSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns

@@ -54,12 +54,7 @@ class TelloOptions:
 
 
 def options_of(uri: VehicleUri) -> TelloOptions:
-    """Parse an address.
-
-    Raises:
-        UnknownNameError: It has an unknown option, or unknown ``velocity_axes``.
-        UsageError: It names no host, or an option's value makes no sense.
-    """
+    """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(f"{uri} names no host: it looks like tello://192.168.10.1")

@@ -6,10 +6,11 @@ The drone can't be asked what is set: what was written last is shown, and sent a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
+from skyloop.drivers.base import checked_value
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.vehicles.tello.link import TelloLink
@@ -117,22 +118,6 @@ def scale_parameters(limits: Scale, full: Scale) -> list[Parameter]:
     return made
 
 
-def scaled(scale: Scale, parameter: Parameter, value: Value) -> Scale:
-    """Return a scale with one number changed.
-
-    Raises:
-        ParameterError: The value is no number or out of the parameter's range.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ParameterError(f"{parameter.name} takes a number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
-    low, high = parameter.minimum, parameter.maximum
-    assert low is not None
-    assert high is not None
-    if not low <= value <= high:
-        raise ParameterError(f"{parameter.name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
-    return replace(scale, **{parameter.name.rpartition(".")[2]: float(value)})
-
-
 def flip_parameter(value: str) -> Parameter:
     """Return the parameter whose writing flips the drone."""
     return Parameter(
@@ -167,29 +152,8 @@ def known_settings(sdk: Sdk | None) -> dict[str, Setting]:
     return {name: setting for name, setting in SETTINGS.items() if sdk is not None and sdk.knows(setting.since)}
 
 
-def command_of(setting: Setting, value: Value) -> str:
-    """Return the command that sets a value.
-
-    Raises:
-        ParameterError: The value is of another type, or none of the choices.
-    """
-    parameter = setting.parameter
-    if type(value) is not type(parameter.value):
-        raise ParameterError(
-            f"{parameter.name} takes a {parameter.type.value}, not {value!r:.60}", code=Refusal.WRONG_TYPE
-        )
-    if value not in setting.commands:
-        names = [str(choice) for choice in setting.commands]
-        raise ParameterError(str(UnknownNameError(parameter.name, str(value), names)), code=Refusal.OUT_OF_RANGE)
-    return setting.commands[value]
-
-
 class DroneSettings:
-    """The values of all parameters. Those of the drone are written through the link.
-
-    Args:
-        link: To the drone.
-    """
+    """The values of all parameters. Those of the drone are written through the link."""
 
     def __init__(self, link: TelloLink) -> None:
         self._link = link
@@ -217,10 +181,8 @@ class DroneSettings:
     def write(self, name: str, value: Value) -> Value:
         """Write a parameter and return the value in force. Takes up to 0.95 s.
 
-        Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: It is read-only, the value does not fit, a flip is asked for on the ground, or the drone
-                refused or did not answer.
+        Raises for a name or a value that does not fit, for a flip on the ground, and where the drone refuses or is
+        silent.
         """
         known = {parameter.name: parameter for parameter in self.parameters()}
         if name not in known:
@@ -228,25 +190,24 @@ class DroneSettings:
         parameter = known[name]
         if parameter.read_only:
             raise ParameterError(f"{name} can only be read", code=Refusal.READ_ONLY)
+        value = checked_value(parameter, value)
         if name.startswith((LIMITS, FULL)):
-            return self._scale(parameter, value)
+            return self._scale(name, value)
         if name == FLIP:
             return self._do_flip(value)
         return self._configure(SETTINGS[name], value)
 
-    def _scale(self, parameter: Parameter, value: Value) -> Value:
+    def _scale(self, name: str, value: Value) -> Value:
+        change: dict[str, Any] = {name.rpartition(".")[2]: value}
         with self._link.lock:
             setpoints = self._link.session.setpoints
-            if parameter.name.startswith(LIMITS):
-                setpoints.limits = scaled(setpoints.limits, parameter, value)
+            if name.startswith(LIMITS):
+                setpoints.limits = replace(setpoints.limits, **change)
             else:
-                setpoints.full = scaled(setpoints.full, parameter, value)
-        assert isinstance(value, int | float)
-        return float(value)
+                setpoints.full = replace(setpoints.full, **change)
+        return value
 
     def _do_flip(self, value: Value) -> Value:
-        if value != NO_FLIP and value not in FLIPS:
-            raise ParameterError(str(UnknownNameError(FLIP, str(value), FLIPS)), code=Refusal.OUT_OF_RANGE)
         if value != NO_FLIP:
             with self._link.lock:
                 session = self._link.session
@@ -257,7 +218,7 @@ class DroneSettings:
         return value
 
     def _configure(self, setting: Setting, value: Value) -> Value:
-        command = command_of(setting, value)
+        command = setting.commands[value]
         reply = self._link.ask(command)
         name = setting.parameter.name
         if reply is None:

@@ -35,14 +35,7 @@ Done = Callable[[str | None], None]
 
 @dataclass(slots=True)
 class Request:
-    """A command whose answer is waited for.
-
-    Args:
-        text: The command.
-        done: Called with the answer, or None if there was none.
-        tries: How often it is sent at most.
-        sent_ns: When it was sent last.
-    """
+    """A command whose answer is waited for."""
 
     text: str
     done: Done
@@ -89,11 +82,7 @@ class Conversation:
             request.done(None)
 
     def on_reply(self, reply: str) -> str | None:
-        """Handle a reply.
-
-        Returns:
-            The motion that it answers, None if it answers none.
-        """
+        """Handle a reply; return the motion that it answers, None if it answers none."""
         asked = self._asked
         plain_error = is_error(reply) and ":" not in reply
         if asked is not None and answers(reply, asked.text) and not (plain_error and self._motions):
@@ -206,14 +195,7 @@ class TelloSession(VehicleSession):
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Accept an action and have it sent soon.
-
-        Returns:
-            What is applied, after the limits.
-
-        Raises:
-            DriverError: It can't be done now; see :meth:`SetpointController.apply`.
-        """
+        """Accept an action and have it sent soon; see :meth:`SetpointController.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns, new=new)
         self._keep(action, now_ns)
@@ -227,12 +209,7 @@ class TelloSession(VehicleSession):
         return applied
 
     def ask(self, text: str, done: Done) -> None:
-        """Send a command that is answered.
-
-        Args:
-            text: The command.
-            done: Called with the answer, or None if there was none.
-        """
+        """Send a command; ``done`` gets the answer, or None if there was none."""
         self.conversation.ask(Request(text, done))
         self.due_ns = 0
 

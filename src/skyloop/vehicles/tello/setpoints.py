@@ -56,11 +56,6 @@ def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[
     """Return the sticks, and what they ask for: each number within its limit, and no more than a full stick.
 
     The Tello holds a speed, and no attitude: a tilt is taken as a share of the full stick, and so of the full speed.
-
-    Args:
-        action: The set-point.
-        full: What a full stick comes to.
-        limits: The most that is asked for.
     """
     climb = min(full.climb, limits.climb)
     yaw = min(full.yaw_rate, limits.yaw_rate)
@@ -269,13 +264,7 @@ class SetpointController:
             self._steering = self._decision is not Decision.STAY
 
     def on_answer(self, motion: str, reply: str, now_ns: int) -> None:
-        """Handle the answer to a take-off or landing. That to an emergency stop shows nothing: the motors do.
-
-        Args:
-            motion: The command that is answered.
-            reply: The drone's answer.
-            now_ns: When it came.
-        """
+        """Handle the answer to a take-off or landing. That to an emergency stop shows nothing: the motors do."""
         refused = is_error(reply)
         if motion == LAND:
             self.watch.landing_answered = self._decision is Decision.LAND and not refused

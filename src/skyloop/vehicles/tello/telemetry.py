@@ -37,13 +37,9 @@ def height_m(state: State) -> float | None:
 
 
 def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
-    """Return the velocity forward, left, up [m/s]; None if it is not known.
+    """Return the velocity forward, left, up [m/s], from numbers along these axes; None if it is not known.
 
     ``vgx`` and its like are in dm/s: a Tello that moved at 1 m/s reported 7 (DJITelloPy, issue 96).
-
-    Args:
-        state: The drone's.
-        axes: Which axes its numbers are along.
     """
     if state.speed_dm_s is None or axes is VelocityAxes.NONE:
         return None
@@ -59,15 +55,7 @@ def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
 def feedback_of(
     state: State, flight: FlightState, captured_ns: int, axes: VelocityAxes, native: dict[str, Value]
 ) -> Feedback:
-    """Return the drone's state in SI units and our axes. What it does not report is None.
-
-    Args:
-        state: As the drone reported it.
-        flight: The flight state.
-        captured_ns: When the state came.
-        axes: Which axes its velocity is along.
-        native: The drone's own telemetry.
-    """
+    """Return the drone's state in SI units and our axes. What it does not report is None."""
     acceleration = state.acceleration_mg
     factor = STANDARD_GRAVITY / 1000
     return Feedback(

@@ -66,10 +66,7 @@ def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
 def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | None:
     """Return a camera's intrinsics for pictures of another width, which the drone makes smaller when asked to.
 
-    Args:
-        front: The front camera, with its intrinsics at full size.
-        camera: The one that is shown; None is known of the other's.
-        width: Of the pictures [px].
+    Known are those of the front camera, at full size.
     """
     known = front.intrinsics
     if camera != FRONT or known is None:
@@ -92,17 +89,7 @@ BURST: Final = 64
 
 
 class VideoStream:
-    """The port that video comes to. Pictures have no stamps: they count as captured when their first datagram came.
-
-    Args:
-        options: Of the vehicle's address.
-        addresses: Returns the drone's address and this host's, None while they are not known.
-        connection: Its number.
-        clock: Monotonic, ns.
-
-    Raises:
-        OSError: The port can't be opened, or the drone's address is not known yet.
-    """
+    """The port that video comes to. Pictures have no stamps: they count as captured when their first datagram came."""
 
     def __init__(
         self, options: TelloOptions, addresses: Callable[[], tuple[str, str] | None], connection: int, clock: Clock
@@ -128,11 +115,7 @@ class VideoStream:
         return self._assembly.stray
 
     def read(self) -> list[Coded]:
-        """Return the pictures that arrived, after :data:`POLL_S` at most.
-
-        Raises:
-            OSError: Nothing came for :data:`SILENT_S`.
-        """
+        """Return the pictures that arrived, after :data:`POLL_S` at most."""
         frames: list[Coded] = []
         if wait_readable(self._socket, POLL_S):
             self._drain(frames)

@@ -1,4 +1,6 @@
-"""What a camera of Video4Linux offers, and its exposure and gain, by the kernel's own calls.
+"""The cameras of this machine, as Video4Linux lists them: what they offer, and their exposure and gain.
+
+All is said by the kernel's own calls.
 
 Layouts and numbers are those of ``linux/videodev2.h`` (``Documentation/userspace-api/media/v4l``), which are the same
 on all architectures with integers of 32 bits. FFmpeg streams from the device meanwhile: settings need no stream.
@@ -12,6 +14,7 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 #: Descriptor, request and buffer, which is changed; raises OSError.
@@ -105,12 +108,7 @@ class Control:
 
 
 class V4l2Device:
-    """An open device.
-
-    Args:
-        descriptor: Of its node.
-        ioctl: The kernel's call; None: ``fcntl.ioctl``.
-    """
+    """An open device."""
 
     def __init__(self, descriptor: int, ioctl: Ioctl | None = None) -> None:
         """Store the arguments. No I/O."""
@@ -149,14 +147,7 @@ class V4l2Device:
         return Control(number, _text(name), minimum, maximum, step, default, value[1])
 
     def set_exposure(self, exposure_ms: float | None) -> str:
-        """Set the exposure.
-
-        Args:
-            exposure_ms: [ms]; None: the camera chooses.
-
-        Returns:
-            Why it could not be set, in words; empty if it was.
-        """
+        """Set the exposure [ms]; None: the camera chooses. Return why it could not be set, in words."""
         if exposure_ms is None:
             problem = self._set(AUTO_EXPOSURE, _APERTURE_FIRST) and self._set(AUTO_EXPOSURE, _AUTO)
             return f"the camera has no automatic exposure: {problem}" if problem else ""
@@ -243,15 +234,7 @@ class V4l2Device:
 
 @contextmanager
 def opened(path: str, ioctl: Ioctl | None = None) -> Iterator[V4l2Device]:
-    """Open a device for its settings.
-
-    Args:
-        path: Such as ``/dev/video0``.
-        ioctl: As for :class:`V4l2Device`.
-
-    Raises:
-        OSError: It can't be opened.
-    """
+    """Open a device, such as ``/dev/video0``, for its settings; ``ioctl`` as for :class:`V4l2Device`."""
     descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     try:
         yield V4l2Device(descriptor, ioctl)
@@ -271,3 +254,63 @@ def _reason(error: OSError) -> str:
     if error.errno in (errno.EINVAL, errno.ENOTTY):
         return "the camera has no such setting, or not that value"
     return error.strerror or str(error)
+
+
+_CLASS: Final = Path("/sys/class/video4linux")
+_DEVICES: Final = Path("/dev")
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDevice:
+    """A camera of this machine."""
+
+    path: Path  #: such as ``/dev/video0``
+    name: str  #: as its driver calls it
+    allowed: bool  #: whether this user may open it
+
+    def __str__(self) -> str:
+        why = "" if self.allowed else ", but this user may not open it: sudo usermod -aG video $USER, and log in again"
+        return f"video://{self.path} ({self.name}){why}"
+
+
+def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevice]:
+    """Return the cameras of this machine, by number; none where the system has no Video4Linux.
+
+    A camera may have several nodes: only the first, which gives pictures, is listed.
+    """
+    try:
+        nodes = sorted(system.iterdir(), key=lambda node: (len(node.name), node.name))
+    except OSError:
+        return []
+    return [
+        CameraDevice(path, _read(node / "name") or node.name, os.access(path, os.R_OK | os.W_OK))
+        for node in nodes
+        if node.name.startswith("video")
+        and _read(node / "index") in ("", "0")
+        and (path := devices / node.name).exists()
+    ]
+
+
+def described(found: list[CameraDevice]) -> str:
+    """Return which cameras there are, in words."""
+    if not found:
+        return "no camera is connected to this machine"
+    return f"cameras of this machine: {', '.join(map(str, found))}"
+
+
+def listed(camera: CameraDevice, ioctl: Ioctl | None = None) -> list[str]:
+    """Return what a camera offers, in lines for people: its address, then formats, sizes, rates, exposure and gain."""
+    try:
+        with opened(str(camera.path), ioctl) as device:
+            told = [*map(str, device.formats()), *device.settings()]
+            lines = told if device.captures() else ["gives no pictures"]
+    except OSError as error:
+        lines = [f"can't be opened: {error.strerror or error}"]
+    return [str(camera), *(f"  {line}" for line in lines)]
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:
+        return ""

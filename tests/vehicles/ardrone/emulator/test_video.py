@@ -30,8 +30,15 @@ from skyloop.vehicles.ardrone.video import cameras_of
 from skyloop.vehicles.ardrone.wire import uvlc
 from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame, PaveParser
-from skyloop.vehicles.emulation.encoders import GROUP, Encoder, as_the_drone_does, require_encoder
-from skyloop.vehicles.emulation.video import Piece, VideoEncoding, with_inset
+from skyloop.vehicles.emulation.video import (
+    GROUP,
+    Encoder,
+    Piece,
+    VideoEncoding,
+    as_the_drone_does,
+    require_encoder,
+    with_inset,
+)
 
 av = pytest.importorskip("av")
 

@@ -35,9 +35,8 @@ from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.navdata import STANDARD, Ports
 from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
-from skyloop.vehicles.emulation.encoders import require_encoder
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
-from skyloop.vehicles.emulation.video import Packer, Piece, VideoEncoding
+from skyloop.vehicles.emulation.video import Packer, Piece, VideoEncoding, require_encoder
 
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera
@@ -298,18 +297,10 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     @property
     def ports(self) -> Ports:
-        """The real ports, where 0 was asked for.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The real ports, where 0 was asked for."""
         return self._started.ports
 
     @property
     def logic(self) -> ArdroneLogic:
-        """The state of the running firmware, for tests; it belongs to its thread.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The state of the running firmware, for tests; it belongs to its thread."""
         return self._started.logic

@@ -89,18 +89,10 @@ class Configuration:
         return self._ids[Category.SESSION], self._ids[Category.USER], self._ids[Category.APPLICATION]
 
     def write(self, name: str, text: str, ids: Ids | None = None) -> bool:
-        """Handle a ``CONFIG``.
+        """Handle a ``CONFIG``, with the ids that came right before it, if any; return whether it was obeyed.
 
         Once a session, user or application of its own is in force, only what comes with its ids is obeyed, except for
         ``custom:…_id``, or nobody else could ever begin one.
-
-        Args:
-            name: The key.
-            text: Its value.
-            ids: What came in the command right before it, if anything did.
-
-        Returns:
-            Whether it was obeyed.
         """
         name = name.strip().lower()
         key = self._keys.get(name)

@@ -68,14 +68,7 @@ def limits_of(configuration: Configuration) -> Limits:
 def set_point(
     progress: Progress, configuration: Configuration, *, yaw_rad: float, forward_m_s: float
 ) -> Attitude | Hover:
-    """Return the set-point that a ``PCMD`` asks for.
-
-    Args:
-        progress: The command.
-        configuration: Has the limits.
-        yaw_rad: The drone's, counter-clockwise from east.
-        forward_m_s: The drone's speed.
-    """
+    """Return the set-point that a ``PCMD`` asks for, within the configured limits."""
     if not progress.flags & Pcmd.PROGRESSIVE:
         return Hover()
     most_tilt = configuration.number("control:euler_angle_max")
@@ -119,13 +112,7 @@ class Animation:
 
 
 class FlightControl:
-    """Flies one drone. Times are of the caller's clock [ns].
-
-    Args:
-        vehicle: What is commanded.
-        configuration: Has the limits and thresholds.
-        version: Of the drone, 1 or 2.
-    """
+    """Flies one drone. Times are of the caller's clock [ns]."""
 
     def __init__(self, vehicle: Vehicle, configuration: Configuration, *, version: int) -> None:
         self._vehicle = vehicle
@@ -210,13 +197,7 @@ class FlightControl:
     # Supervision -----------------------------------------------------------------------------------------------
 
     def supervise(self, believed: VehicleFeedback, silence_s: float, now_ns: int) -> None:
-        """Watch the battery, the angles and the link. Called regularly.
-
-        Args:
-            believed: What the vehicle believes now.
-            silence_s: For how long no command has come.
-            now_ns: The present time.
-        """
+        """Watch battery and angles, and the link by how long no command has come. Called regularly."""
         self._believed = believed
         self._watch_battery(believed)
         if believed.state is FlightState.EMERGENCY:

@@ -97,14 +97,7 @@ class LedAnimation:
 
 
 class ArdroneLogic:
-    """The logic of one drone. Not thread-safe.
-
-    Args:
-        vehicle: What is commanded.
-        send_text: Sends bytes to every client of the control port.
-        clock: Monotonic, ns.
-        version: Of the drone, 1 or 2.
-    """
+    """The logic of one drone. Not thread-safe."""
 
     def __init__(self, vehicle: Vehicle, send_text: Callable[[bytes], None], clock: Clock, *, version: int) -> None:
         self._vehicle = vehicle
@@ -183,11 +176,7 @@ class ArdroneLogic:
     # Telling ---------------------------------------------------------------------------------------------------
 
     def state(self, *, video: bool) -> State:
-        """Return the state bits.
-
-        Args:
-            video: Whether anybody receives pictures.
-        """
+        """Return the state bits; ``video``: whether anybody receives pictures."""
         flight_state = self._vehicle.state
         bits = {
             State.FLYING: flight_state.airborne,

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from skyloop.vehicles.ardrone.wire.navdata import FIRST_SEQUENCE
-from skyloop.vehicles.emulation.datagrams import Address, bound
-from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.emulation.datagrams import Address, Loop, bound
 
 MOST: Final = 8
 
@@ -54,11 +53,6 @@ class Outlet:
 
     A client that reads too slowly gets no part of a stream, but whole pieces left out: from one that does not fit until
     the next that can be understood without those before.
-
-    Args:
-        loop: Calls back when there is something to read or room to write.
-        connection: Accepted.
-        gone: Called when the client is gone.
     """
 
     def __init__(self, loop: Loop, connection: socket.socket, gone: Callable[[Outlet], None]) -> None:
@@ -76,12 +70,7 @@ class Outlet:
         loop.watch(connection, self._read)
 
     def offer(self, piece: bytes, *, starts: bool) -> None:
-        """Send a piece, unless the client is too slow.
-
-        Args:
-            piece: What is sent.
-            starts: Whether a client can begin with it.
-        """
+        """Send a piece, unless the client is too slow; ``starts``: a client can begin with it."""
         if starts:
             self._skipping = False
         if self._skipping or self._backlog > MOST_BACKLOG:
@@ -133,17 +122,7 @@ class Outlet:
 
 
 class StreamPort:
-    """A listening port with its clients. Used on the loop's thread.
-
-    Args:
-        loop: Calls back when somebody connects.
-        bind: Address and port of this machine; port 0 is any free one.
-        name: For errors.
-        joined: Called with each new client. One more than :data:`MOST_CLIENTS` is turned away.
-
-    Raises:
-        LinkError: The port is taken.
-    """
+    """A listening port with its clients. Used on the loop's thread."""
 
     def __init__(self, loop: Loop, bind: Address, *, name: str, joined: Callable[[Outlet], None] | None = None) -> None:
         self._loop = loop

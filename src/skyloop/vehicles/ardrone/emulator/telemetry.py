@@ -91,15 +91,10 @@ def options_of(snapshot: Snapshot, tags: list[int]) -> list[o.Option]:
 
 
 def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
-    """Return the tags of the options that are sent, ascending.
+    """Return the tags of the options that are sent, ascending, by the mask ``general:navdata_options``.
 
     In demo mode those of the usual mask and of the configured one. In full mode those of the configured one; all where
     it still is the usual one, for that is what drones sent to programs that never configured it.
-
-    Args:
-        mask: ``general:navdata_options``, one bit for each tag.
-        demo: Whether the drone is in demo mode.
-        version: Of the drone, 1 or 2.
     """
     if demo:
         mask |= NAVDATA_OPTIONS_USUAL

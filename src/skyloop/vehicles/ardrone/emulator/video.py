@@ -45,8 +45,7 @@ from skyloop.vehicles.ardrone.wire.uvlc_codes import (
     UVLC_START,
     PictureType,
 )
-from skyloop.vehicles.emulation.encoders import Encoder, Format
-from skyloop.vehicles.emulation.video import Piece
+from skyloop.vehicles.emulation.video import Encoder, Format, Piece
 
 _NS_PER_US: Final = 1000
 _NS_PER_MS: Final = 1_000_000
@@ -116,13 +115,7 @@ FORMATS: Final = {
 
 
 class PavePacker:
-    """Packs pictures of an AR.Drone 2: a PaVE header, and a picture in H.264 or MPEG-4.
-
-    Args:
-        clock: The drone's.
-        header_size: 64 or 68 bytes.
-        attitude: Returns theta, phi and psi [rad], for the header.
-    """
+    """Packs pictures of an AR.Drone 2: a PaVE header, and a picture in H.264 or MPEG-4."""
 
     def __init__(self, clock: DroneClock, header_size: int, attitude: Callable[[], tuple[float, float, float]]) -> None:
         self._clock = clock

@@ -29,11 +29,10 @@ from skyloop.faults import Faults
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.vehicles.emulation.datagrams import Loop
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
-from skyloop.vehicles.emulation.encoders import GROUP
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
-from skyloop.vehicles.emulation.loop import Loop
-from skyloop.vehicles.emulation.video import OneCamera, VideoEncoding
+from skyloop.vehicles.emulation.video import GROUP, OneCamera, VideoEncoding
 from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
 from skyloop.vehicles.mavlink.emulator.autopilot import Autopilot
 from skyloop.vehicles.mavlink.emulator.links import (
@@ -167,11 +166,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     @property
     def autopilot(self) -> Autopilot:
-        """The running autopilot, for tests; it belongs to its thread.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The running autopilot, for tests; it belongs to its thread."""
         return self._started.autopilot
 
     @property
@@ -181,11 +176,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     @property
     def tcp_address(self) -> str:
-        """Address of a driver on this machine, over TCP.
-
-        Raises:
-            UsageError: This kind has no such port.
-        """
+        """Address of a driver on this machine, over TCP; raises for a kind that has no such port."""
         if self.settings.ports.tcp is None:
             raise UsageError(f"an emulated {self.settings.kind.value} has no TCP port")
         return f"mavlink://tcp:{self.settings.bind}:{self.settings.ports.tcp}"

@@ -51,14 +51,7 @@ PlaceHandler = Callable[[Arguments, int], int]
 
 
 class Autopilot(ABC):
-    """One autopilot. All methods belong to one thread. ``ports``, its links, are set before the first report.
-
-    Args:
-        vehicle: What it flies.
-        system: Its MAVLink system id.
-        boot_s: From the start until it lets itself be armed, in seconds of the simulation.
-        gps: Whether it has GPS; if not, it is not ready before poses come from outside.
-    """
+    """One autopilot. All methods belong to one thread. ``ports``, its links, are set before the first report."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
     CAPABILITIES: ClassVar[int]
@@ -227,12 +220,7 @@ class Autopilot(ABC):
                 port.send(parameter)
 
     def send_text(self, text: str, severity: int = WARNING) -> None:
-        """Send a text to everybody.
-
-        Args:
-            text: For people; sent in pieces if it is long.
-            severity: ``MAV_SEVERITY``.
-        """
+        """Send a text for people to everybody, in pieces if it is long."""
         self._text = self._text % 0xFFFF + 1
         for port in self.ports:
             for chunk in chunks_of(text, severity, self._text):
@@ -246,13 +234,7 @@ class Autopilot(ABC):
     # Messages come -----------------------------------------------------------------------------------------------
 
     def on_message(self, port: Port, message: Message, now_ns: int) -> None:
-        """Handle a message. Before the first report all are ignored: it is not awake yet.
-
-        Args:
-            port: Where it came, and answers go.
-            message: Whatever it is.
-            now_ns: When it came.
-        """
+        """Handle a message; answers go to its port. Before the first report all are ignored: it is not awake yet."""
         if self._begun_s is None or getattr(message, "target_system", 0) not in (0, self.system):
             return
         kind = message.get_type()
@@ -407,11 +389,7 @@ class Autopilot(ABC):
         self._disarmed()
 
     def crashed(self, text: str) -> None:
-        """Disarm: the vehicle stopped its motors by itself.
-
-        Args:
-            text: Why, for people.
-        """
+        """Disarm: the vehicle stopped its motors by itself, for this reason."""
         if self.armed:
             self._disarm(f"Crash: Disarming ({text})")
 

@@ -13,8 +13,7 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.options import SimOptions
-from skyloop.vehicles.emulation.datagrams import Address, ByteServer, DatagramPort
-from skyloop.vehicles.emulation.loop import Loop
+from skyloop.vehicles.emulation.datagrams import Address, ByteServer, DatagramPort, Loop
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 
 REPORTS_HZ: Final = 125.0  #: as often as a world that keeps time reports
@@ -30,17 +29,11 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """Ports of one emulated autopilot.
+    """Ports of one emulated autopilot."""
 
-    Args:
-        udp: The autopilot's own, from which it sends to ``remote`` until a message comes.
-        remote: UDP, of the other end.
-        tcp: Its server for one client; None: it has none.
-    """
-
-    udp: int
-    remote: int
-    tcp: int | None = None
+    udp: int  #: the autopilot's own, from which it sends to ``remote`` until a message comes
+    remote: int  #: UDP, of the other end
+    tcp: int | None = None  #: its server for one client; None: it has none
 
     @classmethod
     def standard(cls, kind: Kind, drone: int = 0) -> Ports:
@@ -79,11 +72,7 @@ class Ports:
 
     @classmethod
     def several(cls, kind: Kind, base: int | None, drones: int) -> list[Ports]:
-        """Return the ports of several drones; none of them twice. See :meth:`counted`.
-
-        Raises:
-            UsageError: They don't fit below 65536.
-        """
+        """Return the ports of several drones; none of them twice. See :meth:`counted`."""
         if base != 0:
             return [cls.counted(kind, base, drone) for drone in range(drones)]
         with ExitStack() as held:  # of all of them: the system soon gives a port that was closed to the next who asks
@@ -133,11 +122,7 @@ MAX_INTERVAL_US: Final = 2**31 - 1  #: the greatest that ``MESSAGE_INTERVAL`` ha
 
 
 class Streams:
-    """The messages of one link. Times are the autopilot's [s].
-
-    Args:
-        rates: By message number, from the start [1/s].
-    """
+    """The messages of one link. Times are the autopilot's [s]."""
 
     def __init__(self, rates: Mapping[int, float]) -> None:
         self._usual = dict(rates)
@@ -200,17 +185,7 @@ def _codec(settings: Settings) -> Codec:
 
 
 class UdpPort:
-    """A UDP port: sends to the remote port until a message comes, then to its sender.
-
-    Args:
-        loop: Calls back when something comes.
-        settings: Of the firmware.
-        streams: Rates of the messages.
-        on_message: Called with each message.
-
-    Raises:
-        LinkError: The port is taken.
-    """
+    """A UDP port: sends to the remote port until a message comes, then to its sender."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
@@ -234,8 +209,9 @@ class UdpPort:
         return self._port.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the peer."""
-        self._port.send(self._codec.encode(message, version=self._settings.version), self._peer)
+        """Send a message to the peer; MAVLink 1 has no numbers above 255."""
+        if self._settings.version == 2 or message.id < 256:
+            self._port.send(self._codec.encode(message, version=self._settings.version), self._peer)
 
     def close(self) -> None:
         """Close the port."""
@@ -253,17 +229,7 @@ class UdpPort:
 
 
 class TcpPort:
-    """A TCP server for one client at a time: the next one waits in the kernel, connected and without a byte.
-
-    Args:
-        loop: Calls back when something comes.
-        settings: Of the firmware.
-        streams: Rates of the messages.
-        on_message: Called with each message.
-
-    Raises:
-        LinkError: The port is taken.
-    """
+    """A TCP server for one client at a time: the next one waits in the kernel, connected and without a byte."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
@@ -280,12 +246,9 @@ class TcpPort:
         return self._server.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the client, if there is one.
-
-        Raises:
-            OSError: The client is gone.
-        """
-        self._server.send(self._codec.encode(message, version=self._settings.version))
+        """Send a message to the client, if there is one."""
+        if self._settings.version == 2 or message.id < 256:
+            self._server.send(self._codec.encode(message, version=self._settings.version))
 
     def close(self) -> None:
         """Close the server and the connection."""

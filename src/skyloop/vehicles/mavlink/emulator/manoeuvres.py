@@ -61,13 +61,7 @@ class Target:
     yaw_rate: float = 0.0
 
     def follow(self, flight: FlightControl, speeds: Speeds = USUAL, turn: float | None = None) -> None:
-        """Fly it. Called at every tick.
-
-        Args:
-            flight: What flies.
-            speeds: The greatest ones on the way to a position.
-            turn: A yaw rate instead of its own [rad/s].
-        """
+        """Fly it, with a yaw rate [rad/s] instead of its own if one is given. Called at every tick."""
         if turn is None:
             turn = self.yaw_rate if self.yaw is None else flight.yaw_rate_to(self.yaw)
         if self.velocity is not None and self.place is None:
@@ -94,14 +88,9 @@ def target_of(message: Message) -> Target:
 
 
 def global_target_of(message: Message, datum: float | None) -> Target | None:
-    """Return the target of ``SET_POSITION_TARGET_GLOBAL_INT``.
+    """Return the target of ``SET_POSITION_TARGET_GLOBAL_INT``; None for a place or a frame that does not exist.
 
-    Args:
-        message: The set-point.
-        datum: How high its altitude 0 is above our origin [m]; None for an unknown frame.
-
-    Returns:
-        None for a position that does not exist, or that is in an unknown frame.
+    ``datum``: how high its altitude 0 is above our origin [m].
     """
     mask, place = message.type_mask, None
     if not mask & _POSITION:
@@ -191,11 +180,7 @@ class Turn:
 
 
 class Manoeuvres:
-    """The manoeuvres of one flight. Heights are above the flight's origin [m].
-
-    Args:
-        flight: What flies them.
-    """
+    """The manoeuvres of one flight. Heights are above the flight's origin [m]."""
 
     def __init__(self, flight: FlightControl) -> None:
         self._flyer = flight
@@ -259,14 +244,7 @@ class Manoeuvres:
         speeds: Speeds = USUAL,
         turn: float | None = None,
     ) -> None:
-        """Follow a set-point, or hold the position without one. Called at every tick.
-
-        Args:
-            target: The set-point.
-            lean: Flies an attitude.
-            speeds: The greatest ones on the way to a position.
-            turn: A yaw rate instead of the set-point's [rad/s].
-        """
+        """Follow a set-point, or hold the position without one; ``lean`` flies an attitude. Called at every tick."""
         if isinstance(target, Target):
             target.follow(self._flyer, speeds, turn)
         elif target is not None:

@@ -67,12 +67,7 @@ class Mission:
         self._wanted = 0  # of an upload under way; 0: there is none
 
     def answers(self, message: Message, home: tuple[int, int, int]) -> list[Message] | None:
-        """Return the answers to a message; None for one that is not about a mission.
-
-        Args:
-            message: Whatever came.
-            home: Latitude and longitude [1e-7 degrees], altitude above mean sea level [mm].
-        """
+        """Return the answers to a message; None for one that is not about a mission."""
         kind = message.get_type()
         if getattr(message, "mission_type", 0) != 0:
             return None
@@ -245,12 +240,7 @@ PX4: Final[dict[str, tuple[float, int]]] = {
 
 
 class ParameterTable:
-    """The values, and the lists that are being sent.
-
-    Args:
-        standard: Value and ``MAV_PARAM_TYPE`` by name.
-        bytewise: How integers are encoded.
-    """
+    """The values, and the lists that are being sent."""
 
     def __init__(self, standard: Mapping[str, tuple[float, int]], *, bytewise: bool) -> None:
         self._kinds = {name: kind for name, (_, kind) in standard.items()}

@@ -22,10 +22,9 @@ from typing import Final
 from skyloop.clock import monotonic_ns
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
-from skyloop.vehicles.emulation.datagrams import ByteServer
+from skyloop.vehicles.emulation.datagrams import ByteServer, Loop
 from skyloop.vehicles.emulation.emulator import Emulator, RunningEmulator
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
-from skyloop.vehicles.emulation.loop import Loop
 from skyloop.vehicles.msp.emulator.board import PORT, Board, BoardSettings, with_racers
 from skyloop.vehicles.msp.wire.frames import Parser, encode
 
@@ -117,20 +116,12 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The real port, where 0 was asked for."""
         return self._started.port
 
     @property
     def board(self) -> Board:
-        """The running flight controller, for tests; it belongs to its thread.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The running flight controller, for tests; it belongs to its thread."""
         return self._started.board
 
     @property

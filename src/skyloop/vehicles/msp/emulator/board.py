@@ -169,11 +169,6 @@ class Board:
     """One flight controller. Not thread-safe. Used on the loop's thread.
 
     ``received``: sticks that came, in the order roll, pitch, yaw, throttle, AUX; ``frames``: how many.
-
-    Args:
-        vehicle: What it flies.
-        settings: How it is set up.
-        now_ns: When it is switched on.
     """
 
     def __init__(self, vehicle: Vehicle, settings: BoardSettings, now_ns: int) -> None:

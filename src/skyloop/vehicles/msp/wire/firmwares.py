@@ -40,11 +40,7 @@ class Rates:
 
 
 def betaflight_rates(payload: bytes) -> Rates:
-    """Read Betaflight's ``RC_TUNING``, from API 1.43 on with the kind of rates.
-
-    Raises:
-        DecodeError: It is too short.
-    """
+    """Read Betaflight's ``RC_TUNING``, from API 1.43 on with the kind of rates. Raises :class:`DecodeError`."""
     if len(payload) < 14:
         raise DecodeError(f"RC_TUNING of {len(payload)} bytes: 14 are the least")
     number = payload[22] if len(payload) > 22 else 0
@@ -108,12 +104,7 @@ def _quick(rates: AxisRates) -> Curve:
 
 
 def inav_curve(expo: int, full: float) -> Curve:
-    """Return INAV's curve: what a stick comes to.
-
-    Args:
-        expo: 0 to 100.
-        full: What a full stick comes to, in any unit.
-    """
+    """Return INAV's curve by its expo (0 to 100) and what a full stick comes to, in any unit."""
     return lambda stick: full * _bent(stick, expo / 100, 3)
 
 
@@ -227,13 +218,7 @@ ARMED_OF_INAV: Final = 1 << 2  #: among the flags of INAV's status
 
 
 def flag_names(variant: str, flags: int, count: int) -> list[str]:
-    """Return what keeps it from arming, by the firmware's own names.
-
-    Args:
-        variant: The firmware's four letters.
-        flags: A bit each.
-        count: How many flags its version has, as it reports; 0: not known.
-    """
+    """Return what keeps it from arming, a bit each, by the firmware's own names; ``count`` flags, 0: not known."""
     names = []
     for bit in range(32):
         if not flags >> bit & 1:

@@ -31,17 +31,11 @@ _V2: Final = struct.Struct("<BHH")
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame.
+    """One frame."""
 
-    Args:
-        function: 0 to 65535; from 255 on only version 2 can say it.
-        payload: At most 65535 bytes.
-        direction: Who speaks.
-    """
-
-    function: int
-    payload: bytes = b""
-    direction: Direction = Direction.REQUEST
+    function: int  #: 0 to 65535; from 255 on only version 2 can say it
+    payload: bytes = b""  #: at most 65535 bytes
+    direction: Direction = Direction.REQUEST  #: who speaks
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -74,15 +68,7 @@ def xor(data: bytes) -> int:
 
 
 def encode(frame: Frame, *, version: int | None = None) -> bytes:
-    """Return the bytes of a frame.
-
-    Args:
-        frame: To be sent.
-        version: 1 or 2; None: the lowest that can say it.
-
-    Raises:
-        ValueError: That version can't say it.
-    """
+    """Return the bytes of a frame, in the lowest version that can say it unless one is given. Raises ``ValueError``."""
     function, payload = frame.function, frame.payload
     if not 0 <= function <= LARGEST or len(payload) > LARGEST:
         raise ValueError(f"function {function} with {len(payload)} bytes does not fit into a frame")

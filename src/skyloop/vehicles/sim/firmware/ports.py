@@ -31,11 +31,7 @@ _reserved: set[tuple[str, int]] = set()  # instances of this process that may no
 
 
 def bound(kind: socket.SocketKind, port: int = 0) -> socket.socket:
-    """Return a socket that is bound to a port of this computer alone; 0: any free one.
-
-    Raises:
-        OSError: The port is taken.
-    """
+    """Return a socket that is bound to a port of this computer alone; 0: any free one."""
     made = socket.socket(socket.AF_INET, kind)
     try:
         if kind is socket.SOCK_STREAM:
@@ -133,11 +129,7 @@ class Apart:
         return OPTION + ",".join(map(str, (*self.descriptors, *self._ports)))
 
     def receive_socket(self) -> socket.socket:
-        """Return the UDP socket that the newest keeper made; the caller closes it.
-
-        Raises:
-            OSError: There is no new one.
-        """
+        """Return the UDP socket that the newest keeper made; the caller closes it. OSError: there is no new one."""
         newest = None
         with suppress(BlockingIOError):
             while descriptors := socket.recv_fds(self._ours, 1, 1)[1]:
@@ -198,8 +190,7 @@ def _carry(source: socket.socket, sink: socket.socket) -> None:
 def leave_network() -> None:
     """Move this process into a new network that has nothing but a loopback.
 
-    Raises:
-        OSError: That is not allowed: it takes root, or a kernel that lets everybody make user namespaces.
+    That takes root, or a kernel that lets everybody make user namespaces: else it raises OSError.
     """
     if sys.platform != "linux":
         raise OSError("there are networks of one's own on Linux only")

@@ -204,17 +204,7 @@ def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
 
 
 def find_program(variable: str, names: Sequence[str], what: str, where: str) -> str:
-    """Return the path of a firmware's program.
-
-    Args:
-        variable: The environment variable that has it, if it is set.
-        names: What it is called on the search path.
-        what: The firmware, for people.
-        where: Where its program comes from, for people.
-
-    Raises:
-        UsageError: There is none.
-    """
+    """Return the path of a firmware's program: what the variable names, or one of these names on the search path."""
     given = os.environ.get(variable)
     if given:
         path = Path(given).expanduser()

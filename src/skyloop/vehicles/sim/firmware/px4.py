@@ -65,16 +65,7 @@ _UNKNOWN_COURSE: Final = 65535
 
 
 class Px4(CoupledFirmware):
-    """PX4, flying a simulated drone. See :class:`CoupledFirmware`.
-
-    Args:
-        on_event: See :class:`CoupledFirmware`.
-        folder: The same.
-        instruments: Of the vehicle.
-
-    Raises:
-        MissingExtraError: pymavlink is not installed.
-    """
+    """PX4, flying a simulated drone. See :class:`CoupledFirmware`."""
 
     NAME: ClassVar[str] = "PX4"
     IN_STEP: ClassVar[bool] = True

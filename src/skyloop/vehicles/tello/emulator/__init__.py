@@ -33,9 +33,8 @@ from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import Limits, VehicleParameters
 from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
-from skyloop.vehicles.emulation.encoders import Encoder, Format, require_encoder
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
-from skyloop.vehicles.emulation.video import OneCamera, Piece, VideoEncoding
+from skyloop.vehicles.emulation.video import Encoder, Format, OneCamera, Piece, VideoEncoding, require_encoder
 from skyloop.vehicles.tello.emulator.logic import TelloLogic
 from skyloop.vehicles.tello.emulator.telemetry import MOST
 from skyloop.vehicles.tello.wire import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, PORT, Sdk, pieces
@@ -284,18 +283,10 @@ class TelloFirmware(Emulator[RunningFirmware]):
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The real port, where 0 was asked for."""
         return self._started.port
 
     @property
     def logic(self) -> TelloLogic:
-        """The state of the running firmware, for tests; it belongs to its thread.
-
-        Raises:
-            UsageError: It is not started.
-        """
+        """The state of the running firmware, for tests; it belongs to its thread."""
         return self._started.logic

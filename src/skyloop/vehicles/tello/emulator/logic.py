@@ -68,13 +68,7 @@ _FULL_TURN: Final = 360  # the most of a turn from 2.0 on
 
 
 def numbers_of(name: str, words: list[str], sdk: Sdk) -> list[int] | str:
-    """Return the numbers of a command, or what the Tello answers instead of executing it.
-
-    Args:
-        name: The command.
-        words: What follows it.
-        sdk: The version that is emulated.
-    """
+    """Return the numbers of a command, or what the Tello answers instead of executing it."""
     _, ranges = NUMBERS[name]
     if len(words) != len(ranges):
         return "error"

@@ -28,12 +28,7 @@ class Sighting:
 
 
 def seen(pads: Mapping[int, tuple[float, float]], truth: VehicleTruth) -> Sighting | None:
-    """Return the nearest pad in view.
-
-    Args:
-        pads: x and y in world axes [m], by number.
-        truth: The drone as it is.
-    """
+    """Return the nearest pad in view, of those at x and y in world axes [m], by number."""
     x, y, z = truth.position_m
     if not LOWEST_M <= z <= HIGHEST_M:
         return None
@@ -98,11 +93,7 @@ def state_string(snapshot: Snapshot, sdk: Sdk) -> bytes:
 
 
 def answer(question: str, snapshot: Snapshot) -> str:
-    """Return the answer to a question about the state.
-
-    Raises:
-        KeyError: The question is not about the state.
-    """
+    """Return the answer to a question about the state; raises ``KeyError`` for another one."""
     values = fields(snapshot)
     answers = {
         "battery?": values["bat"],
