@@ -41,17 +41,20 @@ class VehicleState:
     amsl_m: float | None  #: altitude above mean sea level
     remote: bool = False  #: a remote control is there and received, as far as the vehicle reports it
     heartbeat_ns: int = 0  #: when its newest heartbeat came, which says whether it is armed
+    tells_landed: bool = False  #: it reports by itself whether it stands, if not at present
 
     @property
     def airborne(self) -> bool | None:
         """Whether it is off the ground under its own power; None while that can't be known.
 
-        An armed vehicle that reports neither that nor its height, as when it was just found again, may well be flying.
+        An armed vehicle that reports neither that nor its height, as when it was just found again, may well be flying;
+        so may a low one that is about to say so itself.
         """
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False
         if self.landed is Landed.UNKNOWN:
-            return None if self.altitude_m is None else self.altitude_m > AIRBORNE_M
+            high = None if self.altitude_m is None else self.altitude_m > AIRBORNE_M
+            return None if self.tells_landed and not high else high
         return True
 
     @property
@@ -239,6 +242,7 @@ class Telemetry:
             amsl_m=self.amsl_m(now_ns),
             remote=self.remote(now_ns),
             heartbeat_ns=self._newest["HEARTBEAT"][1] if "HEARTBEAT" in self._newest else 0,
+            tells_landed="EXTENDED_SYS_STATE" in self._newest,
         )
 
 
