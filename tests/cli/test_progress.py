@@ -21,8 +21,6 @@ from skyloop.cli.install import EXTRAS
 from skyloop.cli.text import console as skyloop_console
 from skyloop.cli.text import named
 from skyloop.vehicles.video.v4l2 import CameraDevice, cameras, described
-from tests.cli.conftest import FAST_SIM, Run
-from tests.processes.conftest import Process, in_terminal
 from tests.support.commands import FAST_SIM, Run
 from tests.support.processes import Process, in_terminal
 

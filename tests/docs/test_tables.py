@@ -25,8 +25,6 @@ from skyloop.vehicles.ros2 import options as ros2_options
 from skyloop.vehicles.sim import options as sim_options
 from skyloop.vehicles.tello import options as tello_options
 from skyloop.vehicles.video import driver as video_options
-from skyloop.vehicles.video import options as video_options
-from tests.docs.pages import ROOT, rows, section
 from tests.support.pages import ROOT, rows, section
 
 

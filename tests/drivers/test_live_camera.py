@@ -21,8 +21,6 @@ from skyloop.messages import EventKind, Intrinsics
 from skyloop.pyav import new_decoder
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.emulation.video import Encoded, Encoder, Format
-from tests.drivers.mavlink.film import FPS, GROUP, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
-from tests.drivers.mavlink.rtsp_server import HOST, RtpPacker, RtspServer
 from tests.support.film import FPS, GROUP, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
 from tests.support.rtsp_server import HOST, RtpPacker, RtspServer, free_port
 

@@ -17,7 +17,6 @@ from skyloop.drivers.live_container import HOPELESS_S, STRICT_S, LiveDecoder, Pi
 from skyloop.drivers.live_frames import Coded
 from skyloop.errors import UnsupportedError
 from skyloop.vehicles.emulation.video import Encoder, Format
-from tests.drivers.mavlink.film import FPS, GROUP, HEIGHT, WIDTH, Film
 from tests.support.film import FPS, GROUP, HEIGHT, WIDTH, Film
 
 av = pytest.importorskip("av")

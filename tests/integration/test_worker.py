@@ -13,9 +13,6 @@ from skyloop.client.drone import open_drone
 from skyloop.client.publishing import Membership
 from skyloop.errors import NameTakenError, UnknownNameError, UsageError
 from skyloop.extend import join_processor
-from tests.client.scripted import QUICK
-from tests.integration.fake_vehicle import FakeVehicle
-from tests.integration.test_inprocess import WAIT_S, Node
 from tests.support.fake_vehicle import WAIT_S, FakeVehicle, Node
 from tests.support.scripted_proxy import QUICK
 

@@ -18,7 +18,6 @@ from skyloop.vehicles.ardrone.emulator.video import MP4_360P
 from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame
 from skyloop.vehicles.emulation.video import Encoder
-from tests.drivers.ardrone.video_ports import LONG, SHORT, Digest, digest, frames, pieces, recording, true_pictures
 from tests.vehicles.ardrone.video_ports import LONG, SHORT, Digest, digest, frames, pieces, recording, true_pictures
 
 NAMES = st.sampled_from((LONG, SHORT))

@@ -413,6 +413,18 @@ def test_a_px4_at_rest_is_not_lost_and_one_in_the_air_is() -> None:
     assert "the vehicle does not know where it is" in bench.texts
 
 
+def test_a_px4_that_lifts_off_is_not_lost_by_what_it_told_at_rest() -> None:
+    """A real one reports its estimator once a second: the newest report is from before, up to 0.33 s were seen."""
+    bench = Bench(Vehicle(PX4)).found()
+    bench.vehicle.flags = 0x9F
+    bench.go_on(2.0)
+    bench.flying("AUTO.TAKEOFF", 0.3)
+    bench.go_on(0.5)
+    bench.vehicle.flags = 0x1F
+    bench.go_on(3.0)
+    assert "the vehicle does not know where it is" not in bench.texts
+
+
 def test_an_arducopter_that_assumes_its_place_is_lost_at_rest_too() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     bench.vehicle.flags = 0x9F

@@ -611,6 +611,29 @@ def test_who_is_found_again_in_the_air_does_not_stand_before_it_says_so(autopilo
 
 
 @AUTOPILOTS
+def test_who_is_found_again_low_above_the_ground_has_not_landed_before_it_says_so(autopilot: int) -> None:
+    """A real PX4's position came before its landed state: ``land()`` returned 3.6 s before it stood."""
+    bench = steering(autopilot)
+    bench.apply(Land())
+    bench.vehicle.mode = LAND[autopilot][0]
+    bench.go_on(1.0)
+    bench.go_on(4.0, silent=True)
+    bench.vehicle.place = (0.0, 0.0, -0.2)
+    bench.said.clear()
+    bench.sink.feedbacks.clear()
+    for _ in range(20):
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        bench.hear(bench.vehicle.heartbeat(), bench.vehicle.telemetry()[0], bench.vehicle.telemetry()[-1])
+        bench.tick()
+    assert {each.state for each in bench.sink.feedbacks} == {FlightState.UNKNOWN}
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) not in bench.commands()
+    bench.vehicle.landed = Landed.ON_GROUND
+    bench.go_on(0.5)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) in bench.commands()
+
+
+@AUTOPILOTS
 def test_an_armed_one_that_tells_nothing_of_the_ground(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot))
     bench.vehicle.armed = True

@@ -25,7 +25,6 @@ from skyloop.messages import Hover, LinkState
 from skyloop.pyav import new_decoder
 from skyloop.vehicles.ardrone.wire.pave import PaveParser
 from skyloop.vehicles.video.v4l2 import cameras, described
-from tests.recordings import recorded
 from tests.support.recordings import recorded
 
 LONG, TORN = "ardrone2/video-8s.pave", "ardrone2/video-64-byte-headers.pave"

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.clock import NS_PER_S, seconds
+from skyloop.clock import NS_PER_S, nanoseconds, seconds
 from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.feedback import EarthOrigin
@@ -41,17 +41,20 @@ class VehicleState:
     amsl_m: float | None  #: altitude above mean sea level
     remote: bool = False  #: a remote control is there and received, as far as the vehicle reports it
     heartbeat_ns: int = 0  #: when its newest heartbeat came, which says whether it is armed
+    tells_landed: bool = False  #: it reports by itself whether it stands, if not at present
 
     @property
     def airborne(self) -> bool | None:
         """Whether it is off the ground under its own power; None while that can't be known.
 
-        An armed vehicle that reports neither that nor its height, as when it was just found again, may well be flying.
+        An armed vehicle that reports neither that nor its height, as when it was just found again, may well be flying;
+        so may a low one that is about to say so itself.
         """
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False
         if self.landed is Landed.UNKNOWN:
-            return None if self.altitude_m is None else self.altitude_m > AIRBORNE_M
+            high = None if self.altitude_m is None else self.altitude_m > AIRBORNE_M
+            return None if self.tells_landed and not high else high
         return True
 
     @property
@@ -212,6 +215,7 @@ class Telemetry:
             amsl_m=self.amsl_m(now_ns),
             remote=self.remote(now_ns),
             heartbeat_ns=self._newest["HEARTBEAT"][1] if "HEARTBEAT" in self._newest else 0,
+            tells_landed="EXTENDED_SYS_STATE" in self._newest,
         )
 
 
@@ -361,6 +365,7 @@ _PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
 _EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 _PLACE: Final = 0x10 | 0x08
 _LOST: Final = 0x80
+_RISEN_NS: Final = nanoseconds(1.5)  #: after lift-off no report is from before it: a PX4 sends one a second
 
 
 class HealthMonitor:
@@ -370,6 +375,7 @@ class HealthMonitor:
         self._texts = Texts()
         self._reported: dict[str, bool] = {}
         self._reasons: set[str] = set()  # why it can't be armed, as told while it wakes up
+        self._airborne_ns: int | None = None  # since when it is in the air
 
     @property
     def was_ready(self) -> bool:
@@ -405,11 +411,16 @@ class HealthMonitor:
         if gps is not None:
             good = gps.fix_type >= GOOD_FIX
             events += self._changed("gps", good, "the vehicle's GPS has a fix", "the vehicle's GPS has no fix")
+        if vehicle is None or not vehicle.airborne:
+            self._airborne_ns = None
+        elif self._airborne_ns is None:
+            self._airborne_ns = now_ns
+        risen = self._airborne_ns is not None and now_ns - self._airborne_ns >= _RISEN_NS
         for kind in _EKF:
             ekf = telemetry.newest(kind, now_ns, SLOW_S)
             if ekf is not None:
                 # A PX4 at rest assumes that it stands still, and says so; only in the air does that mean it is lost.
-                counts = kind != "ESTIMATOR_STATUS" or (vehicle is not None and vehicle.airborne)
+                counts = kind != "ESTIMATOR_STATUS" or risen
                 good = bool(ekf.flags & _PLACE) and not (counts and ekf.flags & _LOST)
                 events += self._changed(
                     "ekf", good, "the vehicle knows where it is", "the vehicle does not know where it is"
