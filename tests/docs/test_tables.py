@@ -7,8 +7,8 @@ import tomllib
 from types import ModuleType
 
 import pytest
+from doc_tables import PAGES, made
 
-from scripts.doc_tables import PAGES, made
 from skyloop.cockpit.server import _LARGEST_MESSAGE
 from skyloop.drivers.uri import parse_uri
 from skyloop.proxy.relay import MAX_ANNOTATION

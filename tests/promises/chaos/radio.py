@@ -139,6 +139,7 @@ class Radio:
             return []
         with suppress(BlockingIOError):
             self._received += os.read(self._serial, _MOST)
+        self._left_ns = monotonic_ns()  # not before: until it reads, this process may be put off while more comes
         return list(frames_of(self._received))
 
     def _up(self, frame: bytes) -> None:
