@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -48,7 +48,7 @@ def attempts() -> str:
     return table(("tries to", *COLUMNS.values()), rows)
 
 
-def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     """A table of Markdown."""
     lines = ["|".join(f" {cell} " if cell else " " for cell in row) for row in (head, *rows)]
     return "\n".join([f"|{lines[0]}|", "|" + "---|" * len(head), *(f"|{line}|" for line in lines[1:])])

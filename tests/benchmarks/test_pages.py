@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -18,7 +19,7 @@ from benchmarks.tracking import TrackingResults
 from skyloop.cli.app import build as build_skyloop
 from skyloop.errors import UsageError
 
-PAGES = {
+PAGES: Mapping[str, tuple[Path, Callable[[], Mapping[str, str]]]] = {
     "delays": (delays.PAGE, lambda: delays.blocks(delays.MEASURED)),
     "network": (network.LOSS_PAGE, lambda: network.loss_blocks(network.MEASURED)),
     "network, scale": (network.SCALE_PAGE, lambda: network.scale_blocks(network.MEASURED)),
