@@ -204,7 +204,7 @@ class ExternalPose:
 
 
 class Driver(ABC):
-    """Base class of drivers: owns the life cycle; a subclass writes ``_open``, ``_close`` and ``_apply``.
+    """Base class of drivers: owns the life cycle; a subclass writes what is abstract and, if it flies, ``_apply``.
 
     No I/O happens before :meth:`open`. Times given to the sink are ``time.monotonic_ns`` of this host. ``_open(sink)``
     starts threads and waits for nothing, ``_close()`` joins them and forgets what was in force, and ``_apply(action)``

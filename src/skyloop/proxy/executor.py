@@ -1,6 +1,6 @@
 """Carries actions out: what the vehicle takes goes to its driver, the rest to the software autopilot, and a return.
 
-Not thread-safe: the command handler's lock is held around every call, which keeps the driver's calls one at a time.
+Not thread-safe: the command handler's lock is held around every call. Parameters and external poses go past it.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ class ActionExecutor:
         self._driver = driver
         self._left_to = ""  # as the driver said last
         self.unsaid: Exception | None = None  #: why it did not say; the tick clears and raises it
-        self._vehicle = publisher
+        self._publisher = publisher
         self.gave_up = ""  #: why the vehicle refused to go on with a software take-off; the reader clears it
 
     @property
     def state(self) -> FlightState:
         """The flight state now, which may be newer than the last feedback."""
-        return self.flight.state(self._vehicle.reported_state)
+        return self.flight.state(self._publisher.reported_state)
 
     @property
     def airborne(self) -> bool:
@@ -77,7 +77,7 @@ class ActionExecutor:
 
     def seen(self, now_ns: int) -> Snapshot:
         """What is known of the vehicle now."""
-        vehicle = self._vehicle
+        vehicle = self._publisher
         state = self.flight.state(vehicle.reported_state)
         return Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
 
@@ -88,17 +88,17 @@ class ActionExecutor:
             self._left_to = shortened(left_to, MAX_LINK_TEXT // 2) if left_to else ""
         except Exception as error:  # noqa: BLE001  the failsafe comes first, whatever the driver's code does
             self.unsaid = error
-        return self.flight.observe(self._vehicle.reported_state, self._left_to, now_ns, self._shown(now_ns))
+        return self.flight.observe(self._publisher.reported_state, self._left_to, now_ns, self._shown(now_ns))
 
     def _shown(self, now_ns: int) -> Feedback | None:
         """The newest sample, where it shows how the vehicle is now."""
-        feedback = self._vehicle.feedback_now if self._vehicle.link_up else None
+        feedback = self._publisher.feedback_now if self._publisher.link_up else None
         return feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
 
     @property
     def stands(self) -> bool:
         """Whether the vehicle stands on the ground by its own word, whatever the software autopilot is about to do."""
-        return self._vehicle.reported_state is FlightState.LANDED
+        return self._publisher.reported_state is FlightState.LANDED
 
     def stop_autopilot(self) -> None:
         """Stop the software autopilot because others steer."""
@@ -136,7 +136,7 @@ class ActionExecutor:
         try:
             self.execute(action, now_ns, new=False)
         except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
-            self._vehicle.driver_failed(where, error)
+            self._publisher.driver_failed(where, error)
             return False
         return True
 
@@ -147,7 +147,7 @@ class ActionExecutor:
             try:
                 taken = self._driver.failsafe(action)
             except Exception as error:  # noqa: BLE001  it is reported, and tried again
-                self._vehicle.driver_failed("failsafe", error)
+                self._publisher.driver_failed("failsafe", error)
             if taken and self.autopilot is not None:
                 self.autopilot.stop(action.name)
             elif self.autopilot is not None:
@@ -173,29 +173,29 @@ class ActionExecutor:
         try:
             self._driver.apply(last)
         except Exception as error:  # noqa: BLE001  it is reported, and there is nothing else to do
-            self._vehicle.driver_failed("failsafe", error)
+            self._publisher.driver_failed("failsafe", error)
 
     def step(self, now_ns: int) -> AnyAction | None:
         """Let the software autopilot steer, if it is on; returns what it made the driver apply."""
         if self.autopilot is None:
             return None
-        action = self.autopilot.step(now_ns, self._shown(now_ns), self._vehicle.reported_state)
+        action = self.autopilot.step(now_ns, self._shown(now_ns), self._publisher.reported_state)
         if action is None:
             return None
         try:
             return self._driver.apply(action)
         except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
-            self._vehicle.driver_failed("autopilot", error)
+            self._publisher.driver_failed("autopilot", error)
             if isinstance(error, DriverError):
                 before = self.autopilot.mode
-                self.autopilot.refused(self._vehicle.reported_state)
+                self.autopilot.refused(self._publisher.reported_state)
                 self.gave_up = str(error) if self.autopilot.mode is not before else ""
             return None
 
     def _start(self, action: AnyAction, now_ns: int) -> None:
         assert self.autopilot is not None
         assert isinstance(action, Takeoff | Hover | Land | Velocity | Position)
-        self.autopilot.start(action, now_ns, self._vehicle.feedback_now)
+        self.autopilot.start(action, now_ns, self._publisher.feedback_now)
 
 
 class ReturnSupervisor:

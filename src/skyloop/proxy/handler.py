@@ -92,7 +92,7 @@ class CommandHandler(FlightSupervisor):
         """Return why ``limits.altitude`` must not be lowered to this height [m] now, for a person; empty if it may."""
         with self._lock:
             flies = self._executor.airborne
-            return self.checks.airspace.ceiling_problem(altitude, self._vehicle.feedback_now) if flies else ""
+            return self.checks.airspace.ceiling_problem(altitude, self._publisher.feedback_now) if flies else ""
 
     def problem_with_moment(self) -> str:
         """Return why the vehicle must not do something once now, such as a flip, for a person; empty if it may."""
@@ -146,7 +146,7 @@ class CommandHandler(FlightSupervisor):
             self.authority.holder is None
             and self.ladder.idle
             and not self.flight.ours
-            and self._vehicle.link_breaks == self._breaks_seen
+            and self._publisher.link_breaks == self._breaks_seen
             and not self._executor.airborne
         )
 
@@ -222,7 +222,7 @@ class CommandHandler(FlightSupervisor):
         """Return what was applied, and when: the time of receipt for a command that was refused."""
         # Each call of a function costs microseconds on a machine that was idle, and a command comes when it was: an
         # ordinary command is received, decided and executed here; what went wrong is put into words elsewhere.
-        vehicle, checks, flight = self._vehicle, self.checks, self.flight
+        vehicle, checks, flight = self._publisher, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
         if flight.whose is not Whose.OURS:
@@ -338,7 +338,7 @@ class CommandHandler(FlightSupervisor):
         try:
             applied = self._executor.execute(command.action, now_ns)
         except Exception as error:  # noqa: BLE001  it is reported, and the repeats try again
-            why = self._vehicle.driver_refused("emergency_stop", error)
+            why = self._publisher.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         if in_time and self.holds(session, command.lease):
             self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent meanwhile

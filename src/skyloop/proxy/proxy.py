@@ -1,7 +1,7 @@
 """The proxy: one vehicle's driver made a node that any number of applications see and one at a time flies.
 
-Threads: the transport's receiving thread carries commands out, the driver's threads publish what they receive, a ticker
-at 50 Hz updates authority, failsafe and software autopilot, and one thread answers requests that may ask the driver.
+Threads: the transport's carries out commands and poses, the driver's publish, a ticker (50 Hz) updates authority,
+failsafe and autopilot, another answers requests. The driver's flying calls hold the handler's lock, ``end``'s too.
 """
 
 from __future__ import annotations

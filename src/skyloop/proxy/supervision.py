@@ -101,7 +101,7 @@ class FlightSupervisor:
         self._back = ReturnSupervisor(self.checks, self.ladder, executor)
         self._lock = threading.RLock()
         self._executor = executor
-        self._vehicle = publisher
+        self._publisher = publisher
         self._events = events
         self._counts = counters.counts
         self._delays_ns = counters.delays_ns
@@ -175,7 +175,7 @@ class FlightSupervisor:
         Intents end when it breaks and when it is back, so that nothing asked for in between is done later. Hover is
         given both times: a driver must not go on with an old set-point. A pilot's landing lasts, as nothing is safer.
         """
-        breaks = self._vehicle.link_breaks
+        breaks = self._publisher.link_breaks
         if breaks == self._breaks_seen:
             return
         self._breaks_seen = breaks
@@ -183,7 +183,7 @@ class FlightSupervisor:
         if landing is None or (landing.automatic and not landing.begun):
             self._start_over(Fate.LINK, now_ns)
             return
-        if landing.begun or self._vehicle.link_up:
+        if landing.begun or self._publisher.link_up:
             self.ladder.land_on(now_ns)
         else:
             self.ladder.hand_over(now_ns)
@@ -195,7 +195,7 @@ class FlightSupervisor:
         A landing that the ladder ordered leaves what is found in the air to others at once: nobody is there to say
         whose it is. After all else that is given up it does so when the vehicle is heard, as its pilot may be there.
         """
-        if self._vehicle.link_up:
+        if self._publisher.link_up:
             self._heard_ns = now_ns
             return
         ladder, asked = self.ladder, self._asked(Hover, Land)
@@ -229,7 +229,7 @@ class FlightSupervisor:
     def _observe_position(self, now_ns: int) -> None:
         """Note where the vehicle is, and hover where that jumped: what was asked for meant another place."""
         airspace = self.checks.airspace
-        airspace.observe(self._vehicle.feedback_now)
+        airspace.observe(self._publisher.feedback_now)
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
@@ -292,7 +292,7 @@ class FlightSupervisor:
         if not intent.over:
             if state is not intent.state:
                 self._look(now_ns)  # a landing may be others': then that is what ended it
-            feedback = self._vehicle.feedback_now
+            feedback = self._publisher.feedback_now
             intent.observe(state, now_ns, None if feedback is None else feedback.captured_ns)
             if intent.over:
                 self._tell(session)
@@ -323,7 +323,7 @@ class FlightSupervisor:
 
     def _tell(self, session: Session) -> None:
         """Let feedback tell what became of an application's newest intent: soon where it ended."""
-        self._vehicle.tell(session.intents.newest, session.app_id, session.name)
+        self._publisher.tell(session.intents.newest, session.app_id, session.name)
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
         """Publish what the proxy itself made the vehicle do."""
@@ -381,7 +381,7 @@ class FlightSupervisor:
         """Let feedback show who is in command, the failsafe's step and whose the flight is."""
         authority, flight = self.authority, self.flight
         owner = authority.holder or authority.silent
-        self._vehicle.stamp(
+        self._publisher.stamp(
             {
                 "owner": name_of(self._sessions, owner.app_id) if owner is not None else None,
                 "owner_id": owner.app_id if owner is not None else 0,
@@ -407,7 +407,7 @@ class FlightSupervisor:
         if self._left:
             return []
         ladder, flight = self.ladder, self.flight
-        if self._vehicle.link_up and ladder.given_up:
+        if self._publisher.link_up and ladder.given_up:
             flight.forget()
         seen = self._look(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:

@@ -17,11 +17,11 @@ from typing import Final, NamedTuple
 from skyloop.clock import NS_PER_S, seconds
 from skyloop.messages import AnyAction, Attitude, Feedback, Hover, Position, Refusal, Takeoff, Velocity
 from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
+from skyloop.proxy.core.flight import STALE_NS
 from skyloop.proxy.core.settings import ALTITUDE_GAIN, SLACK_M, AirspaceSettings, Clamp, Limits
 from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665
-STALE_NS: Final = NS_PER_S // 2  #: a vehicle whose feedback is older has no position
 LOST_NS: Final = 2 * NS_PER_S  #: a position that is older is not waited for
 BLIND_M: Final = 0.5  #: between walls a vehicle flies to a place at most so far without a new position
 #: A position that changes by more than this, and more than can have been flown since, has jumped.

@@ -52,7 +52,7 @@ class FailsafeInputs:
     state: FlightState
     airborne: bool
     last_command_ns: int  #: when the last valid command came, whoever held the authority then
-    pilot: str  #: ``held``, or why nobody holds the authority: ``released``, ``silent``, ``gone``, ``none``
+    pilot: str  #: ``held``, or why nobody does: ``released``, ``silent``, ``gone``, ``expired``, ``none``
     link_up: bool  #: hop proxy–vehicle
     battery: float | None
     ours: bool = True  #: the flight was begun, or taken, by an application of this proxy
@@ -90,7 +90,7 @@ Effect = StepChange | BatteryLow | FailsafeAction
 def due(
     now_ns: int, inputs: FailsafeInputs, settings: FailsafeSettings, *, barred: str, battery_low: bool
 ) -> tuple[Failsafe, str]:
-    """Return the step that is due for a flight of ours, and why: the whole ladder.
+    """Return the step that is due for a flight of ours, and why, by time, battery and link.
 
     ``battery_low``: it is below the charge to return at, and the pilot has not taken over for that.
     """
