@@ -352,13 +352,18 @@ def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
     ],
 )
 def test_what_others_fly_is_left_to_them_at_the_end(
-    proxy: ScriptedProxy, drone: Drone, take: Callable[[ScriptedProxy], None], told: str
+    proxy: ScriptedProxy,
+    drone: Drone,
+    take: Callable[[ScriptedProxy], None],
+    told: str,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     take(proxy)
     drone.wait(lambda f: f.others is not None or drone.authority.state == "preempted", WAIT_S)
     steps: list[str] = []
     assert drone._piloting.end_flight(steps.append) is None
     assert steps == [told]
+    assert ("nobody lands it" in caplog.text) == ("RTL" in told)
     assert {action.name for action in proxy.actions()} <= {"idle"}
 
 

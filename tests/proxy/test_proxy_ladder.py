@@ -267,6 +267,67 @@ def test_a_hover_that_is_given_up_ends_in_a_landing_when_its_pilot_leaves(bench:
     assert set(bench.driver.told) == {Land()}
 
 
+def _given_up(bench: Bench) -> App:
+    """A pilot whose vehicle was not heard for 65 s, so that its hover was given up."""
+    pilot = bench.airborne()
+    be_patient(pilot)
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.link(LinkState.LOST, "a dead downlink")
+    in_the_dark(bench, 65, pilot, Idle())
+    assert messages(pilot, "hover_given_up")
+    return pilot
+
+
+def test_a_landing_asked_for_after_the_hover_was_given_up_goes_on_when_the_link_is_back(bench: Bench) -> None:
+    pilot = _given_up(bench)
+    bench.driver.refuses = "busy"
+    pilot.command(Land())
+    in_the_dark(bench, 2, pilot, Land())
+    bench.driver.refuses = ""
+    bench.driver.told.clear()
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(2.0, lambda: pilot.command(Land(), repeat=True))
+    assert set(bench.driver.told) == {Land()}
+
+
+def test_the_ladders_landing_after_a_hover_that_was_given_up_goes_on_when_the_link_is_back(bench: Bench) -> None:
+    pilot = _given_up(bench)
+    for name in ("failsafe.hover_after_s", "failsafe.land_after_s"):
+        pilot.ask(SetParameter(name, 5.0, pilot.lease))
+    pilot.ask(ReleaseAuthority())
+    for _ in range(8):
+        bench.clock.advance(1.0)
+        bench.tick()
+    bench.driver.told.clear()
+    bench.driver.link(LinkState.UP)
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(12.0)
+    assert Land() in bench.driver.told
+    assert bench.proxy.handler.flight.ours
+
+
+def test_a_link_that_comes_back_while_the_ladder_looks_leaves_what_is_found_to_others(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pilot = _given_up(bench)
+    bench.driver.told.clear()
+    inner, back = bench.driver.left_to, []
+
+    def left_to() -> str | None:
+        if not back:
+            back.append(True)
+            bench.driver.link(LinkState.UP)
+            bench.driver.report(state=FlightState.FLYING)
+        return inner()
+
+    monkeypatch.setattr(bench.driver, "left_to", left_to)
+    bench.run(2.0, lambda: pilot.command(Idle(), repeat=True))
+    assert bench.driver.told == []
+    assert bench.proxy.handler.flight.whose is Whose.OTHERS
+
+
 @pytest.mark.parametrize("stays", [True, False])
 def test_what_is_found_after_a_landing_was_given_up_is_left_alone(bench: Bench, stays: bool) -> None:
     """One hover went to whatever was found by then."""

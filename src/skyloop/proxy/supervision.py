@@ -211,7 +211,8 @@ class FlightSupervisor:
             ladder.give_up()
         elif not self.flight.forget():
             return
-        self._events.publish_drafts(given_up_event(what))
+        if what == "landing" or self._executor.airborne:
+            self._events.publish_drafts(given_up_event(what))
         self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
@@ -407,9 +408,11 @@ class FlightSupervisor:
         if self._left:
             return []
         ladder, flight = self.ladder, self.flight
-        if self._publisher.link_up and ladder.given_up:
-            flight.forget()
         seen = self._look(now_ns)
+        # What flew on by the software autopilot's set-points, or is to land meanwhile, is the same flight still.
+        steered = Hover not in self._executor.native
+        if seen.link_up and ladder.given_up and not (ladder.lands or steered) and flight.forget():
+            seen = self._look(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:
             ladder.land_on(now_ns)  # no hover takes its pilot's landing back
         inputs = FailsafeInputs(
@@ -430,12 +433,14 @@ class FlightSupervisor:
         """Do what the ladder decided; return what is to be published then, as each event takes its time."""
         if stamps or any(isinstance(effect, StepChange) for effect in effects):
             self._stamp()
+        drafts = []
         for effect in effects:
             if isinstance(effect, StepChange):
                 if effect.step is not Failsafe.NONE:
                     self._end_intents(Fate.FAILSAFE, self._clock())
+                drafts.append(failsafe_event(effect))
             elif isinstance(effect, BatteryLow):
-                continue
+                drafts.append(battery_event(effect))
             elif isinstance(effect.action, ReturnToStart):
                 self._back.begin(effect.action, now_ns)
                 self.ladder.attempted(True)
@@ -445,5 +450,4 @@ class FlightSupervisor:
                 self.ladder.attempted(taken)
                 if taken:
                     self._echo_own(effect.action, now_ns)
-        drafts = [failsafe_event(one) for one in effects if isinstance(one, StepChange)]
-        return drafts + [battery_event(one) for one in effects if isinstance(one, BatteryLow)]
+        return drafts

@@ -140,6 +140,8 @@ class Autopilot:
 
     def brake(self) -> None:
         """Fly on no longer: the vehicle failed at what was to take the place of this."""
+        if isinstance(self._target, Position) and self._target.yaw is not None:
+            self._hold_yaw = None  # as in `start`: it keeps the yaw that it has reached
         self._target = Velocity()
 
     def refused(self, reported: FlightState) -> None:
