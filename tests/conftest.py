@@ -36,7 +36,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 # Folders whose processes mostly fly. Measuring their coverage would slow flights down and find what others have found.
-FLIGHTS = {"test_bench.py", "benchmarks", "docs", "examples", "processes", "test_demo.py", "third_party"}
+FLIGHTS = {"benchmarks", "docs", "examples", "processes", "third_party", "test_bench.py", "test_demo.py"}
 
 # Folders of which `make test` leaves everything out: promises kept for minutes, under faults, or between several hosts.
 SLOW = {"benchmarks", "faults", "fuzz", "hardware", "hosts", "security", "third_party"}

@@ -30,7 +30,7 @@ class Recorder:
         self.velocities.append(values)
 
     @property
-    def _core(self) -> Self:
+    def _piloting(self) -> Self:
         return self
 
     def let_go(self, reason: str, *, land: bool) -> None:

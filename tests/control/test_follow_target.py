@@ -269,7 +269,7 @@ class Recorder:
         self.attitudes.append(attitude)
 
     @property
-    def _core(self) -> Self:
+    def _piloting(self) -> Self:
         return self
 
     def let_go(self, reason: str, *, land: bool) -> None:

@@ -22,7 +22,7 @@ from tests.support.processes import Process
 
 ROOT = Path(__file__).parents[2]
 OWN = ROOT / ".third-party" / "ray" / "bin" / "python"  #: Ray in an environment of its own, as it is large
-TARGET = f"{ROOT / 'tests' / 'processes' / 'processor.py'}:Marks"
+TARGET = f"{ROOT / 'tests' / 'integration' / 'processes' / 'processor.py'}:Marks"
 
 
 @pytest.fixture

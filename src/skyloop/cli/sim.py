@@ -31,7 +31,7 @@ from skyloop.cli.network import (
     warn_if_open,
 )
 from skyloop.errors import UsageError
-from skyloop.vehicles.sim.options import AutopilotKind
+from skyloop.vehicles.sim.firmware import AutopilotKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -7,7 +7,7 @@ class is registered under the entry-point group ``skyloop.drivers`` with its URI
 
 from __future__ import annotations
 
-import math
+import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -437,9 +437,9 @@ def checked_value(parameter: Parameter, value: Value) -> Value:
         whole = kind is ParameterType.INT
         if isinstance(value, bool) or not isinstance(value, int | float) or (whole and value % 1):
             raise ParameterError(f"{name} takes a {'whole ' * whole}number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
-        low = -math.inf if parameter.minimum is None else parameter.minimum
-        high = math.inf if parameter.maximum is None else parameter.maximum
-        if not (math.isfinite(value) and low <= value <= high):
+        low = -sys.float_info.max if parameter.minimum is None else parameter.minimum
+        high = sys.float_info.max if parameter.maximum is None else parameter.maximum
+        if not low <= value <= high:  # NaN, infinities and ints of any size, too
             raise ParameterError(f"{name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
         return value if whole else float(value)
     if type(value) is not type(parameter.value):

@@ -1197,3 +1197,49 @@ def test_hovering_and_a_failsafe_end_the_way(autopilot: int) -> None:
     bench.go_on(0.4)
     assert set(bench.commands()) == {HOLD[autopilot][1]}
     assert {each.type_mask for each in bench.heard_of(SET_POINT)} <= {0x5C7}
+
+
+@AUTOPILOTS
+def test_what_is_found_armed_on_the_ground_before_it_says_that_it_has_landed_gets_no_set_points(autopilot: int) -> None:
+    """After a hover a velocity upwards went out, and OFFBOARD was asked for, without a take-off."""
+    bench = Bench(Vehicle(autopilot)).found()
+    vehicle = bench.vehicle
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    vehicle.armed, vehicle.status, vehicle.landed = True, 4, Landed.ON_GROUND
+    bench.go_on(1.0)
+    bench.go_on(6.0, silent=True)
+    bench.said.clear()
+    for action in (None, Hover(), Velocity(0.0, 0.0, 0.5)):
+        for step in range(100):
+            bench.clock.advance(0.02)
+            vehicle.boot_ms += 20
+            told = [each for each in vehicle.telemetry() if each.get_type() != "EXTENDED_SYS_STATE"]
+            bench.hear(*([vehicle.heartbeat()] if step % 10 == 0 else []), *told)
+            bench.tick()
+            if action is not None and step == 0:
+                bench.apply(action)
+    assert bench.heard_of("SET_POSITION_TARGET_LOCAL_NED") == []
+
+
+@AUTOPILOTS
+def test_an_autopilot_that_does_not_know_whether_it_has_landed_is_disarmed_by_its_height(autopilot: int) -> None:
+    bench = steering(autopilot)
+    bench.vehicle.landed = Landed.UNKNOWN
+    bench.apply(Land())
+    bench.vehicle.mode, bench.vehicle.place = LAND[autopilot][0], (0.0, 0.0, -0.1)
+    bench.go_on(5.0)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) in bench.commands()
+
+
+@AUTOPILOTS
+def test_a_second_take_off_that_is_cut_disarms_what_the_first_one_armed(autopilot: int) -> None:
+    bench = arming(autopilot)
+    bench.go_on(3.0, silent=True)
+    bench.vehicle.armed = True
+    bench.hear(bench.vehicle.heartbeat())
+    bench.tick()
+    bench.apply(Takeoff())
+    bench.go_on(3.0, silent=True)
+    bench.commands()
+    bench.go_on(1.0)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) in bench.commands()

@@ -213,19 +213,23 @@ def test_a_refused_take_off_is_told_and_over() -> None:
     assert rig.tell() is FlightState.LANDED
 
 
-@pytest.mark.parametrize("offers", [False, True])
-def test_a_robot_that_is_not_landed_stops(offers: bool) -> None:
+@pytest.mark.parametrize("answer", ["no service", "refused", "none"])
+def test_a_robot_that_is_not_landed_stops(answer: str) -> None:
     """One without a watchdog of its own went on with the velocity that it was sent last, and got no other."""
     rig = Rig()
     rig.tell(z=1.0)
     rig.session.command(Velocity(forward=0.5))
-    rig.robot.offers = offers
-    if offers:
+    rig.robot.offers = answer != "no service"
+    if rig.robot.offers:
         rig.session.command(Land())
-        rig.answer(False, "not now")
     else:
         with pytest.raises(DriverError, match="nobody offers"):
             rig.session.command(Land())
+    if answer == "refused":
+        rig.answer(False, "not now")
+    if answer == "none":
+        rig.clock.advance(ANSWER_S + 0.1)
+        rig.session.tick()
     rig.session.tick()
     assert rig.robot.sent[-1] == Velocity()
 

@@ -190,6 +190,8 @@ class SetpointController:
         elif not vehicle.airborne:
             takeoff = TakeoffSequence(self._autopilot, self.takeoff_m, now_ns, disarms=self.goal is Goal.LAND)
             self._end()
+            if now_ns < self._disarms_until_ns:  # what is armed by now, or late, is so by the take-off before
+                takeoff.arm_asked_ns = now_ns
             self.goal, self._takeoff, self._disarms_until_ns = Goal.TAKE_OFF, takeoff, 0
         elif self.goal is not Goal.FOLLOW:
             self._follow(PositionHold(now_ns))
@@ -210,8 +212,8 @@ class SetpointController:
         if vehicle is not None and vehicle.airborne is False:
             if self.goal is not Goal.LAND:  # which goes on to disarm what is armed, or may be any moment
                 self._end()
-        elif alone or vehicle is None:
-            self._end()
+        elif alone or vehicle is None or (vehicle.airborne is None and self.goal is not Goal.FOLLOW):
+            self._end()  # on the ground some would start by a set-point
             self.goal = Goal.HOLD
         elif self.goal is not Goal.FOLLOW or not isinstance(self._setpoint, PositionHold):
             self._follow(PositionHold(now_ns))

@@ -215,7 +215,8 @@ class Telemetry:
             amsl_m=self.amsl_m(now_ns),
             remote=self.remote(now_ns),
             heartbeat_ns=self._newest["HEARTBEAT"][1] if "HEARTBEAT" in self._newest else 0,
-            tells_landed="EXTENDED_SYS_STATE" in self._newest,
+            tells_landed=(told := self.newest("EXTENDED_SYS_STATE", now_ns)) is not None
+            and _LANDED.get(told.landed_state, Landed.UNKNOWN) is not Landed.UNKNOWN,
         )
 
 

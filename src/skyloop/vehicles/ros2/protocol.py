@@ -197,6 +197,8 @@ class RobotSession:
             if self._velocity is not None:
                 self._robot.send(self._velocity)
             if self._pending is not None and now_ns - self._pending.since_ns > nanoseconds(ANSWER_S):
+                if self._pending.state is FlightState.LANDING and self._velocity is None:
+                    self._velocity = Velocity()  # one without a watchdog flies on with its last
                 self._pending = None
         if lost:
             self._lose(LinkState.LOST, silent_s, self._options.odom, self._options.image)

@@ -18,7 +18,6 @@ that speaks to the firmware, ``mavlink://`` or ``msp://``.
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import StrEnum
 from typing import Final
 from urllib.parse import urlencode
 
@@ -28,15 +27,7 @@ from skyloop.errors import UnknownNameError, UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FPV_CAMERA, FRONT_CAMERA, CameraModel
 from skyloop.sim.options import EVERY_ACTION, MOST_LAG_S, SimOptions
 from skyloop.sim.vehicles import VEHICLES
-
-
-class AutopilotKind(StrEnum):
-    """Firmware that can fly a simulated drone, by its name in an address."""
-
-    ARDUPILOT = "ardupilot"
-    BETAFLIGHT = "betaflight"
-    PX4 = "px4"
-
+from skyloop.vehicles.sim.firmware import AutopilotKind
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA, FPV_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
