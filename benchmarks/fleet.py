@@ -39,11 +39,11 @@ from benchmarks.scale import FRAME_PERIOD_S, loopback
 from skyloop.bench import CAMERA, BenchVehicle, Machine, stamped
 from skyloop.client import Drone, connect
 from skyloop.client.drone import Access
+from skyloop.clock import SWITCH_INTERVAL_S
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.host import Host
-from skyloop.host.serve import SWITCH_INTERVAL_S
 from skyloop.messages import AnyAction
 from skyloop.network import FabricSettings
 from skyloop.transport.local.directory import DIRECTORY_VARIABLE

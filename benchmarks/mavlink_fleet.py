@@ -22,11 +22,11 @@ from benchmarks.measuring.workers import Pipe, Worker, Workers
 from skyloop.client import Drone, connect
 from skyloop.client.drone import Access
 from skyloop.client.swarm import Swarm
+from skyloop.clock import SWITCH_INTERVAL_S
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import SkyloopError
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.host import Host
-from skyloop.host.serve import SWITCH_INTERVAL_S
 from skyloop.host.vehicle import SharedVehicle
 from skyloop.messages import Feedback, LinkState, Position
 from skyloop.sim.host import SimHost

@@ -18,6 +18,9 @@ from typing import Final
 Clock = Callable[[], int]
 
 NS_PER_S: Final = 1_000_000_000
+#: After which a thread of a process that serves vehicles hands the interpreter lock over: with Python's 5 ms, each of
+#: many packets in a flood can hold up a command for that long.
+SWITCH_INTERVAL_S: Final = 0.001
 
 monotonic_ns: Clock = time.monotonic_ns
 _BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)

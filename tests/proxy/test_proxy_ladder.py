@@ -313,7 +313,8 @@ def test_a_link_that_comes_back_while_the_ladder_looks_leaves_what_is_found_to_o
 ) -> None:
     pilot = _given_up(bench)
     bench.driver.told.clear()
-    inner, back = bench.driver.left_to, []
+    inner = bench.driver.left_to
+    back: list[bool] = []
 
     def left_to() -> str | None:
         if not back:

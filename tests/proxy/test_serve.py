@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ import pytest
 from skyloop.clock import monotonic_ns
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind, Takeoff
-from skyloop.proxy.serve import serve
+from skyloop.proxy.serve import run, serve
 from skyloop.transport.local import dial
 from tests.proxy.toy_process import Toy
 from tests.support.proxy_bench import WAIT_S, App
@@ -119,3 +120,17 @@ def test_a_descriptor_that_is_not_open_is_refused() -> None:
     os.close(writing)
     with pytest.raises(UsageError, match=f"{reading} is not open"):
         serve("fake://", "toy", parent_fd=reading)
+
+
+def test_a_process_that_serves_hands_the_interpreter_over_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[float] = []
+    monkeypatch.setattr("sys.setswitchinterval", told.append)
+
+    @contextmanager
+    def beside(proxies: object) -> Iterator[None]:
+        raise UsageError("no")
+        yield
+
+    with pytest.raises(UsageError, match="no"):
+        run([], records=False, beside=beside)
+    assert told == [0.001]

@@ -19,6 +19,7 @@ import typer
 
 from skyloop.cli.naming import MULTICAST, keys_directory, network_places
 from skyloop.cli.text import columns
+from skyloop.clock import SWITCH_INTERVAL_S
 from skyloop.errors import UsageError
 from skyloop.files import expand
 
@@ -68,7 +69,6 @@ OPEN: Final = (
 
 #: Makes the transport server of a proxy: of its name and its vehicle's address.
 MakeEnd = Callable[[str, str], "TransportServer"]
-SWITCH_INTERVAL_S: Final = 0.001
 
 
 def settings_of(

@@ -19,7 +19,7 @@ from typing import Final
 
 import msgspec
 
-from skyloop.clock import monotonic_ns
+from skyloop.clock import SWITCH_INTERVAL_S, monotonic_ns
 from skyloop.errors import (
     FileFormatError,
     LinkError,
@@ -40,9 +40,6 @@ from skyloop.toml_file import Place
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
 
-#: The interpreter's lock is handed over after so long: a hundred drivers' threads wait for it beside the one that
-#: receives commands.
-SWITCH_INTERVAL_S: Final = 0.001
 _POLL_S: Final = 0.2
 MAX_REQUEST: Final = 1 << 22  #: bytes, in packets of ``_CHUNK``
 MAX_PACKET: Final = 1 << 16  #: bytes

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
@@ -14,7 +15,7 @@ from types import FrameType
 from typing import Final, TypeVar
 
 from skyloop.child_process import interrupt_deferred, on_parent_end
-from skyloop.clock import monotonic_ns, nanoseconds
+from skyloop.clock import SWITCH_INTERVAL_S, monotonic_ns, nanoseconds
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UsageError
@@ -147,6 +148,7 @@ def run(
     default not for private ones, which are not started again under their name. ``beside``: entered with the proxies
     before they start, and left when they have ended.
     """
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
     records = parent_fd is None if records is None else records
     if audit is not None or records:
