@@ -182,18 +182,8 @@ def test_each_path_is_seen_to_its_end() -> None:
     assert {name: {file.split("/")[0] for _, file, _ in each["path"]} for name, each in paths.items()} == {
         "velocity": {"client", "clock.py", "drivers", "messages", "proxy", "sim", "transport", "vehicles", "zones.py"},
         "frame": {"client", "messages", "proxy", "sim", "transport", "vehicles"},
-        "parameter": {
-            "client",
-            "clock.py",
-            "drivers",
-            "errors.py",
-            "messages",
-            "proxy",
-            "sim",
-            "transport",
-            "vehicles",
-        },
-        "death": {"clock.py", "drivers", "errors.py", "messages", "proxy", "sim", "transport", "vehicles"},
+        "parameter": {"client", "clock.py", "drivers", "messages", "proxy", "sim", "transport", "vehicles"},
+        "death": {"drivers", "messages", "proxy", "sim", "transport", "vehicles"},
     }
 
 
