@@ -20,7 +20,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, with_ardrones
 
 HERE = Path(__file__).parent
-INSTALLED = HERE.parents[1] / ".third-party"
+INSTALLED = HERE.parents[2] / ".third-party"
 PATIENCE_S = 90.0
 
 

@@ -47,7 +47,7 @@ def python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sockets: Path) -> st
         monkeypatch.setenv(variable, str(profile))
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(sockets))
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    monkeypatch.setenv("PYTHONPATH", str(HERE.parents[1] / "src"))
+    monkeypatch.setenv("PYTHONPATH", str(HERE.parents[2] / "src"))
     return python
 
 
