@@ -1144,7 +1144,8 @@ def connect(
         timeout_s: Time for the proxy to answer [s]; None or 0: 5 s for a name, 20 s for an address.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
-        on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``.
+        on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. One that
+            others fly stays as it is; a warning in the log says so.
         authority: How a pilot asks for the authority: priority, waiting, asking its holder first. None:
             ``Authority()``.
         network: True, an address, or a :class:`Network` with keys; False stays on this host. None: as the variable
