@@ -113,7 +113,7 @@ class PageLane(MavlinkLane):
     def _start_pilot(self) -> Process:
         program = self.folder / f"{self.name}.mjs"
         bundle = ("--bundle", "--platform=node", "--format=esm", "--log-level=error", f"--outfile={program}")
-        subprocess.run([ESBUILD, "tests/promises/chaos.ts", *bundle], cwd=PAGE, check=True)
+        subprocess.run([ESBUILD, "tests/chaos.ts", *bundle], cwd=PAGE, check=True)
         launch = partial(Process, log=self.folder / f"{self.name}.log", environment=self.environment())
         self.proxy.until("ready")
         self.cockpit = launch(sys.executable, "-m", "skyloop.cockpit", self.name, "--port", "0")
