@@ -204,15 +204,15 @@ class FlightSupervisor:
         asked_ns = ladder.wanted_ns if asked is None else asked.asked_ns  # its pilot may have left
         if now_ns - max(asked_ns, self._heard_ns) < BELIEF_NS:
             return
-        what = "landing" if ladder.lands or self._asked(Land) is not None else "hover"
+        lands = ladder.lands or (asked is not None and type(asked.action) is Land)
         if asked is not None:
             self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: ask for it again", Refusal.VEHICLE_LINK_LOST)
         if ladder.step is not Failsafe.LAND:
             ladder.give_up()
         elif not self.flight.forget():
             return
-        if what == "landing" or self._executor.airborne:
-            self._events.publish_drafts(given_up_event(what))
+        if lands or self._executor.airborne:
+            self._events.publish_drafts(given_up_event("landing" if lands else "hover"))
         self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
@@ -409,9 +409,8 @@ class FlightSupervisor:
             return []
         ladder, flight = self.ladder, self.flight
         seen = self._look(now_ns)
-        # What flew on by the software autopilot's set-points, or is to land meanwhile, is the same flight still.
-        steered = Hover not in self._executor.native
-        if seen.link_up and ladder.given_up and not (ladder.lands or steered) and flight.forget():
+        # One that the software autopilot has steered on, or that was told to land since, is still the same flight.
+        if seen.link_up and ladder.given_up and not ladder.lands and Hover in self._executor.native and flight.forget():
             seen = self._look(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:
             ladder.land_on(now_ns)  # no hover takes its pilot's landing back
