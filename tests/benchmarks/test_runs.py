@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ class Run(NamedTuple):
     options: str
     kind: type[msgspec.Struct]
     needs: str = "numpy"  #: packages
+    holds: Callable[[Any], bool] = bool  #: what shows that it did what it was to measure
 
 
 RUNS = {
@@ -37,12 +38,13 @@ RUNS = {
     "load": Run("--seconds 0.5 --observers 2 --pages 2", load.Load),
     "codecs": Run("--seconds 0.5", codecs.CodecResults, "av"),
     "network": Run("--seconds 1 --losses 0.1", network.Network, "zenoh"),
-    "swarm": Run("--seconds 3 --drones 2", swarm.Swarm, "zenoh cv2"),
-    "scale": Run("--seconds 0.5 --counts 1,2", scale.Scale, "zenoh matplotlib"),
+    "swarm": Run("--seconds 3 --drones 2", swarm.Swarm, "zenoh cv2", lambda found: found.failsafe.missed == 0),
+    "scale": Run("--seconds 0.5 --counts 1,2", scale.Scale, "zenoh matplotlib", lambda found: not found.skipped),
     "fleet": Run(
         "--seconds 1 --vehicles 3 --observers 2 --networked 2 --mavlink 4 --busy-ms 0.1",
         fleet.HostedFleet,
         "zenoh pymavlink",
+        lambda found: (found.mavlink.up, found.mavlink.flown, found.mavlink.failed) == (4, 2, {}),
     ),
     "learning": Run("--seconds 0.5", learning.Learning, "gymnasium"),
     "recordings": Run("--seconds 1", recordings.Recordings, "mcap av"),
@@ -73,7 +75,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.mark.process
 @pytest.mark.parametrize("name", list(RUNS))
 def test_it_runs_and_writes_the_fields_of_its_type(name: str, small: None, tmp_path: Path) -> None:
-    options, kind, needs = RUNS[name]
+    options, kind, needs, holds = RUNS[name]
     for package in needs.split():
         if importlib.util.find_spec(package) is None:
             pytest.skip(f"{package} is not installed")
@@ -86,6 +88,7 @@ def test_it_runs_and_writes_the_fields_of_its_type(name: str, small: None, tmp_p
     results = msgspec.json.decode(written.read_bytes(), type=kind)
     fields = {field.encode_name for field in msgspec.structs.fields(kind)}
     assert fields <= set(json.loads(written.read_bytes())), "the documented fields"
+    assert holds(results)
     for one in summaries(results):
         assert 0 < one.minimum_us <= one.median_us <= one.p99_us <= one.p999_us <= one.maximum_us
     for cases in (getattr(results, name, None) for name in ("cells", "sizes", "cases", "rows")):

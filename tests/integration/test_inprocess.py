@@ -35,15 +35,9 @@ from skyloop.messages import (
 from skyloop.proxy.core.flight import BELIEF_NS
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import video
-from tests.support.fake_vehicle import WAIT_S, FakeVehicle, Node
+from tests.support.fake_vehicle import WAIT_S, FakeVehicle, Node, node
 
-
-@pytest.fixture
-def node() -> Iterator[Node]:
-    node = Node(FakeVehicle())
-    node.proxy.start()
-    yield node
-    node.proxy.end()
+__all__ = ["node"]  # a fixture
 
 
 @contextmanager

@@ -13,16 +13,10 @@ from skyloop.client.drone import open_drone
 from skyloop.client.publishing import Membership
 from skyloop.errors import NameTakenError, UnknownNameError, UsageError
 from skyloop.extend import join_processor
-from tests.support.fake_vehicle import WAIT_S, FakeVehicle, Node
+from tests.support.fake_vehicle import WAIT_S, Node, node
 from tests.support.scripted_proxy import QUICK
 
-
-@pytest.fixture
-def node() -> Iterator[Node]:
-    node = Node(FakeVehicle())
-    node.proxy.start()
-    yield node
-    node.proxy.end()
+__all__ = ["node"]  # a fixture
 
 
 @contextmanager

@@ -16,16 +16,10 @@ from skyloop.client.drone import open_drone
 from skyloop.errors import NameTakenError, UsageError
 from skyloop.messages import Annotation, LogEntry, Polyline, Severity
 from skyloop.processing import Output, Settings, Worker
-from tests.support.fake_vehicle import WAIT_S, FakeVehicle, Node
+from tests.support.fake_vehicle import WAIT_S, Node, node
 from tests.support.scripted_proxy import QUICK
 
-
-@pytest.fixture
-def node() -> Iterator[Node]:
-    node = Node(FakeVehicle())
-    node.proxy.start()
-    yield node
-    node.proxy.end()
+__all__ = ["node"]  # a fixture
 
 
 @contextmanager

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 
 import numpy as np
+import pytest
 
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import VehicleUri
@@ -111,3 +113,11 @@ class Node:
         self.proxy.end()
         self.proxy = Proxy(self.vehicle, self.server, name="alpha")
         self.proxy.start()
+
+
+@pytest.fixture
+def node() -> Iterator[Node]:
+    node = Node(FakeVehicle())
+    node.proxy.start()
+    yield node
+    node.proxy.end()

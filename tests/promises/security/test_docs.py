@@ -1,4 +1,4 @@
-"""The tables of attempts in ``docs/security.md`` are those of the tests."""
+"""The tables of doors and replays in ``docs/security.md`` are those of the tests."""
 
 from __future__ import annotations
 
