@@ -208,7 +208,7 @@ class ByteStream(ABC):
 
 
 class TcpStream(ByteStream):
-    """A client of a TCP server. Connected is not yet served.
+    """A client of a TCP server, by its numeric address: looking up a name would block. Connected is not yet served.
 
     Raises:
         OSError: It can't be reached within :data:`CONNECT_S`.

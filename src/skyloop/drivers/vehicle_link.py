@@ -157,7 +157,7 @@ class VehicleLink(ABC, Generic[S]):
             self.session.close()
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Have the session accept an action, and send it at once if its pace allows. Any thread."""
+        """Have the session accept an action, send it at once if its pace allows; return what is applied. Any thread."""
         return self._decide(partial(self.session.command, action))
 
     # For a kind's methods that the proxy's threads call ----------------------------------------------------------
@@ -176,7 +176,10 @@ class VehicleLink(ABC, Generic[S]):
     def _wait_for_answer(
         self, ask: Callable[[Callable[[str | None], None]], None], within_s: float, otherwise: str | None
     ) -> str | None:
-        """Ask the vehicle and wait for its answer. Any thread but the link's."""
+        """Ask the vehicle and wait for its answer; ``otherwise`` if none comes in time. Any thread but the link's.
+
+        ``ask`` is called with the lock held, and given the function that takes the answer.
+        """
         done = threading.Event()
         answers: list[str | None] = []
 

@@ -143,7 +143,7 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action."""
+        """Accept an action and return what is applied, within the limits. Raises DriverError if it can't be."""
 
     @abstractmethod
     def close(self) -> None:

@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from skyloop.clock import NS_PER_S
 from skyloop.errors import MissingExtraError, SkyloopError
 
+if TYPE_CHECKING:
+    from av.video.codeccontext import VideoCodecContext
+
 _log = logging.getLogger(__name__)
 
 
@@ -171,9 +174,6 @@ def with_inset(picture: NDArray[np.uint8], other: NDArray[np.uint8], size: tuple
     made[:height, :width] = other[rows[:, None], columns]
     return made
 
-
-if TYPE_CHECKING:
-    from av.video.codeccontext import VideoCodecContext
 
 GROUP: Final = 15  #: pictures from one key frame to the next
 

@@ -29,8 +29,8 @@ class OwnLimit:
     """A limit of the driver's own."""
 
     name: str
-    option: str
-    usual: float
+    option: str  #: its name in an address
+    usual: float  #: its default
     low: float
     high: float
     unit: str
@@ -86,8 +86,8 @@ class Address:
     """Where the vehicle is."""
 
     kind: ConnectionKind
-    place: str
-    number: int
+    place: str  #: host or device
+    number: int  #: port, or bits a second
 
     def __str__(self) -> str:
         place = f"[{self.place}]" if ":" in self.place and self.kind is not ConnectionKind.SERIAL else self.place

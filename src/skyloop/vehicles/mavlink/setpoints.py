@@ -100,7 +100,7 @@ class SetpointController:
         self._setpoint: Setpoint | None = None
         self._lead_ns: int | None = None  # since when the stream flows
         self._sent_ns = 0
-        self._followed: Velocity | None = None  # the last velocity sent to a vehicle that read it
+        self._followed: Velocity | None = None  # the velocity sent last; None: something else was
         self._entered = False  # the mode that is wanted was seen since
         self._strayed_ns: int | None = None  # since when it is another one again
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows

@@ -48,7 +48,7 @@ class VehicleState:
         """Whether it is off the ground under its own power; None while that can't be known.
 
         An armed vehicle that reports neither that nor its height, as when it was just found again, may well be flying;
-        so may a low one that is about to say so itself.
+        so may a low one whose own report is late.
         """
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False
@@ -134,9 +134,9 @@ class Telemetry:
         heartbeat = self._newest.get("HEARTBEAT")
         return 0 if heartbeat is None else int(heartbeat[0].system_status)
 
-    def landed(self, now_ns: int) -> Landed:
-        """Return what it reports of standing on the ground."""
-        message = self.newest("EXTENDED_SYS_STATE", now_ns, LANDED_S)
+    def landed(self, now_ns: int, max_age_s: float = LANDED_S) -> Landed:
+        """Return what it reports of standing on the ground, unless that is too old."""
+        message = self.newest("EXTENDED_SYS_STATE", now_ns, max_age_s)
         return Landed.UNKNOWN if message is None else _LANDED.get(message.landed_state, Landed.UNKNOWN)
 
     def prearm_good(self, now_ns: int) -> bool | None:
@@ -215,8 +215,7 @@ class Telemetry:
             amsl_m=self.amsl_m(now_ns),
             remote=self.remote(now_ns),
             heartbeat_ns=self._newest["HEARTBEAT"][1] if "HEARTBEAT" in self._newest else 0,
-            tells_landed=(told := self.newest("EXTENDED_SYS_STATE", now_ns)) is not None
-            and _LANDED.get(told.landed_state, Landed.UNKNOWN) is not Landed.UNKNOWN,
+            tells_landed=self.landed(now_ns, math.inf) is not Landed.UNKNOWN,
         )
 
 

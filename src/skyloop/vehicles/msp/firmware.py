@@ -346,10 +346,10 @@ class Identification:
         self.setup = replace(self.setup, sticks=msp.rx_map(payload), sticks_told=True)
 
     def _on_rx(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, rx=msp.RxConfig.decode(payload))
+        self.setup = replace(self.setup, rx=RxConfig.decode(payload))
 
     def _on_failsafe(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, failsafe=msp.FailsafeConfig.decode(payload))
+        self.setup = replace(self.setup, failsafe=FailsafeConfig.decode(payload))
 
     def _on_tuning(self, payload: bytes) -> None:
         if self.setup.identity.variant == BETAFLIGHT:
@@ -377,7 +377,7 @@ class Identification:
             self.setup = replace(self.setup, angle_limit_deg=int.from_bytes(payload[:2], "little") / 10)
         elif payload is not None:
             with suppress(DecodeError):
-                self.setup = replace(self.setup, cells=msp.CellVoltages.decode(payload))
+                self.setup = replace(self.setup, cells=CellVoltages.decode(payload))
         self._done(self.setup)
 
 

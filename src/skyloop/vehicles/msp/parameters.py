@@ -111,7 +111,7 @@ class DriverParameters:
     def _limits(self) -> list[_Entry]:
         def writing(field: str) -> Callable[[float], None]:
             def write(value: float) -> None:
-                self._setpoints.limits = replace(self._setpoints.limits, **{field: float(value)})
+                self._setpoints.limits = replace(self._setpoints.limits, **{field: value})
 
             return write
 
@@ -127,7 +127,7 @@ class DriverParameters:
     def _gains(self) -> list[_Entry]:
         def writing(field: str) -> Callable[[float], None]:
             def write(value: float) -> None:
-                self._setpoints.gains = replace(self._setpoints.gains, **{field: float(value)})
+                self._setpoints.gains = replace(self._setpoints.gains, **{field: value})
 
             return write
 
@@ -142,14 +142,14 @@ class DriverParameters:
 
     def _tilt(self) -> _Entry:
         def write(value: float) -> None:
-            self._setpoints.full_tilt_rad = float(value) or None
+            self._setpoints.full_tilt_rad = value or None
 
         text = "what a full stick leans in ANGLE mode; 0: as the flight controller says (angle_limit)"
         return _Entry(_number(TILT, self._setpoints.full_tilt_rad or 0.0, 0.0, 1.5, "rad", text, 0.0), write)
 
     def _hover(self) -> _Entry:
         def write(value: float) -> None:
-            self._setpoints.hover = float(value) or None
+            self._setpoints.hover = value or None
 
         text = "throttle that carries it, as a share of the full one: learnt in flight; 0: not known"
         return _Entry(_number(HOVER, self._setpoints.hover or 0.0, 0.0, 0.9, "", text, 0.0), write)

@@ -241,7 +241,7 @@ class Player:
         self._damaged = 0  # frames, in the passes before
 
     def run(self, wait_for: tuple[str, ...]) -> None:
-        """Play until stopped, from when somebody wants one of these cameras, if any.
+        """Play until stopped; begin once somebody wants one of these cameras, or at once if there are none.
 
         At the end the link is closed, and up again if somebody goes back from there.
         """

@@ -246,7 +246,7 @@ class Timeline:
     """Maps the clock of the recording to the clock of its replay, and back. Pure."""
 
     def __init__(self, speed: float, begin_ns: int, origin_ns: int) -> None:
-        """Store the arguments."""
+        """Map ``begin_ns`` on the recording's clock to ``origin_ns`` on the replay's."""
         self._speed = speed
         self._begin_ns = begin_ns
         self._origin_ns = origin_ns

@@ -197,9 +197,7 @@ class RobotSession:
             if self._velocity is not None:
                 self._robot.send(self._velocity)
             if self._pending is not None and now_ns - self._pending.since_ns > nanoseconds(ANSWER_S):
-                if self._pending.state is FlightState.LANDING and self._velocity is None:
-                    self._velocity = Velocity()  # one without a watchdog flies on with its last
-                self._pending = None
+                self._fail_pending()
         if lost:
             self._lose(LinkState.LOST, silent_s, self._options.odom, self._options.image)
             return
@@ -263,10 +261,10 @@ class RobotSession:
                     self._up = up
                 elif up:
                     self._refused = why
-                elif self._pending is pending and self._velocity is None:
-                    self._velocity = Velocity()  # the last one sent may still be in force
-                if self._pending is pending:
+                if self._pending is pending and success:
                     self._pending = None
+                elif self._pending is pending:
+                    self._fail_pending()
             if not success:
                 self._sink.event(EventKind.VEHICLE_MESSAGE, why, Severity.ERROR, reason="service_failed")
 
@@ -275,6 +273,12 @@ class RobotSession:
             self._velocity = Velocity()  # it stops if nobody offers the service
         self._robot.call(service, answered)
         self._velocity, self._pending = None, pending
+
+    def _fail_pending(self) -> None:
+        """Forget what is pending, and stop after a landing: without a watchdog it flies on with its last velocity."""
+        if self._pending is not None and self._pending.state is FlightState.LANDING and self._velocity is None:
+            self._velocity = Velocity()
+        self._pending = None
 
     def _received(self) -> int:
         """Note that something came, and return the time."""
@@ -353,7 +357,7 @@ class CaptureClock:
         self._newest_ns = 0
 
     def captured_ns(self, stamp_ns: int, arrived_ns: int, system_ns: int) -> int:
-        """Return when a message with this stamp was captured; 0: it has none. It arrived at a time of both clocks."""
+        """Return when a message was captured, by its stamp (0: none) and its arrival on both of this host's clocks."""
         age_ns = system_ns - stamp_ns
         if stamp_ns == 0:
             captured_ns = arrived_ns

@@ -81,15 +81,12 @@ def with_value(state: ParameterValues, name: str, value: Value) -> tuple[Paramet
         UnknownNameError: There is no such parameter.
         ParameterError: It does not take this value.
     """
-    for entry in _GROUPS.get(name.partition(".")[0], _no_entries)(state, state):
+    group = _GROUPS.get(name.partition(".")[0])
+    for entry in group(state, state) if group is not None else ():
         if entry.parameter.name == name:
             written = _checked(entry.parameter, value)
             return entry.write(state, written), written
     raise UnknownNameError("parameter of the simulated drone", name, names(state))
-
-
-def _no_entries(_state: ParameterValues, _standard: ParameterValues) -> list[_Settable]:
-    return []
 
 
 def _limit_entries(state: ParameterValues, standard: ParameterValues) -> list[_Settable]:

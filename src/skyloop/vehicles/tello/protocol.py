@@ -38,9 +38,9 @@ class Request:
     """A command whose answer is waited for."""
 
     text: str
-    done: Done
-    tries: int = TRIES
-    sent_ns: int | None = None
+    done: Done  #: is given the answer, or None if there was none
+    tries: int = TRIES  #: how often it is sent at most
+    sent_ns: int | None = None  #: when it was sent last
 
 
 class Conversation:

@@ -66,7 +66,7 @@ def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
 def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | None:
     """Return a camera's intrinsics for pictures of another width, which the drone makes smaller when asked to.
 
-    Known are those of the front camera, at full size.
+    Those of the bottom camera are not known: None.
     """
     known = front.intrinsics
     if camera != FRONT or known is None:

@@ -174,7 +174,6 @@ class PaveSource:
     """
 
     def __init__(self, path: Path) -> None:
-        self._name = str(path)
         self.damaged = 0
         self._parser = PaveParser()
         self._file = path.open("rb")
@@ -327,7 +326,7 @@ class FilePlayer:
         self._speed = speed
 
     def run(self, source: Source, *, wait: bool) -> None:
-        """Play until the end, or until the driver is closed; ``wait``: from when somebody wants the images."""
+        """Play until the end, or until the driver is closed; with ``wait``, begin once somebody wants the images."""
         publisher = self._publisher
         publisher.sink.link(LinkState.UP)
         while wait and not (publisher.wanted or publisher.wanted_encoded):

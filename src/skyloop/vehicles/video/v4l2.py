@@ -1,6 +1,6 @@
 """The cameras of this machine, as Video4Linux lists them: what they offer, and their exposure and gain.
 
-All is said by the kernel's own calls.
+It uses the kernel's own calls.
 
 Layouts and numbers are those of ``linux/videodev2.h`` (``Documentation/userspace-api/media/v4l``), which are the same
 on all architectures with integers of 32 bits. FFmpeg streams from the device meanwhile: settings need no stream.

@@ -59,7 +59,6 @@ TABLE_QUANT: Final = 31  #: not a size but a mode: the steps are those of ``TABL
 TABLE_QUALITY: Final = 2
 DQUANT: Final = (-1, -2, 1, 2)  #: what the two bits of a quantiser change stand for
 
-MAX_RUN: Final = 63
 MAX_RUN_ZEROS: Final = 6  #: leading zeros of the longest code of a run
 
 

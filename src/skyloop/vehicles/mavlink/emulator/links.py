@@ -117,6 +117,10 @@ class Settings:
     key: bytes | None
     video: tuple[str, int] | None
 
+    def carries(self, message: Message) -> bool:
+        """Return whether this version has the message: MAVLink 1 has no numbers above 255."""
+        return self.version == 2 or message.id < 256
+
 
 MAX_INTERVAL_US: Final = 2**31 - 1  #: the greatest that ``MESSAGE_INTERVAL`` has room for
 
@@ -209,8 +213,8 @@ class UdpPort:
         return self._port.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the peer; MAVLink 1 has no numbers above 255."""
-        if self._settings.version == 2 or message.id < 256:
+        """Send a message to the peer."""
+        if self._settings.carries(message):
             self._port.send(self._codec.encode(message, version=self._settings.version), self._peer)
 
     def close(self) -> None:
@@ -247,7 +251,7 @@ class TcpPort:
 
     def send(self, message: Message) -> None:
         """Send a message to the client, if there is one."""
-        if self._settings.version == 2 or message.id < 256:
+        if self._settings.carries(message):
             self._server.send(self._codec.encode(message, version=self._settings.version))
 
     def close(self) -> None:

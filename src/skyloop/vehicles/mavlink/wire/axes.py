@@ -75,6 +75,9 @@ _POSITIONS: Final = ("SET_POSITION_TARGET_LOCAL_NED", "ODOMETRY", "VISION_POSITI
 class WorldAxes:
     """Moves the positions in messages between the world's axes and the autopilot's. Both point the same way.
 
+    For an autopilot that begins its axes at its first fix: ArduPilot refuses another origin while it flies by
+    satellites, and several vehicles would have several axes.
+
     Args:
         begin: Latitude and longitude [°] and altitude [m] of where the world's axes begin; None: where the autopilot's
             do.

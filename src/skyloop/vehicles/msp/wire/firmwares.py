@@ -218,7 +218,7 @@ ARMED_OF_INAV: Final = 1 << 2  #: among the flags of INAV's status
 
 
 def flag_names(variant: str, flags: int, count: int) -> list[str]:
-    """Return what keeps it from arming, a bit each, by the firmware's own names; ``count`` flags, 0: not known."""
+    """Return what keeps it from arming, by the firmware's own names. ``count``: how many flags it has; 0: not known."""
     names = []
     for bit in range(32):
         if not flags >> bit & 1:

@@ -180,7 +180,6 @@ class ArduCopter(CoupledFirmware):
     """ArduCopter, flying a simulated drone. See :class:`CoupledFirmware`."""
 
     NAME: ClassVar[str] = "ArduCopter"
-    IN_STEP: ClassVar[bool] = True
 
     def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
         super().__init__(on_event, folder=folder)

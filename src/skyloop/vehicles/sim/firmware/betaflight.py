@@ -53,7 +53,6 @@ from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, Started
 
 MOTORS_PORT: Final = 9002
 STATE_PORT: Final = 9003
-STICKS_PORT: Final = 9004
 MSP_PORT: Final = 5761  #: TCP: its first serial port
 
 _STATE: Final = struct.Struct("<18d")
@@ -162,7 +161,6 @@ class Betaflight(CoupledFirmware):
     """
 
     NAME: ClassVar[str] = "Betaflight"
-    IN_STEP: ClassVar[bool] = False
 
     def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
         super().__init__(on_event, folder=folder)

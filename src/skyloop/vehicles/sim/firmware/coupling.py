@@ -27,8 +27,6 @@ class CoupledFirmware(ABC):
     """
 
     NAME: ClassVar[str]  #: for people
-    #: Whether the firmware's time is the simulation's: it can be slower and faster than real time then.
-    IN_STEP: ClassVar[bool]
 
     def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
         """Prepare without starting anything.

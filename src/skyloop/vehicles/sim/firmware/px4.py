@@ -68,7 +68,6 @@ class Px4(CoupledFirmware):
     """PX4, flying a simulated drone. See :class:`CoupledFirmware`."""
 
     NAME: ClassVar[str] = "PX4"
-    IN_STEP: ClassVar[bool] = True
 
     def __init__(
         self,
