@@ -42,7 +42,7 @@ _RANGES: Final = (
 
 
 def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Return the command line with these commands made: only their modules are imported, the others' when asked for."""
+    """Return the command line. Only the modules of these commands are imported now; others when they are asked for."""
     app = typer.Typer(
         name="skyloop",
         cls=ByTask,

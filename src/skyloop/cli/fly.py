@@ -26,7 +26,8 @@ from skyloop.cli.naming import (
     one_drone,
     python_files,
 )
-from skyloop.cli.text import coloured
+from skyloop.cli.text import coloured, tell
+from skyloop.clock import beats
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.extend import Known, end_flight, let_go
 from skyloop.messages import Failsafe, ReturnPhase
@@ -191,7 +192,7 @@ class Flight:
         self._report = report
 
     def run(self, seconds: float | None) -> bool:
-        """Run the controller for so long, or to its end; return whether no error, which is shown, left it hovering."""
+        """Run the controller for so long, or to its end. Return False after an error: it is shown, and it hovers."""
         try:
             summary = self._controller.run(seconds=seconds)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
@@ -347,8 +348,8 @@ class FlightProgress:
             self._thread.join()
 
     def _lines(self) -> None:
-        while not self._ended.wait(self._every_s):
-            print(self.line(), file=sys.stderr, flush=True)
+        for _ in beats(self._every_s, self._ended):
+            tell(self.line())
 
 
 def flight_line(drone: Drone, flown_s: float) -> str:

@@ -119,6 +119,6 @@ def _is_there(module: str) -> bool:
 
 
 def with_all_missing(told: str, parts: Iterable[str]) -> str:
-    """Return an error that ends with how to install a part, with all that are missing of those that are needed."""
+    """Return an error that ends with how to install a part, so that it names all of ``parts`` that are missing."""
     before, command, first = told.rpartition(install_command(""))
     return before + command + " ".join((first, *(part for part in missing(parts) if part != first)))

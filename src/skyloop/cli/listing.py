@@ -73,7 +73,7 @@ def list_proxies(
 
 
 def none_runs(settings: FabricSettings | None) -> str:
-    """Return, in words, that no proxy can be reached, here or on the network that was searched, and whose there are."""
+    """Say that no proxy can be reached, here or on the network that was searched, and whose proxies run here."""
     also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
     others = of_others()
     ours = f"No proxy of yours is running on this host{also}" if others else f"No proxy is running on this host{also}"

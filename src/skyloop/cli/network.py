@@ -18,7 +18,7 @@ import msgspec
 import typer
 
 from skyloop.cli.naming import MULTICAST, keys_directory, network_places
-from skyloop.cli.text import columns
+from skyloop.cli.text import columns, tell
 from skyloop.clock import SWITCH_INTERVAL_S
 from skyloop.errors import UsageError
 from skyloop.files import expand
@@ -133,12 +133,7 @@ def metrics_beside(where: str | None) -> Beside | None:
     from skyloop.metrics.endpoint import parse_where
 
     parse_where(where)
-    return serving_beside(where, announce)
-
-
-def announce(line: str) -> None:
-    """Print a line about metrics; on standard error, as programs read the lines of proxies on standard output."""
-    typer.echo(line, err=True)
+    return serving_beside(where, tell)  # on standard error, as programs read the lines of proxies on standard output
 
 
 def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:
@@ -220,7 +215,7 @@ def router(
         if metrics is not None:
             from skyloop.metrics import router_readings, serve
 
-            announce(beside.enter_context(serve(lambda: [router_readings(lambda: session)], metrics)).announcement)
+            tell(beside.enter_context(serve(lambda: [router_readings(lambda: session)], metrics)).announcement)
         typer.echo(f"ready: a router at {', '.join(session.listens)}")
         while not ended.wait(_POLL_S):  # looks up now and then: the kernel may hand a signal to any thread
             if chosen.ring is None:

@@ -7,8 +7,8 @@ That is therefore one hypothesis among others, at ranges from near to far, with 
 Proceedings 145(4), 1998; N. Peach, IEE Proceedings 142(1), 1995). While the vehicle stays, all of them fit. Once it has
 moved, above all up or down, where hardly any target moves, those at a wrong range do not.
 
-An altimeter that measures to rising ground, or drifts, tells of a motion that is none. What may hang is therefore seen
-from a height that follows the vehicle's own climb, and the altimeter only slowly.
+An altimeter that measures to rising ground, or drifts, reports motion that did not happen. A target that may hang is
+therefore seen from a height that follows the vehicle's own climb, and the altimeter only slowly.
 """
 
 from __future__ import annotations
@@ -103,10 +103,8 @@ class RangeEstimator(TargetEstimator):
 
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
         """Return how badly a box fits, as :meth:`TargetEstimator.distance`: the best fit of all, and the mixture's."""
-        cameras = self._cameras(camera)
-        fits, costs = zip(
-            *(guess.distance(view, one, at_ns) for guess, one in zip(self._guesses, cameras, strict=True)), strict=True
-        )
+        seen_from = self._seen_from(camera, self._steady(camera))
+        fits, costs = zip(*(guess.distance(view, one, at_ns) for guess, one in seen_from), strict=True)
         likelihood = float(self._weights @ np.exp(-np.minimum(costs, 700.0) / 2.0))
         return min(fits), -2.0 * math.log(likelihood) if math.isfinite(min(costs)) and likelihood > 0.0 else math.inf
 
@@ -124,7 +122,8 @@ class RangeEstimator(TargetEstimator):
             self.start(view, camera, at_ns, ground=True)
             return True
         self._base_m += apart_m * within(since_s / _STEADY_S, 0.0, 1.0)
-        seen_from = list(zip(self._guesses, self._cameras(camera), strict=True))
+        steady = self._steady(camera)
+        seen_from = self._seen_from(camera, steady)
         costs = np.minimum([guess.distance(view, one, at_ns)[1] for guess, one in seen_from], 1e9)
         used = [guess.update(view, one, at_ns) for guess, one in seen_from]
         if not any(used):
@@ -132,7 +131,7 @@ class RangeEstimator(TargetEstimator):
             return False
         self.seen_ns, self.refused = max(at_ns, self.seen_ns), 0
         # Of a vehicle that stays boxes tell nothing: the guess that counts on the least motion would win slowly.
-        stirred = self._stir(self._steady(camera), since_s) / _STIRRED_M
+        stirred = self._stir(steady, since_s) / _STIRRED_M
         told = 1.0 if self._size_known else within(stirred**2, 0.0, 1.0)
         worse = np.minimum(costs - costs.min(), _WORST)
         self._weights = self._weights * np.exp(-0.5 * worse * told * within(since_s / _TOGETHER_S, 0.0, 1.0))
@@ -210,10 +209,9 @@ class RangeEstimator(TargetEstimator):
         x, y, _ = camera.position
         return replace(camera, position=np.array([x, y, camera.rise_m + self._base_m]))
 
-    def _cameras(self, camera: Camera) -> list[Camera]:
-        """Return the camera for each guess: of what stands on the ground it is as high as the altimeter says."""
-        steady = self._steady(camera)
-        return [camera if guess is self._on_ground else steady for guess in self._guesses]
+    def _seen_from(self, camera: Camera, steady: Camera) -> list[tuple[TargetEstimator, Camera]]:
+        """Return each guess with its camera: for a target on the ground, as high as the altimeter says."""
+        return [(guess, camera if guess is self._on_ground else steady) for guess in self._guesses]
 
     def _jumps(self, camera: Camera, at_ns: int) -> bool:
         """Return whether the height jumps, or did a moment ago."""

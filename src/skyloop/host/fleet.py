@@ -158,7 +158,7 @@ def parse_fleet(text: str, source: str) -> Fleet:
 
 
 def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Defaults) -> VehicleSettings:
-    """Return a vehicle's settings with the defaults filled in; ``own`` stands at the place that errors name.
+    """Return a vehicle's settings with the defaults filled in; ``own`` is what the file has at ``place``.
 
     Raises:
         FileFormatError: A value is not valid.

@@ -288,7 +288,7 @@ class Track:
         self._recent.append((captured_ns, position))
         while captured_ns - self._recent[0][0] > nanoseconds(WINDOW_S):
             self._recent.popleft()
-        self.pose = replace(BodyPose(self.body, captured_ns, position, quaternion), velocity_m_s=self._velocity())
+        self.pose = BodyPose(self.body, captured_ns, position, quaternion, velocity_m_s=self._velocity())
         return self.pose
 
     def look(self, now_ns: int) -> bool:

@@ -109,11 +109,7 @@ def may_subscribe(identity: Identity) -> Rules:
 
 def _to_applications(names: list[str]) -> list[str]:
     """Return where proxies put packets and frames, and applications subscribe to them."""
-    return [
-        key
-        for name in names
-        for key in (layout.to(name, _ANY), f"{layout.ROOT}/{name}/topic/*", f"{layout.ROOT}/{name}/video/**")
-    ]
+    return [key for name in names for key in layout.downward(name)]
 
 
 def _to_proxies(identity: Identity, who: str) -> list[str]:

@@ -121,6 +121,11 @@ def video_for(name: str, camera: str, variant: str, connection: str) -> str:
     return f"{video(name, camera, variant)}/{connection}"
 
 
+def downward(name: str) -> tuple[str, str, str]:
+    """Return the expressions of all keys by which a proxy sends packets and frames."""
+    return to(name, "*"), f"{ROOT}/{name}/topic/*", f"{ROOT}/{name}/video/**"
+
+
 def parse_sender(key: str) -> Sender:
     """Return the owner of a key.
 

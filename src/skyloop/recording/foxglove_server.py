@@ -6,7 +6,6 @@ of its own and drops the oldest messages of a viewer that does not read them.
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -33,7 +32,6 @@ from skyloop.recording.view import Source
 
 PORT: Final = 8765  #: that Foxglove asks for by itself
 WAITING: Final = 512  #: messages that may wait for a viewer; then its oldest are dropped
-_log = logging.getLogger(__name__)
 
 
 class FoxgloveServer:

@@ -117,7 +117,7 @@ def numbered(path: Path, number: int) -> Path:
 
 
 def first_path(path: Path, drones: list[str], options: Options) -> Path:
-    """Return the path to record to: a file, ``.mcap`` without a suffix, or in a folder one named by drones and time.
+    """Return the path to record to: a file (``.mcap`` by default), or one in a folder, named by drones and time.
 
     Raises:
         UsageError: The file exists already, or its folder does not.
@@ -181,7 +181,10 @@ _MARGIN: Final = 1.25  #: factor of a limit that must be free again before more 
 
 
 def judge_room(free: int, floor: int, before: Room) -> Room:
-    """Decide what is written: all above the floor, no frames below it, nothing below a quarter of it."""
+    """Decide what is written: all above the floor, no frames below it, nothing below a quarter of it.
+
+    To write more than ``before`` again, there must be a margin above the limit.
+    """
     margin = _MARGIN if before is not Room.ALL else 1.0
     if free >= floor * margin:
         return Room.ALL

@@ -7,7 +7,6 @@ import os
 import threading
 import time
 from collections.abc import Sequence
-from itertools import chain
 from types import TracebackType
 from typing import Final, Protocol, Self
 
@@ -104,11 +103,15 @@ class View:
     # The thread ------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        for ending in chain((False for _ in beats(BEAT_S, self._closing)), (True,)):
-            try:
-                self.step(time.monotonic_ns(), ending=ending)
-            except Exception:  # noqa: BLE001  (a view that ended would show a standing picture of a flying drone)
-                _log.exception("the view goes on")
+        for _ in beats(BEAT_S, self._closing):
+            self._try_step(ending=False)
+        self._try_step(ending=True)
+
+    def _try_step(self, *, ending: bool) -> None:
+        try:
+            self.step(time.monotonic_ns(), ending=ending)
+        except Exception:  # noqa: BLE001  (a view that ended would show a standing picture of a flying drone)
+            _log.exception("the view goes on")
 
     def step(self, now_ns: int, *, ending: bool = False) -> None:
         """Subscribe to what is wanted, and show what came. Called by the thread, or by a test."""

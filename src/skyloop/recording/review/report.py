@@ -149,7 +149,7 @@ def _bands(found: dict[str, Table], axis: TimeAxis) -> str:
     if commands is not None:
         asked = np.where(commands["app_id"] > 0, commands["asked"], "")
         rows.append(("asked for", spans(commands.numbers("t_s"), asked, _COMMANDS, axis.end_s)))
-    return band_chart("bands", [(title, spans) for title, spans in rows if spans], marks(found.get("events")), axis)
+    return band_chart("bands", [row for row in rows if row[1]], marks(found.get("events")), axis)
 
 
 def _charts(

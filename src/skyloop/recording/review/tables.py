@@ -281,7 +281,7 @@ def export_parquet(found: dict[str, Table], folder: Path) -> list[Path]:
 
 
 def export_npz(found: dict[str, Table], path: Path) -> list[Path]:
-    """Write one compressed ``.npz``, whose ending the path gets, with an array ``CHANNEL/COLUMN`` for each column."""
+    """Write one compressed ``.npz`` (the path gets that ending) with an array ``CHANNEL/COLUMN`` for each column."""
     arrays = {f"{name}/{column}": values for name, table in found.items() for column, values in table.columns.items()}
     path = path if path.suffix == ".npz" else path.with_suffix(".npz")
     with replacing(path) as part:

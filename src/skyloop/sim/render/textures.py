@@ -19,7 +19,6 @@ from skyloop.sim.render.pictures import PICTURES, clouds, finished, fractal, gra
 from skyloop.sim.render.quads import AtlasBuilder, Texture
 
 Picture = NDArray[np.float32]
-Bgr = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
