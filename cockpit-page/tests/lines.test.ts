@@ -404,7 +404,7 @@ test("the way back to the start is flown from the page, which makes it hover whe
   receive({ type: "done", do: "return" });
   assert.ok(!pilot.going, "it lands by itself from there on");
   pilot.act("return");
-  receive({ type: "refused", do: "return", n: 0, why: "a no-fly zone is in the straight way there" });
+  receive({ type: "refused", do: "return", n: 0, why: "a no-fly zone blocks the straight line" });
   assert.ok(!pilot.going);
 });
 

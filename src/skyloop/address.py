@@ -1,7 +1,7 @@
-"""What may be shown of an address: never a user, a password or a key in it; and whether it is this machine's. Pure.
+"""What may be shown of an address (never a user, a password or a key), and whether it is this machine's. Pure.
 
-People also write passwords unquoted, with the characters that separate an address's parts; where it can't be told
-where such a password ends, the rest is hidden with it.
+People also write passwords unquoted, with the characters that separate an address's parts. Where the end of such a
+password is ambiguous, everything after it is hidden as well.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ HIDDEN: Final = "***"
 _SECRET: Final = "password|passwd|passphrase|pass|pwd|pw|token|secret|key|apikey|auth|credential|credentials"
 _SECRET_NAME: Final = re.compile(rf"(?i)(?:.*[_.-])?(?:{_SECRET})\Z")
 _NAME: Final = re.compile(r"[A-Za-z0-9_.-]*\Z")
-#: In a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``: where it ends is not known.
+#: In a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``, where the end is ambiguous.
 _IN_PATH: Final = re.compile(rf"(?i)(?<![a-z])((?:{_SECRET})=)[^/?#]*")
 _HOST: Final = re.compile(r"(?:\[[^\]]*\]|[^:\[\]]*)(?::\d*)?\Z")
-#: How places begin that are devices, which have no user, whatever stands before an ``@`` in their path.
+#: Prefixes of places that are devices: these have no user, even with an ``@`` in their path.
 _DEVICES: Final = {"mavlink": ("serial:/", "serial:~")}
-_KEEP: Final = "/:@*,;=()[]~!$'+"  # as people write them in an address
+_KEEP: Final = "/:@*,;=()[]~!$'+"  # usual punctuation in addresses
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address."""
+    """Return whether only this machine can reach the address."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -33,13 +33,13 @@ def is_loopback(host: str) -> bool:
 
 
 def without_secrets(text: str, option: str = "", *, broken: bool = False, place_of: str = "") -> str:
-    """Return a part of an address as it may be shown, without what may be a secret: user, password, query and keys.
+    """Return a part of an address without possible secrets: user, password, query and keys.
 
     Args:
-        text: The address of a stream, or another place or value of an option, percent-decoded.
-        option: The option whose value it is.
-        broken: Whether a password in it may have been cut where the address was split.
-        place_of: Scheme of the vehicle's address whose place it is; empty for anything else.
+        text: The address of a stream, another place, or the value of an option; percent-decoded.
+        option: Name of the option, if ``text`` is its value.
+        broken: Whether a password in it may have been cut when the address was split.
+        place_of: Scheme of the vehicle's address, if ``text`` is its place.
     """
     if _SECRET_NAME.match(option):
         return HIDDEN
@@ -59,20 +59,20 @@ def _hide(path: str) -> str:
 
 
 def shown_name(option: str) -> str:
-    """Return the name of an option as it may be shown: what is no name may be the end of a password."""
+    """Return the name of an option to show: a text that is not a name may be the end of a password."""
     return option if _NAME.match(option) else HIDDEN
 
 
 def is_broken(options: Iterable[str]) -> bool:
-    """Return whether names of options show that an address was split within its password."""
+    """Return whether the options' names show that an address was split within its password."""
     return any("@" in option for option in options)
 
 
 def shown_address(text: str) -> str:
-    """Return a vehicle's address as it may be shown.
+    """Return a vehicle's address without possible secrets.
 
     Args:
-        text: The address as it was given, ``scheme://place?option=value``, or what was given in place of one.
+        text: The user's input: ``scheme://place?option=value``, or anything else.
     """
     scheme, separator, rest = text.partition("://")
     place, mark, query = rest.partition("?")

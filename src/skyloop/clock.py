@@ -1,8 +1,8 @@
 """Times and clocks: all times are integer nanoseconds on a monotonic clock, and decisions take the time as an argument.
 
-``time.monotonic_ns`` is ``CLOCK_MONOTONIC``: one clock for all processes of a host, so that ages across processes of
-one host need no estimation. The exception are time namespaces, as containers may have: :func:`clock_identity` shows
-them apart. Wall-clock time is never used for ages.
+``time.monotonic_ns`` is ``CLOCK_MONOTONIC``: one clock for all processes of a host, so ages across processes need no
+estimation. Time namespaces, as in containers, are the exception: :func:`clock_identity` tells them apart. Ages never
+use wall-clock time.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-#: A source of the time: returns integer nanoseconds that never go backwards.
+#: A time source: returns integer nanoseconds that never decrease.
 Clock = Callable[[], int]
 
 NS_PER_S: Final = 1_000_000_000
-#: After which a thread of a process that serves vehicles hands the interpreter lock over: with Python's 5 ms, each of
-#: many packets in a flood can hold up a command for that long.
+#: Interval after which a thread hands over the interpreter lock in a process that serves vehicles. With Python's
+#: default of 5 ms, each packet of a flood could delay a command by that much.
 SWITCH_INTERVAL_S: Final = 0.001
 
 monotonic_ns: Clock = time.monotonic_ns
@@ -37,10 +37,10 @@ def nanoseconds(s: float) -> int:
 
 
 def slept_ns() -> int:
-    """Return for how long this computer has slept since it was started [ns]; 0 where that is not known.
+    """Return how long this computer has slept since it was started [ns]; 0 where that is unknown.
 
-    The monotonic clock stands still meanwhile: nothing that was heard before is as young as it says afterwards. May be
-    too small for a moment, never too large.
+    The monotonic clock stops during sleep, so everything received before it is older than its timestamp suggests. The
+    result may lag for a moment, but is never too large.
     """
     if _BOOTTIME is None:
         return 0
@@ -48,7 +48,7 @@ def slept_ns() -> int:
 
 
 def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
-    """Yield once a period, by absolute deadlines, until ``ended`` is set; beats that come late are not made up for."""
+    """Yield once a period, by absolute deadlines, until ``ended`` is set; missed periods are skipped."""
     due_s = time.monotonic()
     while True:
         due_s = max(due_s + period_s, time.monotonic())
@@ -59,7 +59,7 @@ def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
 
 @functools.cache
 def boot_id() -> str:
-    """Return which boot of this host's kernel runs; empty where that is not known, as on systems other than Linux."""
+    """Return the identity of the running kernel's boot; empty where unknown, as on systems other than Linux."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -68,21 +68,21 @@ def boot_id() -> str:
 
 @functools.cache
 def clock_identity() -> str:
-    """Return which monotonic clock this process reads; processes with the same identity read the same clock.
+    """Return the identity of this process's monotonic clock; processes with the same identity read the same clock.
 
-    It names the boot of the host's kernel and the time namespace. Empty where the boot is not known.
+    It names the boot of the host's kernel and the time namespace. Empty where the boot is unknown.
     """
     if not (boot := boot_id()):
         return ""
     try:
         namespace = Path("/proc/self/ns/time").stat().st_ino
-    except OSError:  # a kernel without them
+    except OSError:  # a kernel without time namespaces
         namespace = 0
     return f"{boot}/{namespace}"
 
 
 class ManualClock:
-    """A clock that stands still until it is advanced, for tests and for simulation faster than real time."""
+    """A clock that only moves when advanced, for tests and for simulation faster than real time."""
 
     def __init__(self, start_ns: int = NS_PER_S) -> None:
         self.now_ns = start_ns
@@ -104,28 +104,28 @@ class ManualClock:
 
 
 class LiveClock:
-    """Maps a live stream's stamps to this host's clock, taking the smallest delay seen lately for no delay.
+    """Maps a live stream's timestamps to this host's clock; the smallest recent delay counts as no delay.
 
-    A stream whose clock runs a little slower is followed through two windows, one of which is always complete. Times
-    run neither backwards nor ahead.
+    Two windows, of which one is always complete, follow a stream whose clock runs slightly slower. Times never decrease
+    and are never in the future.
     """
 
     def __init__(self, window_s: float = 5.0) -> None:
         self._window_ns = nanoseconds(window_s)
         self._stamp_ns = 0
-        self._before_ns: int | None = None  # smallest offset of the window before
-        self._smallest_ns: int | None = None  # and of this one
+        self._before_ns: int | None = None  # smallest offset of the previous window
+        self._smallest_ns: int | None = None  # smallest offset of this window
         self._begun_ns = 0
 
     def captured_ns(self, stamp_s: float, arrived_ns: int) -> int:
         """Return when a picture was captured, never later than it arrived.
 
         Args:
-            stamp_s: On the stream's clock [s]. A step back voids what was learned.
+            stamp_s: Timestamp on the stream's clock [s]. A step back resets the estimate.
             arrived_ns: On this host's monotonic clock.
         """
         stamp_ns = nanoseconds(stamp_s)
-        if stamp_ns < self._stamp_ns:  # the stream's clock was set back: what was learned is void
+        if stamp_ns < self._stamp_ns:  # the stream's clock was set back: reset the estimate
             self._before_ns = self._smallest_ns = None
         self._stamp_ns = stamp_ns
         offset_ns = arrived_ns - stamp_ns

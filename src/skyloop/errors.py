@@ -1,25 +1,25 @@
-"""Every error that Skyloop raises on purpose, in one tree.
+"""All errors that Skyloop raises on purpose, in one hierarchy.
 
 ::
 
     SkyloopError
-    ├── UsageError (also ValueError)      an argument is wrong: says what was given and what is allowed
+    ├── UsageError (also ValueError)      an argument is wrong: names the value and the allowed ones
     │   ├── UnknownNameError (also KeyError)   no such proxy, camera, parameter …; carries ``suggestions``
-    │   ├── FileFormatError               a file cannot be understood; names the file and the place
-    │   └── NameTakenError                the name is in use; says by whom
-    ├── DecodeError (also ValueError)     received bytes are no valid packet, of Skyloop or a vehicle
+    │   ├── FileFormatError               a file cannot be parsed; names the file and the place
+    │   └── NameTakenError                the name is in use; names the user
+    ├── DecodeError (also ValueError)     received bytes are not a valid packet, of Skyloop or a vehicle
     ├── MissingExtraError (also ImportError)   an optional part is not installed; names the ``skyloop install``
-    ├── UnsupportedError                  this platform or this vehicle cannot do what was asked
+    ├── UnsupportedError                  not possible on this platform or with this vehicle
     ├── RefusedError                      the other end understood and refused; carries ``code`` and its reason
     │   ├── AuthorityError                commanding or writing without holding the authority
     │   └── ParameterError                the value is out of range, of the wrong type, or the parameter is read-only
-    ├── LinkError                         the other end of a link is not there or stopped answering
-    │   ├── NoAnswerError (also TimeoutError)  nothing came within the time given
+    ├── LinkError                         the other end of a link is absent or stopped answering
+    │   ├── NoAnswerError (also TimeoutError)  no answer within the given time
     │   └── ClosedError                   this end was closed by its own user
-    ├── SwarmError                        some drones of a swarm failed; carries the ``errors`` by name
+    ├── SwarmError                        some drones of a swarm failed; carries ``errors`` by name
     └── DriverError                       the vehicle's driver failed; carries what the vehicle reported
 
-Leaves say who is at fault and in which phase; catch the branch that you can handle.
+The leaves tell the cause and the phase; catch the branch that you can handle.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from typing import Final, Self
 
 
 def shortened(text: str, most: int) -> str:
-    """Return a text of at most ``most`` characters, with its beginning and its end: causes stand at either.
+    """Shorten a text to ``most`` characters; its beginning and end stay, because causes are found at either.
 
-    What can't be sent as UTF-8, as of a file name that is none, becomes a question mark.
+    Characters that can't be encoded as UTF-8, for example from invalid file names, become question marks.
     """
     text = text.encode("utf-8", "replace").decode("utf-8")
     if len(text) <= most:
@@ -44,7 +44,7 @@ def shortened(text: str, most: int) -> str:
 
 
 class Hint(StrEnum):
-    """What may be done about an error. ``str(error)`` ends with it in Python's words; the command line has its own."""
+    """A possible remedy for an error. ``str(error)`` ends with it, worded for Python; the CLI has its own words."""
 
     SEARCH_NETWORK = "search the network"
     NAME_NETWORK = "name the network"
@@ -54,33 +54,31 @@ class Hint(StrEnum):
 
 
 _IN_PYTHON: Final = {
-    Hint.SEARCH_NETWORK: (
-        "only this host was searched (network=True, or the variable SKYLOOP_NETWORK, searches further)"
-    ),
-    Hint.NAME_NETWORK: "give network=True as well, or set SKYLOOP_NETWORK",
-    Hint.REACH_BY_NETWORK: "a program may reach it over the network (network=True) from anywhere",
+    Hint.SEARCH_NETWORK: ("only this host was searched (use network=True, or set SKYLOOP_NETWORK, to search further)"),
+    Hint.NAME_NETWORK: "also give network=True, or set SKYLOOP_NETWORK",
+    Hint.REACH_BY_NETWORK: "programs may reach it over the network (network=True)",
     Hint.OBSERVE: 'connect with access="observe" to watch meanwhile',
     Hint.FLY: 'connect with access="pilot" to fly',
 }
 
 
 class SkyloopError(Exception):
-    """Base of all errors that Skyloop raises on purpose.
+    """Base class of all errors that Skyloop raises on purpose.
 
     Attributes:
-        hint: What may be done about it, for programs that word it themselves; None: nothing but what is said.
+        hint: A possible remedy, for programs with their own wording; None if the message says it all.
     """
 
     hint: Hint | None = None
 
     def with_hint(self, hint: Hint) -> Self:
-        """Add a hint, and return this error."""
+        """Add a hint and return this error."""
         self.hint = hint
         return self
 
     @property
     def reason(self) -> str:
-        """What is wrong, without the hint."""
+        """The message without the hint."""
         return super().__str__()
 
     def __str__(self) -> str:
@@ -92,13 +90,13 @@ class UsageError(SkyloopError, ValueError):
 
 
 class UnknownNameError(UsageError, KeyError):
-    """Raised when nothing of this name exists; ``suggestions`` holds the nearest known names, best first.
+    """Raised when a name is unknown; ``suggestions`` holds the nearest known names, best first.
 
     Attributes:
-        kind: What was looked up, for example ``camera``.
+        kind: The kind of thing, for example ``camera``.
         name: The name that was given.
         known: All known names, sorted.
-        suggestions: Up to three known names that are similar.
+        suggestions: Up to three similar known names.
         message: The error's text.
     """
 
@@ -106,10 +104,10 @@ class UnknownNameError(UsageError, KeyError):
         """Compose the message, with suggestions from the known names.
 
         Args:
-            kind: What was looked up, for example ``camera``.
+            kind: The kind of thing, for example ``camera``.
             name: The name that was given.
-            known: Names that exist.
-            where: Where they were looked up, behind the name: ``on the network``.
+            known: All known names.
+            where: Where it was searched for, to follow the name in the message: ``on the network``.
         """
         choices = sorted(set(known))
         self.kind = kind
@@ -129,30 +127,30 @@ class UnknownNameError(UsageError, KeyError):
 
     @property
     def reason(self) -> str:  # KeyError would show the repr of the message
-        """What is wrong, without the hint."""
+        """The message without the hint."""
         return self.message
 
-    def __reduce__(self) -> tuple[object, ...]:  # errors of worker processes come back pickled
+    def __reduce__(self) -> tuple[object, ...]:  # errors of worker processes arrive pickled
         return partial(type(self), where=self.where), (self.kind, self.name, self.known), {"hint": self.hint}
 
 
 class FileFormatError(UsageError):
-    """Raised when a file cannot be understood; the message names the file and, where known, the place in it."""
+    """Raised when a file cannot be parsed; the message names the file and, where known, the place in it."""
 
 
 class NameTakenError(UsageError):
-    """Raised when the name asked for is already in use; the message says by whom."""
+    """Raised when the requested name is already in use; the message names the user."""
 
 
 class DecodeError(SkyloopError, ValueError):
-    """Raised for bytes that are no valid packet, of Skyloop or a vehicle.
+    """Raised for bytes that are not a valid packet, of Skyloop or a vehicle.
 
-    Signature, version, kind, length or range is wrong.
+    The signature, version, kind, length or a value's range is wrong.
     """
 
 
 def install_command(*extras: str) -> str:
-    """Return the command that installs optional parts, in a checkout as from a wheel.
+    """Return the command that installs optional parts; it works in a checkout and for an installed wheel.
 
     Args:
         extras: Their names.
@@ -167,8 +165,8 @@ class MissingExtraError(SkyloopError, ImportError):
         """Compose the message.
 
         Args:
-            what: What needs the optional part.
-            extra: Name of the extra, as ``skyloop install`` takes it.
+            what: The feature that needs the optional part.
+            extra: Name of the extra for ``skyloop install``.
             cause: Why the import failed, if known.
         """
         self.what = what
@@ -182,13 +180,13 @@ class MissingExtraError(SkyloopError, ImportError):
 
 
 class UnsupportedError(SkyloopError):
-    """Raised when this platform or this vehicle cannot do what was asked; the message says what is possible instead."""
+    """Raised when this platform or vehicle does not support a request; the message names the alternatives."""
 
 
 class RefusedError(SkyloopError):
-    """Raised when the other end understood the request and refused it.
+    """Raised when the other end understood a request and refused it.
 
-    ``code`` is the value of a :class:`skyloop.messages.Refusal`, or one of the client's own such as ``"busy"``.
+    ``code`` is the value of a :class:`skyloop.messages.Refusal`, or a code of the client's own, such as ``"busy"``.
     """
 
     def __init__(self, message: str, *, code: str = "refused") -> None:
@@ -201,26 +199,26 @@ class AuthorityError(RefusedError):
 
 
 class ParameterError(RefusedError):
-    """Raised when a parameter was not written: the value is out of range or of the wrong type, or it is read-only."""
+    """Raised when a parameter can't be written: the value is out of range or of the wrong type, or it is read-only."""
 
 
 class LinkError(SkyloopError):
-    """Raised when the other end of a link is not there, refuses the connection, or goes away."""
+    """Raised when the other end of a link is absent, refuses the connection, or disappears."""
 
 
 class NoAnswerError(LinkError, TimeoutError):
-    """Raised when nothing comes within the time given."""
+    """Raised when no answer arrives within the given time."""
 
 
 class ClosedError(LinkError):
-    """Raised when an object is used that its own user has closed."""
+    """Raised on use of an object that the application has closed."""
 
 
 class SwarmError(SkyloopError):
-    """Raised when something fails at some drones of a swarm; the message names each of them on a line of its own.
+    """Raised when an action fails for some drones of a swarm; the message has one line for each of them.
 
     Attributes:
-        errors: What failed, by name of the drone.
+        errors: The exceptions, by name of the drone.
         total: Number of drones in the swarm.
     """
 
@@ -228,8 +226,8 @@ class SwarmError(SkyloopError):
         """Compose the message.
 
         Args:
-            what: What the drones failed at.
-            errors: Why, by name of the drone.
+            what: Name of the failed action.
+            errors: The exceptions, by name of the drone.
             total: Number of drones in the swarm.
         """
         self.errors = dict(errors)
@@ -243,4 +241,4 @@ class SwarmError(SkyloopError):
 
 
 class DriverError(SkyloopError):
-    """Raised when a vehicle's driver fails or the vehicle refuses."""
+    """Raised when a vehicle's driver fails, or the vehicle refuses."""

@@ -1,7 +1,7 @@
-"""A drone beyond its public face, for Skyloop's own controllers, recorder, cockpit, processors, ROS bridge and CLI.
+"""A drone beyond its public API, for Skyloop's own controllers, recorder, cockpit, processors, ROS bridge and CLI.
 
 Only the client uses a drone's private attributes; every other package uses this module, which may change with any
-version. Its functions may be called from any thread, and none waits unless its docstring says so.
+version. All functions are thread-safe and return at once unless their docstring says otherwise.
 """
 
 from __future__ import annotations
@@ -24,14 +24,12 @@ D = TypeVar("D", bound="Drone")
 
 
 class Known:
-    """A drone's state in this process. Reading it sends no request, subscribes to nothing, and never raises."""
+    """A drone's state as known in this process. Reading it sends nothing, subscribes to nothing, and never raises."""
 
     def __init__(self, drone: Drone) -> None:
         self._drone, state = drone, drone._state
-        self.app: Final = state.app  #: name of this application, as events give it
-        self.reach: Final = (
-            drone._reach
-        )  #: name or address by which other processes reach the vehicle; None: they can't
+        self.app: Final = state.app  #: name of this application, as in events
+        self.reach: Final = drone._reach  #: name or address for other processes to reach the vehicle; None: they can't
         self.subscriber: Final = state.video.subscriber  #: unique to this drone object, for :func:`stream_channel`
 
     @property
@@ -41,17 +39,17 @@ class Known:
 
     @property
     def is_ending(self) -> bool:
-        """Whether the end of the flight has begun, or the drone is closed: commands raise :class:`ClosedError`."""
+        """Whether the flight is being ended or the drone is closed: commands raise :class:`ClosedError`."""
         return self._drone._piloting.ending
 
     @property
     def is_far(self) -> bool:
-        """Whether frames come over a network, in the encoding that each consumer requests."""
+        """Whether frames arrive over a network, in the encoding that each consumer requests."""
         return self._drone._connection.variants
 
     @property
     def listeners(self) -> list[Listener[Any]]:
-        """The application's callbacks that were not cancelled."""
+        """The application's active callbacks."""
         return list(self._drone._state.listeners)
 
     @property
@@ -61,29 +59,29 @@ class Known:
 
 
 class Commands(Protocol):
-    """The commands of this application and their outcomes. Each command is an intent, which has a number."""
+    """The commands of this application and their outcomes. Each command is an intent and has a number."""
 
     @property
-    def newest(self) -> AnyAction: ...  #: the set-point that is repeated now; idle if none is
+    def newest(self) -> AnyAction: ...  #: the set-point that is being repeated; idle if there is none
     @property
     def intent(self) -> int: ...  #: number of the newest intent
     @property
-    def wants_flight(self) -> bool: ...  #: whether the newest set-point keeps, or brings, the vehicle in the air
+    def wants_flight(self) -> bool: ...  #: whether the newest set-point keeps the vehicle in the air or brings it there
     @property
-    def may_ask(self) -> bool: ...  #: whether the authority is held and there is a connection
+    def may_ask(self) -> bool: ...  #: whether there is a connection with the authority
     @property
     def told(self) -> Outcome | None: ...  #: the proxy's newest report on these intents
 
-    def outcome(self, intent: int) -> Outcome | None: ...  #: how it ended; None while it is under way
-    def release(self, *, wait: bool = True) -> None: ...  #: the authority; NoAnswerError if the proxy is silent
+    def outcome(self, intent: int) -> Outcome | None: ...  #: how it ended; None while it is in progress
+    def release(self, *, wait: bool = True) -> None: ...  #: release the authority; NoAnswerError if the proxy is silent
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer a request to hand over the authority; see :meth:`skyloop.client.commands.CommandSender.answer`."""
 
-    # The presence of the person who flies: while it is required and they are absent, nothing is repeated and nothing
-    # new is flown; what ends a flight is sent once, and an emergency stop as ever.
-    def flown_by_person(self) -> None: ...  #: their presence is required from now on
+    # Presence of the person who flies. While they must be present but are not, set-points are not repeated and new ones
+    # are refused. Commands that end a flight are sent once, and emergency stops work as always.
+    def flown_by_person(self) -> None: ...  #: require their presence from now on
     def present_until(self, until_ns: int) -> None: ...  #: on this process's clock [ns]; never shortens it
-    def is_present(self, now_ns: int) -> bool: ...  #: also True where no presence is required
+    def is_present(self, now_ns: int) -> bool: ...  #: also True if no presence is required
 
 
 def commands(drone: Drone) -> Commands:
@@ -92,21 +90,21 @@ def commands(drone: Drone) -> Commands:
 
 
 def ask(drone: Drone, action: AnyAction) -> int:
-    """Command ``action``, whose numbers were checked, as :meth:`skyloop.Drone.command`; return the intent's number."""
+    """Send ``action``, with numbers already checked, as :meth:`skyloop.Drone.command`; return the intent's number."""
     return drone._commands.ask(action)
 
 
 def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:
-    """Hover, or land, because the library finds that it has to, and not because a person chose to. Never raises.
+    """Hover or land because the library, not a person, decides that it must. Never raises.
 
-    A vehicle that others fly, that lands or that returns is left alone, and so is one that the application itself has
-    landed or stopped; a take-off that does not show yet is ended. Without the authority only the set-point is dropped.
+    Leaves the vehicle alone if others fly it, if it is landing or returning, or if the application itself has landed or
+    stopped it. A take-off that does not show yet is cancelled. Without the authority, only the set-point is dropped.
 
     Args:
         drone: The drone.
-        reason: Why, for the log.
+        reason: The reason, for the log.
         land: Land, rather than hover.
-        for_good: Further commands of the application raise :class:`ClosedError`, except for an emergency stop.
+        for_good: Later commands of the application raise :class:`ClosedError`, except for an emergency stop.
 
     Returns:
         Whether something was sent.
@@ -117,17 +115,17 @@ def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = Fa
 
 
 def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **options: Unpack[DroneOptions]) -> D:
-    """Connect as a pilot that does not ask for the authority yet. Waits for the first feedback.
+    """Connect as a pilot without requesting the authority yet. Waits for the first feedback.
 
     Args:
         kind: ``Drone``, or a class derived from it.
-        dial: Makes a connection to the proxy each time one is needed.
+        dial: Connects to the proxy, now and after each loss.
         app: Name of this application, 1 to 64 characters.
         timeout_s: Time for the proxy to answer and to send feedback [s].
         **options: See :class:`skyloop.client.drone.DroneOptions`.
 
     Raises:
-        SkyloopError: As :func:`skyloop.connect`.
+        SkyloopError: The same as for :func:`skyloop.connect`.
     """
     drone = kind(dial, app=app, **options)
     drone._connect(timeout_s=timeout_s, acquire=False)
@@ -135,9 +133,9 @@ def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **o
 
 
 def connect_to_stop(name: str, app: str) -> Drone:
-    """Connect to a running proxy as a pilot that waits for no feedback and never asks for the authority.
+    """Connect to a running proxy as a pilot that waits for no feedback and never requests the authority.
 
-    Raises what :func:`skyloop.connect` raises.
+    Raises the same errors as :func:`skyloop.connect`.
     """
     from skyloop.client.connect import prepare
 
@@ -147,9 +145,9 @@ def connect_to_stop(name: str, app: str) -> Drone:
 
 
 def end_flight(drone: Drone, report: Callable[[str], object]) -> SkyloopError | None:
-    """Land what this application flies, or let it hover, as ``on_exit`` says, and close. Waits until it has landed.
+    """Land or hover as ``on_exit`` says if this application flies the vehicle, then close. Waits until it has landed.
 
-    ``report`` is called with each step, a text for people, on this thread. Returns what went wrong, or None.
+    ``report`` is called on this thread with a text for each step. Returns the error, or None if everything worked.
     """
     return drone._piloting.end_flight(report)
 
@@ -183,7 +181,7 @@ def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[Stream
 
 
 class InboxOptions(TypedDict, total=False):
-    """What one thread waits for."""
+    """Samples that one thread waits for."""
 
     feedback: bool  #: whether feedback is wanted; True if left out
     frames: bool  #: whether frames are wanted; True if left out

@@ -1,4 +1,4 @@
-"""What goes wrong on the way, exactly the same way for the same seed. Pure: time is left to who sends."""
+"""Injects faults into transports, identically for the same seed. Pure: the sender handles time."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _Item = TypeVar("_Item")
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What goes wrong on the way, as probabilities between 0 and 1 for each packet or frame, in each direction.
+    """Faults to inject, as probabilities between 0 and 1 for each packet or frame, in each direction.
 
-    ``corrupt`` flips one random bit, and is for packets only. ``reorder`` holds one back until the next has passed.
-    Each direction of each connection draws from a ``random.Random`` of its own, made from ``seed``.
+    ``corrupt`` flips one random bit, in packets only. ``reorder`` holds an item back until the next has passed. Each
+    direction of each connection has its own ``random.Random``, derived from ``seed``.
     """
 
     seed: int = 0
@@ -32,7 +32,7 @@ class Faults:
 
 
 class FaultInjector:
-    """One direction of one connection, with its faults. Not shared between threads without a lock."""
+    """The faults of one direction of one connection. Not thread-safe."""
 
     def __init__(self, faults: Faults, key: str) -> None:
         self._faults = faults
@@ -40,7 +40,7 @@ class FaultInjector:
         self._held: list[object] = []
 
     def packets(self, packet: bytes) -> list[bytes]:
-        """What arrives when this packet is sent: any number of packets, in order of arrival."""
+        """Return what arrives when this packet is sent: any number of packets, in order of arrival."""
         if packet and self._random.random() < self._faults.corrupt:
             damaged = bytearray(packet)
             damaged[self._random.randrange(len(damaged))] ^= 1 << self._random.randrange(8)
@@ -48,7 +48,7 @@ class FaultInjector:
         return self.items(packet)
 
     def items(self, item: _Item) -> list[_Item]:
-        """The same for anything, without damage."""
+        """Do the same for items of any type, without corruption."""
         held: list[_Item] = self._held  # type: ignore[assignment]
         chance = self._random.random
         if chance() < self._faults.drop:

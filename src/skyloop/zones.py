@@ -1,6 +1,6 @@
 """Where a vehicle may fly: a room's walls, the safety box, and the no-fly zones; all upright, in world axes. Pure.
 
-World axes are x east, y north, z up [m]. What a vehicle does near such a wall is decided in the proxy.
+World axes are x east, y north, z up [m]. The proxy decides what a vehicle does near these walls.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Final, NamedTuple
 from skyloop.errors import ParameterError
 from skyloop.messages import Refusal, Value
 
-FAR_M: Final = 10_000.0  #: a wall of the safety box that far away is none
+FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away does not count
 MAX_ZONES: Final = 32
-#: A thinner zone is kept clear of as if it were so thick: an overshoot or a gust must not end on its far side [m].
+#: Thinner zones are enlarged to this thickness, so that an overshoot or a gust does not end on their far side [m].
 THINNEST_M: Final = 0.5
-BOX: Final = "safety.box"  #: the parameters of the box begin so
+BOX: Final = "safety.box"  #: prefix of the box's parameters
 ZONES: Final = "safety.zones"
 ROOM: Final = "safety.room"
 
@@ -30,12 +30,12 @@ Vec3 = tuple[float, float, float]
 
 
 class Wall(NamedTuple):
-    """A plane: the unit vector towards it, world axes, and how far it is [m]; below 0 the vehicle is beyond it."""
+    """A plane: the unit vector towards it in world axes, and its distance [m], negative beyond it."""
 
     normal: Vec3
     distance: float
-    name: str  #: of the parameter
-    zone: str = ""  #: name of the zone, if it has one
+    name: str  #: name of the parameter
+    zone: str = ""  #: name of the zone, if any
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +44,10 @@ class Box:
 
     low: Vec3
     high: Vec3
-    name: str = ""  #: of a zone
+    name: str = ""  #: name of the zone, if any
 
     def walls_inside(self, place: Vec3) -> Iterator[Wall]:
-        """Those of a box that is to be kept in."""
+        """Yield the walls of a box to stay inside of."""
         for axis in range(3):
             for sign, distance in ((-1.0, place[axis] - self.low[axis]), (1.0, self.high[axis] - place[axis])):
                 normal = [0.0, 0.0, 0.0]
@@ -55,7 +55,7 @@ class Box:
                 yield Wall((normal[0], normal[1], normal[2]), distance, BOX)
 
     def wall_outside(self, place: Vec3) -> Wall:
-        """The one of a box that is to be kept out of."""
+        """Return the wall of a box to stay outside of."""
         nearest = tuple(max(low, min(high, at)) for low, high, at in zip(self.low, self.high, place, strict=True))
         way = (nearest[0] - place[0], nearest[1] - place[1], nearest[2] - place[2])
         distance = math.hypot(*way)
@@ -67,18 +67,18 @@ class Box:
         )
 
     def holds(self, place: Vec3) -> bool:
-        """Whether a place is within it, or on its surface."""
+        """Return whether a place is inside or on the surface."""
         return all(low <= at <= high for low, high, at in zip(self.low, self.high, place, strict=True))
 
     def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
-        """Whether the straight way between two places leads through it."""
+        """Return whether the straight line between two places crosses it."""
         first, last = 0.0, 1.0
         for low, high, at, to in zip(self.low, self.high, start, end, strict=True):
             first, last = _within(low, high, at, to, first, last)
         return first <= last
 
     def thickened(self) -> Box:
-        """Return it at least :data:`THINNEST_M` thick along each axis, about the same middle."""
+        """Return the box, at least :data:`THINNEST_M` thick along each axis, with the same centre."""
         x, y, z = (_thickened(low, high) for low, high in zip(self.low, self.high, strict=True))
         low, high = (x[0], y[0], z[0]), (x[1], y[1], z[1])
         return self if (low, high) == (self.low, self.high) else replace(self, low=low, high=high)
@@ -99,7 +99,7 @@ class Cylinder:
     name: str = ""
 
     def wall_outside(self, place: Vec3) -> Wall:
-        """The one of a cylinder that is to be kept out of."""
+        """Return the wall of a cylinder to stay outside of."""
         east, north = self.x - place[0], self.y - place[1]
         off = math.hypot(east, north)
         aside = (east / off, north / off) if off > 0.0 else (1.0, 0.0)
@@ -114,22 +114,22 @@ class Cylinder:
         return Wall((0.0, 0.0, up), along, ZONES, self.name)
 
     def holds(self, place: Vec3) -> bool:
-        """Whether a place is within it, or on its surface."""
+        """Return whether a place is inside or on the surface."""
         return math.hypot(place[0] - self.x, place[1] - self.y) <= self.radius and self.low <= place[2] <= self.high
 
     def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
-        """Whether the straight way between two places leads through it."""
+        """Return whether the straight line between two places crosses it."""
         first, last = _within(self.low, self.high, start[2], end[2], 0.0, 1.0)
         if first > last:
             return False
         x, y, across, along = start[0] - self.x, start[1] - self.y, end[0] - start[0], end[1] - start[1]
         length = across * across + along * along
-        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # of the whole line, as a share of it
+        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # position along the infinite line
         share = max(first, min(last, nearest))
         return math.hypot(x + share * across, y + share * along) <= self.radius
 
     def thickened(self) -> Cylinder:
-        """Return it at least :data:`THINNEST_M` thick, about the same middle."""
+        """Return the cylinder, at least :data:`THINNEST_M` thick, with the same centre."""
         radius, (low, high) = max(self.radius, THINNEST_M / 2), _thickened(self.low, self.high)
         if (radius, low, high) == (self.radius, self.low, self.high):
             return self
@@ -147,62 +147,62 @@ class Space:
     """Where a vehicle may fly.
 
     Attributes:
-        room: The walls that it can't pass, where they are known; None: they are not.
+        room: The room's walls, which the vehicle can't pass; None: unknown.
         box: The safety box; None: there is none.
-        zones: The no-fly zones, as they are written.
-        barriers: The same, none of them thinner than :data:`THINNEST_M`.
+        zones: The no-fly zones, as written.
+        barriers: The same, but at least :data:`THINNEST_M` thick.
     """
 
     room: Box | None = None
     box: Box | None = None
     zones: tuple[Zone, ...] = ()
-    barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)  # the zones as they are kept clear of
+    barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)  # the zones as they are enforced
 
     def __post_init__(self) -> None:
-        """Thicken what is too thin."""
+        """Thicken the zones that are too thin."""
         object.__setattr__(self, "barriers", tuple(zone.thickened() for zone in self.zones))
 
     @property
     def walled(self) -> bool:
-        """Whether there are walls that shorten set-points; those of a room do not."""
+        """Whether there are walls that limit set-points; those of a room do not."""
         return self.box is not None or bool(self.zones)
 
     @property
     def thin(self) -> tuple[Zone, ...]:
-        """The zones that are kept clear of as if they were thicker, as they are written."""
+        """The zones that are thickened, as written."""
         return tuple(zone for zone, kept in zip(self.zones, self.barriers, strict=True) if zone is not kept)
 
     def problem_at(self, place: Vec3) -> str:
-        """Return why a place can't be flown to, and what can, in words for a person; empty if it can."""
+        """Return why the vehicle may not fly to a place, and where it may, for people; empty if it may."""
         if self.room is not None and not self.room.holds(place):
-            return f"the place is outside of the room, {self.room} [m] ({ROOM})"
+            return f"the place is outside the room, {self.room} [m] ({ROOM})"
         if self.box is not None and not self.box.holds(place):
-            return f"the place is outside of the safety box, {self.box} [m] ({BOX})"
+            return f"the place is outside the safety box, {self.box} [m] ({BOX})"
         for zone, kept in zip(self.zones, self.barriers, strict=True):
             if kept.holds(place):
-                return f"the place is in a no-fly zone, {_shown(zone, kept)}: choose a place outside of it"
+                return f"the place is in a no-fly zone, {_shown(zone, kept)}: choose a place outside it"
         return ""
 
     def problem_between(self, start: Vec3, end: Vec3) -> str:
-        """Return what is in the straight way between two places, in words for a person; empty if nothing is.
+        """Return what blocks the straight line between two places, for people; empty if nothing does.
 
-        A zone that the way begins in may be left.
+        A zone that contains the start does not count, so that a vehicle can leave it.
         """
         for zone, kept in zip(self.zones, self.barriers, strict=True):
             if not kept.holds(start) and kept.is_in_the_way(start, end):
-                return f"a no-fly zone is in the straight way there, {_shown(zone, kept)}: fly round it, place by place"
+                return f"a no-fly zone blocks the straight line, {_shown(zone, kept)}: fly around it in several legs"
         return ""
 
 
 def space_of(number: Callable[[str], float], text: Callable[[str], str]) -> Space:
-    """Return where parameters allow a vehicle to fly.
+    """Return the space that parameters allow a vehicle to fly in.
 
     Args:
-        number: Returns the value of a parameter that is a number, by its name.
-        text: Returns the value of one that is a text.
+        number: Returns the value of a numeric parameter by its name.
+        text: Returns the value of a text parameter by its name.
 
     Raises:
-        ParameterError: The zones can't be read.
+        ParameterError: The zones can't be parsed.
     """
     low = (number(f"{BOX}.x_low"), number(f"{BOX}.y_low"), number(f"{BOX}.z_low"))
     high = (number(f"{BOX}.x_high"), number(f"{BOX}.y_high"), number(f"{BOX}.z_high"))
@@ -214,23 +214,23 @@ def _room(text: str) -> Box | None:
     try:
         zones = parse_zones(text)
     except ParameterError:
-        return None  # a driver with another notion of this name
+        return None  # a driver that uses this name for something else
     return zones[0] if len(zones) == 1 and isinstance(zones[0], Box) else None
 
 
 def parse_zones(text: str) -> tuple[Zone, ...]:
-    """Read zones as they are written, with semicolons between them.
+    """Parse zones, separated by semicolons.
 
     Args:
         text: ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, world axes [m]; a name and a
-            colon may stand before each: ``tree: cylinder 1 2 0.5 0 3``.
+            colon may precede each: ``tree: cylinder 1 2 0.5 0 3``.
 
     Raises:
-        ParameterError: it can't be read, or there are too many.
+        ParameterError: The text can't be parsed, or has too many zones.
     """
     zones = [_parse_zone(part) for part in text.split(";") if part.strip()]
     if len(zones) > MAX_ZONES:
-        raise _wrong(f"{len(zones)} zones are given, at most {MAX_ZONES} are possible")
+        raise _wrong(f"{len(zones)} zones were given, at most {MAX_ZONES} are possible")
     return tuple(zones)
 
 
@@ -238,16 +238,16 @@ def _parse_zone(text: str) -> Zone:
     before, colon, after = text.partition(":")
     name = " ".join(before.split()) if colon else ""
     if colon and not _NAME.fullmatch(name):
-        raise _wrong(f"a name has 1 to {MAX_NAME} letters and no comma, colon or semicolon, not {name!r:.40}")
+        raise _wrong(f"a name must have 1 to {MAX_NAME} letters and no comma, colon or semicolon, got {name!r:.40}")
     shape, *words = re.split(r"[\s,]+", (after if colon else text).strip())
     if shape not in _SHAPES:
-        raise _wrong(f"a zone is a box or a cylinder, not {shape!r:.40}")
+        raise _wrong(f"a zone must be a box or a cylinder, got {shape!r:.40}")
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        raise _wrong(f"what follows {shape} must be numbers, not {' '.join(words)!r:.60}") from None
+        raise _wrong(f"{shape} must be followed by numbers, got {' '.join(words)!r:.60}") from None
     if len(numbers) != _SHAPES[shape] or not all(math.isfinite(number) for number in numbers):
-        raise _wrong(f"a {shape} has {_SHAPES[shape]} finite numbers, not {len(numbers)} as in {text.strip()!r:.60}")
+        raise _wrong(f"a {shape} must have {_SHAPES[shape]} finite numbers, got {len(numbers)} in {text.strip()!r:.60}")
     if shape == "box":
         pairs = list(zip(numbers[:3], numbers[3:], strict=True))
         low, high = [min(pair) for pair in pairs], [max(pair) for pair in pairs]
@@ -256,7 +256,7 @@ def _parse_zone(text: str) -> Zone:
         return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]), name)
     x, y, radius, bottom, top = numbers
     if radius <= 0.0 or bottom >= top:
-        raise _wrong(f"a cylinder has a radius above 0 and its low end below its high one: {text.strip()!r:.60}")
+        raise _wrong(f"a cylinder must have a radius above 0 and its low end below its high end: {text.strip()!r:.60}")
     return Cylinder(x, y, radius, bottom, top, name)
 
 
@@ -264,7 +264,7 @@ def check_written(name: str, value: Value, number: Callable[[str], float]) -> No
     """Check a value of a safety parameter against the others.
 
     Raises:
-        ParameterError: a wall of the box beyond the opposite one, or no list of zones.
+        ParameterError: A wall of the box is beyond the opposite one, or the zones can't be parsed.
     """
     if name == ZONES:
         parse_zones(str(value))
@@ -282,7 +282,7 @@ def _thickened(low: float, high: float) -> tuple[float, float]:
 
 
 def _shown(zone: Zone, kept: Zone) -> str:
-    thin = "" if zone is kept else f"; it is thin, and kept clear of as if it were {THINNEST_M:g} m thick"
+    thin = "" if zone is kept else f"; it is thin and enforced as if it were {THINNEST_M:g} m thick"
     return f"{zone} [m] ({ZONES}{thin})"
 
 
@@ -292,11 +292,11 @@ def _prefix(name: str) -> str:
 
 def _wrong(why: str) -> ParameterError:
     form = "box x y z x y z; tree: cylinder x y radius z_low z_high"
-    return ParameterError(f"{ZONES}: {why}; it looks like {form!r} [m]", code=Refusal.OUT_OF_RANGE)
+    return ParameterError(f"{ZONES}: {why}; for example {form!r} [m]", code=Refusal.OUT_OF_RANGE)
 
 
 def _within(low: float, high: float, at: float, to: float, first: float, last: float) -> tuple[float, float]:
-    """The part of a way from ``at`` to ``to``, of that between the shares ``first`` and ``last``, between two walls."""
+    """Return the part of the segment from ``at`` to ``to`` between two walls, within ``first`` to ``last``."""
     if at == to:
         return (first, last) if low <= at <= high else (1.0, 0.0)
     one, other = (low - at) / (to - at), (high - at) / (to - at)

@@ -33,7 +33,7 @@ def test_a_route_is_checked(run: Run, tour: Path, tmp_path: Path) -> None:
     save_route(Route(waypoints=(*TOUR.waypoints, RouteWaypoint(50, 0, -3))), far := tmp_path / "far.route.json")
     bad = run("route", "check", str(far), "--drone", FAST_SIM)
     assert bad.code == 1
-    assert "error: waypoint 4: the place is outside of the room" in bad.out
+    assert "error: waypoint 4: the place is outside the room" in bad.out
     listed = json.loads(run("route", "check", str(far), "--drone", FAST_SIM, "--json").out)
     assert [one["waypoint"] for one in listed["findings"] if one["severity"] == "error"] == [4]
     refused = run("route", "fly", str(far), "--drone", FAST_SIM)

@@ -93,7 +93,7 @@ def test_a_flight(proxy: ScriptedProxy) -> None:
 @pytest.mark.parametrize("target", ["replay://none.mcap?speed=max", "replay:///a/b.mcap?start=3&speed=max"])
 def test_a_replay_in_step_is_refused_at_once(target: str) -> None:
     async def begin() -> None:
-        with pytest.raises(UsageError, match=r"in step .* use skyloop\.connect, or give a number"):
+        with pytest.raises(UsageError, match=r"while a thread waits, .* use skyloop\.connect, or give a number"):
             await aio.connect(target)
         with pytest.raises(UsageError, match=r"use skyloop\.connect"):
             async with aio.connect(target):

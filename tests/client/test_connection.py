@@ -296,7 +296,7 @@ def test_loss_and_disorder(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_nobody_there_at_first() -> None:
     proxy = ScriptedProxy()
-    with pytest.raises(LinkError, match="nothing serves"):
+    with pytest.raises(LinkError, match="has no server"):
         open_drone(proxy.server.dial, app="me")
 
 

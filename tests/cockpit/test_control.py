@@ -282,7 +282,7 @@ def test_a_place_that_the_proxy_refuses_is_told_with_its_reason(client: TestClie
         pilot.say("set", name="safety.box.x_high", value=2.0)
         pilot.wait("done", do="set")
         pilot.say("goto", x=3, y=0, z=1)
-        assert "outside of the safety box" in pilot.wait("refused", do="goto")["why"]
+        assert "outside the safety box" in pilot.wait("refused", do="goto")["why"]
         until(lambda: node.flyer.state is FlightState.HOVERING)
         pilot.say("goto", x=0.5, y=0, z=0.3)
         with pilot.staying():
@@ -319,7 +319,7 @@ def test_a_way_stays_watched_after_a_command_that_took_nobodys_place(client: Tes
             pilot.say("route_skip")
             assert "no route" in pilot.wait("refused", do="route_skip")["why"]
             pilot.say("set", name="safety.box.x_high", value=20.0)
-            assert "outside of the safety box" in pilot.wait("refused", do="goto")["why"]
+            assert "outside the safety box" in pilot.wait("refused", do="goto")["why"]
         until(lambda: node.flyer.state is FlightState.HOVERING)
 
 

@@ -100,9 +100,9 @@ def test_the_cockpits_own_world_is_for_drones_that_know_none() -> None:
     ("place", "words"),
     [
         ((1.0, 0.0, 1.0), ""),
-        ((0.0, 5.0, 1.0), "outside of the safety box"),
+        ((0.0, 5.0, 1.0), "outside the safety box"),
         ((2.0, 0.0, 1.0), "in a no-fly zone"),
-        ((3.0, 0.0, 1.0), "in the straight way"),
+        ((3.0, 0.0, 1.0), "blocks the straight line"),
         ((0.0, 0.0, 9.0), "limits.altitude"),
     ],
 )

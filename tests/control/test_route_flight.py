@@ -79,7 +79,7 @@ def test_a_refused_leg_pauses_with_the_reason_and_can_be_skipped() -> None:
         assert flight.law.state == "done"
     paused = [step for step in told if step.kind == "route.paused"]
     assert [step.waypoint for step in paused] == [2]
-    assert "a no-fly zone is in the straight way there" in paused[0].text
+    assert "a no-fly zone blocks the straight line" in paused[0].text
 
 
 @pytest.mark.parametrize(

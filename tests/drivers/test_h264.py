@@ -68,7 +68,7 @@ def test_sizes_keys_and_numbers_of_every_profile(width: int, height: int, more: 
 
 def test_pictures_that_build_on_later_ones_are_named() -> None:
     found = sound(encoded(b_frames=2))
-    assert {unit.reason for unit in found} == {"", "pictures build on later ones (B-frames)"}
+    assert {unit.reason for unit in found} == {"", "pictures refer to later ones (B-frames)"}
     assert not any(unit.after_gap for unit in found)
 
 

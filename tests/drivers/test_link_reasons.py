@@ -26,7 +26,7 @@ DENIED = OSError(errno.EACCES, "Permission denied")
         (TimeoutError("timed out"), "timed out", "join it"),
         (OSError(), "OSError", "join it"),
         (OSError(errno.EADDRINUSE, "in use"), "in use", "end the other program"),
-        (socket.gaierror(-2, "Name or service not known"), "its name is not known", "correct the name"),
+        (socket.gaierror(-2, "Name or service not known"), "its name is unknown", "correct the name"),
     ],
 )
 def test_what_failed_and_what_to_do(error: OSError, reason: str, remedy: str) -> None:
@@ -42,12 +42,12 @@ def test_a_port_that_is_not_there_names_those_that_are(tmp_path: Path) -> None:
     assert trouble.reason == f"there is no {tmp_path}/none"
     assert trouble.remedy.startswith("plug the vehicle in")
     assert trouble.remedy.endswith(f"{tmp_path}/ttyACM0, {tmp_path}/ttyUSB1")
-    assert "ports that are there" not in serial_trouble(OSError(), str(tmp_path / "none"), "", tmp_path / "no").remedy
+    assert "available ports" not in serial_trouble(OSError(), str(tmp_path / "none"), "", tmp_path / "no").remedy
 
 
 def test_what_is_no_port(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "is no serial port" in serial_trouble(OSError(), str(tmp_path / "file"), "").reason
+    assert "is not a serial port" in serial_trouble(OSError(), str(tmp_path / "file"), "").reason
 
 
 @pytest.mark.parametrize(
@@ -125,5 +125,5 @@ def test_a_name_that_nobody_knows(monkeypatch: pytest.MonkeyPatch, error: Except
     monkeypatch.setattr("skyloop.drivers.vehicle_link.NAME_WAIT_S", 10.0)
     lookup = NameLookup()
     for _ in range(2):  # it is asked anew each time
-        with pytest.raises(OSError, match=r"not known|no name of a host"):
+        with pytest.raises(OSError, match=r"not known|not a valid host name"):
             lookup.address("drone")

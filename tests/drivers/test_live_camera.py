@@ -256,7 +256,7 @@ def test_h264_in_a_container_becomes_a_stream(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("codec", "form", "b_frames", "options", "why"),
     [
-        ("libx264", "flv", 2, {"x264-params": "b-adapt=0:scenecut=0"}, "pictures build on later ones (B-frames)"),
+        ("libx264", "flv", 2, {"x264-params": "b-adapt=0:scenecut=0"}, "pictures refer to later ones (B-frames)"),
         ("mpeg4", "matroska", 0, {}, "the video is mpeg4, not H.264"),
     ],
 )
@@ -309,8 +309,8 @@ def test_a_stream_without_keys_is_left_to_ffmpeg_after_a_while_and_that_is_told(
             assert sink.wait(lambda: sink.frame_counts["front"] > 5, PATIENCE_S), told(sink)
         with Projector(server.send):  # with keys: damage is looked for again
             came(sink, GROUP)
-    assert any("no key picture came without a fault" in text for text in told(sink))
-    assert any("none was a key (IDR)" in text for text in told(sink))
+    assert any("no flawless key picture arrived" in text for text in told(sink))
+    assert any("without a key picture (IDR)" in text for text in told(sink))
     assert not [event for event in sink.events if event.kind is EventKind.DRIVER_ERROR]
 
 

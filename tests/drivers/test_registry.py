@@ -71,7 +71,7 @@ def test_an_attribute_that_is_missing_names_package_and_cause(site: Path) -> Non
 
 def test_what_is_no_driver_is_refused(site: Path) -> None:
     install(site, "not_a_drone", "notadrone = collections:OrderedDict")
-    with pytest.raises(DriverError, match=r"not_a_drone .*is not a class of"):
+    with pytest.raises(DriverError, match=r"not_a_drone .*is not a subclass of"):
         driver_class("notadrone")
 
 

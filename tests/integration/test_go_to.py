@@ -107,7 +107,7 @@ def test_a_simulated_room_is_not_left() -> None:
         here = place(drone.feedback())
         assert drone.config["safety.room"] == "box -4 -3 0 4 3 3"
         for x, y, z in ((50.0, 0.0, -3.0), (0.0, 0.0, -0.5), (0.0, 3.5, 1.0)):
-            with pytest.raises(RefusedError, match=r"outside of the room, box .* \(safety\.room\)"):
+            with pytest.raises(RefusedError, match=r"outside the room, box .* \(safety\.room\)"):
                 drone.go_to(x=x, y=y, z=z, timeout_s=LONG_S)
         assert math.dist(place(drone.feedback()), here) < 0.3
 
@@ -147,9 +147,9 @@ def test_walls_hold_for_the_place_and_on_the_way(vehicle: str) -> None:
         x, y, z = place(drone.feedback())
         drone.config["safety.box.x_high"] = x + 1.5
         drone.config["safety.zones"] = f"cylinder {x - 1.5} {y} 0.4 0 50"
-        with pytest.raises(RefusedError, match=r"outside of the safety box, box .*safety\.box"):
+        with pytest.raises(RefusedError, match=r"outside the safety box, box .*safety\.box"):
             drone.go_to(x=x + 2.0, y=y, z=z)
-        with pytest.raises(RefusedError, match="in the straight way there"):
+        with pytest.raises(RefusedError, match="blocks the straight line"):
             drone.go_to(x=x - 3.0, y=y, z=z)
         with pytest.raises(RefusedError, match="the place is in a no-fly zone"):
             drone.go_to(x=x - 1.5, y=y, z=z)

@@ -239,7 +239,7 @@ def near() -> Iterator[Drone]:
         ({"encoding": "h264", "kbit_s": 500.0}, "must be a whole number"),
         ({"encoding": "h264", "part": (0, 2)}, "part is not possible"),
         ({"encoding": "h264", "quality": 50}, "is of encoding"),
-        ({"kbit_s": 500}, "kbit_s and subscriber are of"),
+        ({"kbit_s": 500}, "kbit_s and subscriber need"),
     ],
 )
 def test_wishes_that_make_no_sense_are_refused(near: Drone, options: dict[str, object], why: str) -> None:

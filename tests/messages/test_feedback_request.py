@@ -71,7 +71,7 @@ def test_a_rate_that_makes_no_sense(max_hz: Any) -> None:
     ],
 )
 def test_topics_that_are_none(topic: str) -> None:
-    with pytest.raises(UsageError, match="is no request for feedback"):
+    with pytest.raises(UsageError, match="is not a request for feedback"):
         FeedbackRequest.parse(topic)
 
 

@@ -81,7 +81,7 @@ def test_who_may_tell_and_what() -> None:
         told: list[str] = []
         with drone.on_event(lambda event: told.append(event.text), inline=True):
             assert drone.send_external_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-            wait_until(lambda: any("sim:// takes no poses from outside" in text for text in told), "it was told")
+            wait_until(lambda: any("sim:// does not accept external poses" in text for text in told), "it was told")
         with (
             skyloop.connect(drone.name, access="observe") as onlooker,
             pytest.raises(AuthorityError, match="this application observes"),

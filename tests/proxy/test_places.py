@@ -96,10 +96,10 @@ def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed
         (Position(1.0, 0.0, 1.0), at(0, 0, 1, captured_ns=NOW - 3 * NS_PER_S), Refusal.WRONG_STATE, "3.0 s old"),
         (Position(0.0, 0.0, 7.0), START, Refusal.OUT_OF_RANGE, "z is 7 m, and at most 5.00 m is allowed"),
         (Position(0.0, 0.0, 6.0), at(0, 0, 1, altitude_m=2.0), Refusal.OUT_OF_RANGE, "at most 4.00 m"),
-        (Position(5.0, 0.0, 1.0), START, Refusal.OUT_OF_RANGE, "outside of the safety box, box -4 -4 0 4 4 3"),
-        (Position(0.0, 0.0, 3.5), START, Refusal.OUT_OF_RANGE, "outside of the safety box"),
+        (Position(5.0, 0.0, 1.0), START, Refusal.OUT_OF_RANGE, "outside the safety box, box -4 -4 0 4 4 3"),
+        (Position(0.0, 0.0, 3.5), START, Refusal.OUT_OF_RANGE, "outside the safety box"),
         (Position(2.1, 0.1, 1.0), START, Refusal.OUT_OF_RANGE, "in a no-fly zone, cylinder 2 0 0.5 0 3"),
-        (Position(3.5, 0.1, 1.0), START, Refusal.OUT_OF_RANGE, "in the straight way there, cylinder 2 0 0.5 0 3"),
+        (Position(3.5, 0.1, 1.0), START, Refusal.OUT_OF_RANGE, "blocks the straight line, cylinder 2 0 0.5 0 3"),
     ],
 )
 def test_what_is_refused_and_why(asked: Position, feedback: Feedback | None, reason: Refusal, words: str) -> None:
@@ -111,8 +111,8 @@ def test_what_is_refused_and_why(asked: Position, feedback: Feedback | None, rea
 @pytest.mark.parametrize(
     ("asked", "feedback", "words"),
     [
-        (Position(50.0, 0.0, -3.0), START, "outside of the room, box -4 -4 0 4 4 9 [m] (safety.room)"),
-        (Position(0.0, 0.0, -0.2), START, "outside of the room"),
+        (Position(50.0, 0.0, -3.0), START, "outside the room, box -4 -4 0 4 4 9 [m] (safety.room)"),
+        (Position(0.0, 0.0, -0.2), START, "outside the room"),
         (Position(0.0, 0.0, 8.0), START, "at most 5.00 m is allowed"),
     ],
 )
@@ -156,7 +156,7 @@ def test_repeats_are_lowered_to_a_lower_ceiling_and_drift_past_a_zone_is_not_ref
 
 
 REFUSED = [
-    (Position(3.5, 0.1, 1.0), "in the straight way there"),
+    (Position(3.5, 0.1, 1.0), "blocks the straight line"),
     (Position(0.0, 0.0, 6.0), "at most 5.00 m is allowed"),
     (Position(-2.0, 0.0, -3.0), "3.00 m below the ground"),
 ]

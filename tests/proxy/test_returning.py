@@ -219,7 +219,7 @@ def test_the_height_is_kept_where_it_may_fly(space: Space, limits: Limits, feedb
         (HOME, Space(zones=(Cylinder(2, 0, 0.5, 0, 5),)), at(5, 0, 1), Refusal.OUT_OF_RANGE, "a no-fly zone is in"),
         (HOME, Space(zones=(Box((-1, -1, 0), (1, 1, 1)),)), at(5, 0, 1), Refusal.OUT_OF_RANGE, "a no-fly zone is in"),
         (HOME, Space(zones=(Box((4, -1, 1.5), (6, 1, 1.8)),)), at(5, 0, 1), Refusal.OUT_OF_RANGE, "no-fly zone is in"),
-        (HOME, Space(box=Box((1, -9, 0), (9, 9, 9))), at(5, 0, 1), Refusal.OUT_OF_RANGE, "outside of the safety box"),
+        (HOME, Space(box=Box((1, -9, 0), (9, 9, 9))), at(5, 0, 1), Refusal.OUT_OF_RANGE, "outside the safety box"),
     ],
 )
 def test_what_is_against_it(
@@ -246,7 +246,7 @@ def test_a_zone_that_is_set_on_the_way_stops_it() -> None:
     back = flight()
     back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.0), NOW)
     zones = Space(zones=(Cylinder(2, 0, 0.5, 0, 5),))
-    assert "a no-fly zone is in the straight way" in back.step(within(LIMITS, zones), at(5.0, 0.0, 2.1), NOW).why
+    assert "a no-fly zone blocks the straight line" in back.step(within(LIMITS, zones), at(5.0, 0.0, 2.1), NOW).why
     assert back.step(within(LIMITS, zones), at(5.0, 0.0, 2.1), NOW).action is None, "repeats don't change that"
     assert back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 2.1), NOW).action is not None
 

@@ -315,7 +315,7 @@ def test_safety_as_they_are_written() -> None:
         ("sphere 1 2 3", "a box or a cylinder"),
         ("box 1 2 3", "6 finite numbers, not 3"),
         ("box 1 2 3 4 5 nan", "finite"),
-        ("box 1 2 3 4 5 x", "must be numbers"),
+        ("box 1 2 3 4 5 x", "must be followed by numbers"),
         ("box 1 2 3 1 5 6", "extent"),
         ("cylinder 0 0 0 0 1", "radius"),
         ("cylinder 0 0 1 2 1", "low end"),

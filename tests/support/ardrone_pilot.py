@@ -78,7 +78,7 @@ class Pilot:
                 continue
             if reached(self.seen[-1]):
                 return self.seen[-1]
-        raise AssertionError(f"waited {PATIENCE_S} s in vain until {what}; last: {self.seen[-1:]}")
+        raise AssertionError(f"waited {PATIENCE_S} s, still not true: {what}; last: {self.seen[-1:]}")
 
     def configure(self, key: str, value: str) -> Navdata:
         """With the handshake."""

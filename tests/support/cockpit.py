@@ -424,5 +424,5 @@ def until(condition: Callable[[], Any], what: str = "it happened") -> None:
     """Wait for what nothing signals."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
-        assert time.monotonic() < deadline, f"waited {PATIENCE_S} s in vain until {what}"
+        assert time.monotonic() < deadline, f"waited {PATIENCE_S} s, still not true: {what}"
         time.sleep(0.002)

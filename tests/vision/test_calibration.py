@@ -194,7 +194,7 @@ def test_an_address_may_name_a_calibration(tmp_path: Path) -> None:
     check_intrinsics(uri)
     assert intrinsics_of(uri, 640, 480) == FILE.intrinsics
     assert intrinsics_of(uri, 640, 360) is None
-    with pytest.raises(UsageError, match="does not go with calibration"):
+    with pytest.raises(UsageError, match="can't be combined with calibration"):
         check_intrinsics(parse_uri(f"video://0?calibration={file}&fx=3"))
     with pytest.raises(FileFormatError, match="can't be read"):
         check_intrinsics(parse_uri("video://0?calibration=/no/such/file"))

@@ -7,9 +7,9 @@
         async for frame in drone.frames():
             drone.velocity(forward=0.3)
 
-They wrap :class:`skyloop.Drone` and :class:`skyloop.Swarm`, which work on threads of their own and are
-available as :attr:`Drone.sync` and :attr:`Swarm.sync`. Cancelling a call ends the waiting; what it was waiting for is
-not undone.
+They wrap :class:`skyloop.Drone` and :class:`skyloop.Swarm`, which run in their own threads and are available as
+:attr:`Drone.sync` and :attr:`Swarm.sync`. Cancelling a call ends the waiting, but does not undo the request that it
+waited for.
 """
 
 from skyloop.aio.bridge import Callback, Config, Drone, Listener, Swarm, connect, swarm

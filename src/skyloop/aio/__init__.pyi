@@ -40,7 +40,7 @@ __all__ = ["Callback", "Config", "Drone", "Listener", "Swarm", "connect", "swarm
 class Config:
     """Parameters: ``await drone.config.get("limits.tilt")``, ``await drone.config.set("limits.tilt", 0.2)``.
 
-    Writing needs the authority. See :class:`skyloop.client.Config` for what becomes of values that were written.
+    Writing needs the authority. See :class:`skyloop.client.Config` for how written values are kept.
     """
 
     sync: client.Config
@@ -49,7 +49,7 @@ class Config:
     async def get(self, name: str) -> Value:
         """Return the present value.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Raises:
             UnknownNameError: If there is no such parameter; carries suggestions.
@@ -57,7 +57,7 @@ class Config:
     async def set(self, name: str, value: object) -> None:
         """Write one value.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Raises:
             ParameterError: If the proxy refuses it, with its reason.
@@ -69,22 +69,22 @@ class Config:
     async def items(self) -> list[tuple[str, Value]]:
         """Return (name, value) of all parameters, sorted by name.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def values(self) -> list[Value]:
         """Return the values of all parameters, sorted by name.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def parameters(self) -> list[Parameter]:
         """Return all parameters, sorted by name.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def describe(self, name: str) -> Parameter:
         """Return all that is known of a parameter: type, unit, range, default, value, description.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Raises:
             UnknownNameError: If there is no such parameter; carries suggestions.
@@ -94,9 +94,9 @@ class Drone:
     """A connected vehicle, made by :func:`connect`.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Drone`; those that wait are coroutines.
-    Callbacks, plain or coroutine functions, run on the event loop that was running when they were added. Those of
-    images are plain functions on threads of their own, as work on images would block the event loop, and so is the
-    predicate that :meth:`wait` is given.
+    Callbacks, plain or coroutine functions, run on the event loop that was running when they were added. Image
+    callbacks are the exception: they are plain functions in their own threads, because image processing would block the
+    event loop. So is the predicate of :meth:`wait`.
     """
 
     sync: client.Drone
@@ -107,7 +107,7 @@ class Drone:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting."""
+        """This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting."""
     @property
     def log(self) -> client.Logbook:
         """Publishes text and numbers beside the flight; see :class:`skyloop.client.Logbook`."""
@@ -158,7 +158,7 @@ class Drone:
     async def close(self) -> None:
         """Release the authority, then end the connection, all threads and a private proxy.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Does not land, except that a private proxy lands what flies before it ends. Idempotent. Threads that wait for
         this drone get :class:`ClosedError`.
@@ -166,7 +166,7 @@ class Drone:
     async def stats(self) -> dict[str, ChannelStats]:
         """Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
         callback. Otherwise the proxy is asked for the delay over all pilots, which waits up to 0.2 s.
@@ -174,7 +174,7 @@ class Drone:
     async def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
         """Return the checklist before a flight: what is as it should be, what is not, why it matters, what to do.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Asks the proxy for its parameters and, of each camera, for a picture. Nothing is flown, and no authority is
         needed.
@@ -190,7 +190,7 @@ class Drone:
     async def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         While this waits, a take-off for which the vehicle is not ready yet is commanded again, twice a second. A call
         that fails, a time-out and Ctrl-C included, ends the take-off: the vehicle hovers if it is in the air, else it
@@ -214,7 +214,7 @@ class Drone:
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the present position.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         While this waits, a landing that was ended by a failsafe, a lost link or a lost lease is commanded again. Where
         the vehicle's own link breaks the proxy goes on with the landing by itself, also if nobody waits.
@@ -251,7 +251,7 @@ class Drone:
     ) -> None:
         """Fly straight to a place, and stay there.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         World axes are those of ``Feedback.position_m``. Where the vehicle knows its place on the earth
         (``Feedback.origin``), latitude and longitude may be given instead; they are converted when this is called.
@@ -291,7 +291,7 @@ class Drone:
     ) -> None:
         """Fly back to where the vehicle took off, and land there or hover.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         It climbs straight up to a safe height if it is lower, kept below ``limits.altitude``, the ceiling of the room
         and the upper wall of the safety box, flies straight over its start (:attr:`start_position`) as :meth:`go_to`
@@ -326,7 +326,7 @@ class Drone:
     ) -> AuthorityStatus:
         """Ask for the authority and wait for it.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         A holder of lower priority is pre-empted at once, or with ``takeover="ask"`` asked first, and pre-empted when it
         agrees or after the proxy's ``authority.ask_s``. With ``"ask"`` a holder of the same or higher priority is asked
@@ -353,7 +353,7 @@ class Drone:
     async def release_authority(self) -> None:
         """Release the authority, or leave the queue, and wait until the proxy has confirmed it.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Does nothing if the authority is neither held nor wanted.
 
@@ -364,7 +364,7 @@ class Drone:
     async def next_feedback(self, timeout_s: float = 1.0, *, max_hz: float | None = None) -> Feedback:
         """Wait for feedback that was not read before, and return the newest.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             timeout_s: How long to wait [s].
@@ -378,7 +378,7 @@ class Drone:
     async def next_frame(self, camera: str | None = None, *, timeout_s: float = 1.0) -> Frame:
         """Wait for a frame that this method has not returned before, and return the newest.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         The first call subscribes to the camera, for good.
 
@@ -396,7 +396,7 @@ class Drone:
     async def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
         """Wait until the newest feedback is as wanted.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             state: A flight state or its name, several of them, or a predicate on feedback, which is called on this
@@ -415,7 +415,7 @@ class Drone:
     async def overview(self, timeout_s: float = 2.0) -> Overview:
         """Return the newest overview of all vehicles that the proxy's process serves, a row each.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         It is sent once a second, and much smaller than feedback: for who watches many vehicles. The first call
         subscribes to it, for good, and waits for one.
@@ -713,7 +713,7 @@ class Drone:
     ) -> Listener:
         """Call ``function`` with each overview of all vehicles that the proxy's process serves; see :meth:`overview`.
 
-        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` has to be False.
+        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         Args:
             function: Called on the event loop, once a second.
@@ -728,7 +728,7 @@ class Drone:
     ) -> Listener:
         """Call ``function`` with the newest feedback.
 
-        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` has to be False.
+        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         Like every ``on_...`` method it returns a :class:`Listener`, whose ``cancel()`` ends it, and raises
         :class:`UsageError` if ``function`` can't be called and :class:`ClosedError` if the drone was closed.
@@ -742,7 +742,7 @@ class Drone:
     def on_event(self, function: Callable[[Event], object | Awaitable[object]], *, inline: bool = False) -> Listener:
         """Call ``function`` with each event, including the client's own (number 0).
 
-        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` has to be False.
+        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         Args:
             function: Called on the event loop; up to 256 events wait for it.
@@ -759,7 +759,7 @@ class Drone:
     ) -> Listener:
         """Call ``function`` with what the proxy made of each command of any application.
 
-        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` has to be False.
+        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         Args:
             function: Called on the event loop; up to 256 wait for it.
@@ -770,7 +770,7 @@ class Drone:
     ) -> Listener:
         """Call ``function`` with what any application draws on a frame.
 
-        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` has to be False.
+        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         Args:
             function: Called on the event loop; up to 256 wait for it.
@@ -779,7 +779,7 @@ class Drone:
     def on_log(self, function: Callable[[LogEntry], object | Awaitable[object]], *, inline: bool = False) -> Listener:
         """Call ``function`` with what any application logs, this one included (see ``drone.log``).
 
-        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` has to be False.
+        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         Args:
             function: Called on the event loop; up to 256 entries wait for it.
@@ -796,7 +796,7 @@ class Drone:
     ) -> Listener:
         """Call ``function`` with the results of one processor, or of all.
 
-        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` has to be False.
+        ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         Args:
             function: Called on the event loop.
@@ -819,12 +819,12 @@ class Listener:
 
     sync: client.Listener[Any]
     def __init__(self, sync: client.Listener[Any]) -> None:
-        """Wrap a listener whose function hands over to the event loop."""
+        """Wrap a listener whose function hands samples to the event loop."""
     def cancel(self) -> None:
-        """Stop calling the function. Does not wait for a call that is under way."""
+        """Stop calling the function. Does not wait for a call in progress."""
     @property
     def errors(self) -> int:
-        """Calls that raised."""
+        """Number of calls that raised."""
     @property
     def delivered(self) -> int:
         """How often the function was called."""
@@ -833,11 +833,11 @@ class Listener:
         """Samples that newer ones pushed out before the function was ready for them."""
 
 class Swarm:
-    """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating gives all.
+    """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
-    :meth:`emergency_stop` are coroutines, and so is :meth:`feedback`: what ``on_error`` says may be a landing. One
-    task at a time awaits them; :meth:`emergency_stop` may be called at any time.
+    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may demand a landing. Only one
+    task at a time may await them; :meth:`emergency_stop` may be called at any time.
     """
 
     sync: client.Swarm
@@ -847,24 +847,24 @@ class Swarm:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting."""
+        """This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting."""
     @property
     def active(self) -> dict[str, Drone]:
-        """Drones that commands go to, by name; see :attr:`skyloop.Swarm.active`."""
+        """The drones that receive commands, by name; see :attr:`skyloop.Swarm.active`."""
     def items(self) -> list[tuple[str, Drone]]:
         """Return (name, drone) of all drones, including those set aside."""
     def __getitem__(self, name: str) -> Drone: ...
     def __iter__(self) -> Iterator[Drone]: ...
     def __repr__(self) -> str: ...
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
-        """Await ``function`` of all active drones at the same time, on this event loop. Cancelling it cancels them.
+        """Await ``function`` for all active drones concurrently, on this event loop. Cancelling cancels all of them.
 
         Args:
-            function: A coroutine function; what it raises counts as for :meth:`skyloop.Swarm.each`.
-            what: Name of the action in the report of failures; empty: the function's.
+            function: A coroutine function; its exceptions count as in :meth:`skyloop.Swarm.each`.
+            what: Name of the action in error messages; empty: the function's.
 
         Returns:
-            What it returned, by name.
+            Its results, by name.
         """
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
@@ -883,12 +883,12 @@ class Swarm:
     async def close(self) -> None:
         """End all connections. Does not land. Idempotent.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off with all active drones at the same time; see :meth:`Drone.takeoff`.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             wait: Wait until each hovers.
@@ -901,7 +901,7 @@ class Swarm:
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land all active drones at their present positions, at the same time; see :meth:`Drone.land`.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             wait: Wait until each has landed.
@@ -922,7 +922,7 @@ class Swarm:
     ) -> None:
         """Fly each drone straight to its own place, all at the same time; see :meth:`Drone.go_to`.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Nothing keeps the drones apart on the way: :class:`skyloop.control.formation_flight.Formation` plans ways that
         do. Drones that are set aside are left out.
@@ -945,7 +945,7 @@ class Swarm:
     ) -> None:
         """Fly all active drones back to where each took off, all at the same time; see :meth:`Drone.return_to_start`.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Nothing keeps the drones apart on the way.
 
@@ -963,21 +963,21 @@ class Swarm:
     async def hover(self) -> dict[str, bool]:
         """Stop and hold the position, with all active drones.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         One that others fly is left to them: only its own ``drones[name].hover()`` takes it back.
         """
     async def idle(self) -> dict[str, bool]:
         """Ask for nothing: keep the authority and leave the vehicles as they are.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def velocity(
         self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
         """Fly with the same velocity, each drone in its own levelled body axes.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             forward: Along x, forward [m/s].
@@ -990,7 +990,7 @@ class Swarm:
     ) -> dict[str, bool]:
         """Hold the same attitude with all active drones; see :meth:`Drone.attitude`.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             roll: Right side down is positive [rad].
@@ -1001,17 +1001,17 @@ class Swarm:
     async def reset_emergency(self) -> dict[str, bool]:
         """Leave the emergency state, on the ground, with all active drones.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def command(self, action: AnyAction) -> dict[str, bool]:
         """Make ``action`` the newest set-point of all active drones; see :meth:`send`.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
         """Make each action the newest set-point of the drone of its name, all sent together.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Drones that are set aside are left out. A hover takes no drone from others, see :meth:`hover`. :attr:`spread` is
         how far apart the first and the last command left.
@@ -1039,7 +1039,7 @@ class Swarm:
     ) -> dict[str, AuthorityStatus]:
         """Ask for the authority over all active drones.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             priority: 0 (highest) to 31 (lowest); None: as in the last request.
@@ -1054,12 +1054,12 @@ class Swarm:
     async def release_authority(self) -> None:
         """Release the authority over all active drones.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def feedback(self, *, max_age_s: float | None = None) -> dict[str, Feedback]:
         """Return the newest feedback of each active drone, by name.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             max_age_s: Oldest age since capture that is accepted [s]; a drone whose feedback is older has failed.
@@ -1071,7 +1071,7 @@ class Swarm:
     async def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
         """Wait until all active drones are as wanted *at the same time*.
 
-        It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.
+        This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         A drone whose link is lost is not as wanted, whatever its last feedback. Drones that are not as wanted in time
         have failed.

@@ -1,4 +1,4 @@
-"""The asyncio API of drones and swarms: tables of the members that forward to the synchronous ones, and the rest."""
+"""The asyncio API of drones and swarms: tables of members that forward to the synchronous classes, and the rest."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from skyloop.messages import Encoding
 
 T = TypeVar("T")
 Opened = TypeVar("Opened", bound=AbstractAsyncContextManager[Any, Any])
-#: A callback of an asyncio application, a function or a coroutine function. It runs on the event loop.
+#: A callback of an asyncio application: a function or a coroutine function. It runs on the event loop.
 Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 
 
@@ -46,7 +46,7 @@ class LoopNotifier(Notifier):
             self._loop.call_soon_threadsafe(self._came.set)
 
     async def within(self, timeout_s: float) -> bool:
-        """Wait for a notification that this has not returned True for yet; return whether one came in time."""
+        """Wait for a notification; return whether a new one arrived in time."""
         try:
             await asyncio.wait_for(self._came.wait(), timeout_s)
         except TimeoutError:
@@ -56,10 +56,10 @@ class LoopNotifier(Notifier):
 
 
 async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], object] | None = None) -> T:
-    """Run a function that waits on a thread of its own: a pool could be full when the vehicle has to land.
+    """Run a blocking function in its own thread: a thread pool could be full when the vehicle has to land.
 
-    If the caller is cancelled meanwhile, a wait for a command ends (see :data:`skyloop.client.commands.cancelled`),
-    and ``abandoned`` is called with the result that nobody waits for.
+    If the caller is cancelled, a wait for a command ends (see :data:`skyloop.client.commands.cancelled`), and
+    ``abandoned`` is called with the unclaimed result.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
@@ -73,14 +73,14 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
         else:
             future.set_result(result)  # type: ignore[arg-type]
 
-    outside = cancelled.get()  # of a thread that waits for this coroutine
+    outside = cancelled.get()  # the cancellation of an outer thread that waits for this coroutine
 
     def work() -> None:
         result, error = None, None
         cancelled.set(lambda: future.cancelled() or outside())
         try:
             result = function()
-        except BaseException as problem:  # noqa: BLE001  (it is raised where the result is awaited)
+        except BaseException as problem:  # noqa: BLE001  (it is re-raised where the result is awaited)
             error = problem
         try:
             loop.call_soon_threadsafe(settle, result, error)
@@ -92,14 +92,14 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
     try:
         return await future
     except asyncio.CancelledError:
-        # Cancelled in the very round of the loop in which the result came: nobody else will ever see it.
+        # Cancelled in the same round of the event loop as the result arrived: no one else will see it.
         if future.done() and not future.cancelled() and future.exception() is None and abandoned is not None:
             threading.Thread(target=abandoned, args=(future.result(),), daemon=True).start()
         raise
 
 
 def from_thread(function: Callback[T]) -> Callable[[T], Any]:
-    """Wrap ``function`` so that another thread can call it: it runs on this event loop and is waited for."""
+    """Wrap ``function`` for calls from another thread: it runs on this event loop, and the call waits for it."""
     loop = asyncio.get_running_loop()
 
     async def call(sample: T) -> object:
@@ -112,11 +112,11 @@ def from_thread(function: Callback[T]) -> Callable[[T], Any]:
     return wait
 
 
-# Ways to make a member of a face from one of the synchronous class; each takes over names, defaults and text --------
+# Ways to turn a member of a synchronous class into one of an asyncio class; all keep names, defaults and docstrings ---
 
 
 def mirrors(kind: type, rows: Mapping[Callable[[Any], Any], str]) -> Callable[[type[T]], type[T]]:
-    """Decorate a face with members of ``kind``: for each way to make one, a row of their names."""
+    """Decorate an asyncio class with members of ``kind``: each way to make one has a row of names."""
 
     def fill(face: type[T]) -> type[T]:
         for way, names in rows.items():
@@ -128,23 +128,23 @@ def mirrors(kind: type, rows: Mapping[Callable[[Any], Any], str]) -> Callable[[t
 
 
 def at_once(member: Any) -> Any:
-    """Keep a method or a property that does not wait as it is."""
+    """Keep a non-blocking method or property unchanged."""
     return property(_forwarded(member)) if isinstance(member, property) else _forwarded(member)
 
 
 def awaited(member: Any) -> Any:
-    """Make a coroutine function of a method or a property that waits: it waits on a thread of its own."""
+    """Turn a blocking method or property into a coroutine function, which waits in its own thread."""
     plain = _forwarded(member)
 
     @wraps(plain)
     async def call(self: Any, *args: Any, **given: Any) -> Any:
         return await in_thread(lambda: plain(self, *args, **given))
 
-    return _explained(call, "It is awaited, and waits on a thread of its own. Cancelling the task ends the waiting.")
+    return _explained(call, "This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.")
 
 
 def on_loop(member: Any) -> Any:
-    """Let a method that takes a callback run it on the event loop that runs when it is called."""
+    """Make a method run its callback on the event loop of the caller."""
     plain = _forwarded(member)
 
     @wraps(plain)
@@ -158,12 +158,12 @@ def on_loop(member: Any) -> Any:
     takes = signature.parameters["function"].annotation
     either = re.sub(r"^(Callable\[\[.*\], )(.*)\]$", r"\1\2 | Awaitable[\2]]", takes)
     text = "``function``, plain or a coroutine function, runs on the event loop"
-    text += "; ``inline`` has to be False." if "inline" in signature.parameters else "."
+    text += "; ``inline`` must be False." if "inline" in signature.parameters else "."
     return _explained(_typed(call, signature, function=either, returns="Listener"), text)
 
 
 def opener(face: Callable[[Any], Opened], function: Callable[..., Any]) -> Callable[..., Opening[Opened]]:
-    """Make a function that connects from a synchronous one: its result is awaited, or entered."""
+    """Turn a synchronous connect function into one whose result is awaited, or entered."""
 
     @wraps(function)
     def call(*targets: Any, **options: Any) -> Opening[Opened]:
@@ -174,7 +174,7 @@ def opener(face: Callable[[Any], Opened], function: Callable[..., Any]) -> Calla
 
 
 def like(member: Any, text: str = "") -> Callable[[T], T]:
-    """Give a method that is written by hand its counterpart's docstring, with another paragraph."""
+    """Give a hand-written method its counterpart's docstring, with one more paragraph."""
 
     def explain(function: T) -> T:
         function.__doc__ = member.__doc__
@@ -184,7 +184,7 @@ def like(member: Any, text: str = "") -> Callable[[T], T]:
 
 
 def _forwarded(member: Any) -> Callable[..., Any]:
-    """Call the method, or read the property, of the object that a face wraps."""
+    """Call the method, or read the property, of the wrapped object."""
     reads = isinstance(member, property)
     function = member.fget if reads else member
 
@@ -209,18 +209,18 @@ def _typed(made: T, signature: inspect.Signature, *, returns: str, **types: str)
     own: Any = made
     own.__signature__ = signature.replace(parameters=parameters, return_annotation=returns)
     own.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": returns}
-    del own.__wrapped__  # whose annotations would be read instead
+    del own.__wrapped__  # its annotations would be read instead
     return made
 
 
-# The faces -----------------------------------------------------------------------------------------------------------
+# The asyncio classes -------------------------------------------------------------------------------------------------
 
 
 @mirrors(client.Config, {awaited: "items values parameters describe"})
 class Config:
     """Parameters: ``await drone.config.get("limits.tilt")``, ``await drone.config.set("limits.tilt", 0.2)``.
 
-    Writing needs the authority. See :class:`skyloop.client.Config` for what becomes of values that were written.
+    Writing needs the authority. See :class:`skyloop.client.Config` for how written values are kept.
     """
 
     sync: client.Config  #: the wrapped parameters
@@ -237,19 +237,19 @@ class Config:
 class Listener:
     """A callback that runs on the event loop, one call at a time."""
 
-    sync: client.Listener[Any]  #: the wrapped listener, whose own thread waits for each call
+    sync: client.Listener[Any]  #: the wrapped listener; its thread waits for each call
 
     def __init__(self, sync: client.Listener[Any]) -> None:
-        """Wrap a listener whose function hands over to the event loop."""
+        """Wrap a listener whose function hands samples to the event loop."""
         self.sync = sync
 
     def cancel(self) -> None:
-        """Stop calling the function. Does not wait for a call that is under way."""
-        self.sync.cancel(wait=False)  # its thread may be waiting for this very event loop
+        """Stop calling the function. Does not wait for a call in progress."""
+        self.sync.cancel(wait=False)  # its thread may be waiting for this event loop
 
     @property
     def errors(self) -> int:
-        """Calls that raised."""
+        """Number of calls that raised."""
         return self.sync.errors
 
 
@@ -274,9 +274,9 @@ class Drone:
     """A connected vehicle, made by :func:`connect`.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Drone`; those that wait are coroutines.
-    Callbacks, plain or coroutine functions, run on the event loop that was running when they were added. Those of
-    images are plain functions on threads of their own, as work on images would block the event loop, and so is the
-    predicate that :meth:`wait` is given.
+    Callbacks, plain or coroutine functions, run on the event loop that was running when they were added. Image
+    callbacks are the exception: they are plain functions in their own threads, because image processing would block the
+    event loop. So is the predicate of :meth:`wait`.
     """
 
     sync: client.Drone  #: the wrapped drone
@@ -347,11 +347,11 @@ async def _decoded(channel: VideoChannel, arrival: Arrival | None, max_age_s: fl
     },
 )
 class Swarm:
-    """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating gives all.
+    """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
-    :meth:`emergency_stop` are coroutines, and so is :meth:`feedback`: what ``on_error`` says may be a landing. One
-    task at a time awaits them; :meth:`emergency_stop` may be called at any time.
+    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may demand a landing. Only one
+    task at a time may await them; :meth:`emergency_stop` may be called at any time.
     """
 
     sync: client.Swarm  #: the wrapped swarm
@@ -368,7 +368,7 @@ class Swarm:
 
     @property
     def active(self) -> dict[str, Drone]:
-        """Drones that commands go to, by name; see :attr:`skyloop.Swarm.active`."""
+        """The drones that receive commands, by name; see :attr:`skyloop.Swarm.active`."""
         return {name: self._drones[name] for name in self.sync.active}
 
     @like(client.Swarm.items)
@@ -386,14 +386,14 @@ class Swarm:
         return f"<aio.{repr(self.sync)[1:]}"
 
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
-        """Await ``function`` of all active drones at the same time, on this event loop. Cancelling it cancels them.
+        """Await ``function`` for all active drones concurrently, on this event loop. Cancelling cancels all of them.
 
         Args:
-            function: A coroutine function; what it raises counts as for :meth:`skyloop.Swarm.each`.
-            what: Name of the action in the report of failures; empty: the function's.
+            function: A coroutine function; its exceptions count as in :meth:`skyloop.Swarm.each`.
+            what: Name of the action in error messages; empty: the function's.
 
         Returns:
-            What it returned, by name.
+            Its results, by name.
         """
         loop = asyncio.get_running_loop()
         ours = {id(drone.sync): drone for drone in self}
@@ -412,7 +412,7 @@ class Swarm:
 
         try:
             return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
-        finally:  # where it was cancelled they would fly on, over what is commanded next
+        finally:  # after a cancellation they would keep flying, against the next commands
             over = True
             for waiting in begun:
                 waiting.cancel()
@@ -425,7 +425,7 @@ class Swarm:
 
 
 class Opening(Generic[Opened]):
-    """Result of :func:`connect` and :func:`swarm`: connects when awaited; entered, it also ends with the block."""
+    """Result of :func:`connect` and :func:`swarm`: connects when awaited, or for the duration of an ``async with``."""
 
     _opened: Opened | None = None
 
@@ -457,10 +457,10 @@ class Opening(Generic[Opened]):
 
 
 def _reject_in_step(target: object) -> None:
-    """Raise for a stepped replay, whose time would stand still here."""
+    """Raise for a stepped replay, whose time would never advance here."""
     if isinstance(target, str) and target.startswith("replay://") and parse_uri(target).options.get("speed") == "max":
         raise UsageError(
-            f"{target}: speed=max is in step with the one thread that waits, which an event loop never does: use "
+            f"{target}: speed=max advances only while a thread waits, which an event loop never does: use "
             "skyloop.connect, or give a number, such as speed=10"
         )
 

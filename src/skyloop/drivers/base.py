@@ -1,8 +1,8 @@
 """The contract between the proxy and a vehicle's driver. ``docs/drivers.md`` shows how to write one.
 
-A driver speaks one vehicle family's native protocol and knows nothing of the network, of applications or of
-authority. It converts units and axes at its edge: above it are SI units and body axes x forward, y left, z up. Its
-class is registered under the entry-point group ``skyloop.drivers`` with its URI scheme as the name.
+A driver speaks one vehicle family's native protocol and knows nothing of the network, applications or authority. It
+converts units and axes at its edge: everything above uses SI units and body axes x forward, y left, z up. Its class is
+registered under the entry-point group ``skyloop.drivers`` with its URI scheme as the name.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class Sink(Protocol):
         """Publish the vehicle's newest state.
 
         Args:
-            feedback: With the vehicle's block filled in. The proxy's fields (``seq``, ``published_ns``, ``lease``,
-                ``owner`` and the like) keep their defaults. A number that is not known is None, never NaN.
+            feedback: The state, with the vehicle's block filled in. The proxy's fields (``seq``, ``published_ns``,
+                ``lease``, ``owner``, …) keep their defaults. An unknown number is None, never NaN.
         """
 
     def frame(
@@ -70,23 +70,23 @@ class Sink(Protocol):
         """Publish a whole frame.
 
         Args:
-            camera: A name that :meth:`Driver.capabilities` lists.
+            camera: A name from :meth:`Driver.capabilities`.
             pixels: C-contiguous uint8. Raw encodings have exactly ``height * width * channels`` bytes; JPEG is one
-                file. May be reused when the call returns.
+                file. May be reused after the call.
             captured_ns: When the frame was captured, on this host's monotonic clock.
             width: [px]
             height: [px]
-            encoding: Of ``pixels``.
-            intrinsics: For this size, None if they are not known.
+            encoding: Encoding of ``pixels``.
+            intrinsics: For this size; None if unknown.
         """
 
     def wants(self, camera: str) -> bool:
-        """Return whether anybody uses this camera's frames now. If not, a driver may save itself the decoding."""
+        """Return whether anyone uses this camera's frames at present. If not, a driver need not decode them."""
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many of this camera's frames a second are used now, by whoever uses most of them.
+        """Return how many of this camera's frames per second the most demanding consumer uses at present.
 
-        0: none; infinity: all. A driver for which a frame is expensive may leave out what exceeds it.
+        0: none; infinity: all. A driver whose frames are expensive may skip those beyond this rate.
         """
 
     def stream(
@@ -100,79 +100,79 @@ class Sink(Protocol):
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a picture as the vehicle encoded it, of a camera whose ``CameraInfo`` announces ``stream="h264"``.
+        """Publish a picture as the vehicle encoded it, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
 
-        Size, time and intrinsics are those of the decoded frame, which goes to :meth:`frame` as well while somebody
-        wants that.
+        Size, time and intrinsics are those of the decoded frame. While someone uses frames, that one is also passed to
+        :meth:`frame`.
 
         Args:
-            camera: A name that :meth:`Driver.capabilities` lists.
-            data: One access unit of H.264 in Annex B form, undamaged, with SPS and PPS if it is a key picture, of a
-                stream without B pictures. One that is no key picture follows the picture that was given last: begin
-                with a key picture after a gap, and after a while in which nobody wanted any.
+            camera: A name from :meth:`Driver.capabilities`.
+            data: One access unit of H.264 in Annex B form, undamaged, from a stream without B pictures; key pictures
+                with SPS and PPS. Any other picture continues the previous one passed here: start with a key picture
+                after a gap, and after a period without receivers.
             captured_ns: When the picture was captured, on this host's monotonic clock.
             width: [px]
             height: [px]
-            key: Whether decoding can begin with this picture.
-            intrinsics: For this size, None if they are not known.
+            key: Whether decoding can start with this picture.
+            intrinsics: For this size; None if unknown.
         """
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether anybody receives this camera's encoded pictures now."""
+        """Return whether anyone receives this camera's encoded pictures at present."""
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        """Report a new state of the vehicle link, or a new reason for the present one.
+        """Report a new state of the vehicle link, or a new reason for the current one.
 
         Args:
             state: UP once the vehicle answers.
-            reason: What is waited for, and what failed last. Shown to everybody.
-            remedy: What a person can do about it, as an instruction ("join its Wi-Fi network"). Shown to everybody.
+            reason: The expected event and the last failure. Shown to every client.
+            remedy: What a person can do about it, as an instruction ("join its Wi-Fi network"). Shown to every client.
         """
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
-        """Emit an event that a person or a program may want to know about.
+        """Emit an event.
 
         Args:
-            kind: Of the event.
-            text: For people.
-            severity: For people and for filters.
-            **data: For programs.
+            kind: Kind of the event.
+            text: Text for people.
+            severity: Severity, for people and filters.
+            **data: Data for programs.
         """
 
 
 class ServedLink(Protocol):
-    """A link to a vehicle that a host serves on a thread of its own, together with those of other vehicles."""
+    """A vehicle link served by a host, on one thread for the links of several vehicles."""
 
     def fileno(self) -> int:
-        """Return what becomes readable when :meth:`serve` is to be called."""
+        """Return a descriptor that becomes readable when :meth:`serve` must be called."""
 
     def serve(self, *, readable: bool) -> int | None:
-        """Do what there is to do, without waiting. What it raises is reported already; it is tried again after a pause.
+        """Do all pending work without waiting. Its errors have been reported already; the host retries after a pause.
 
         Args:
-            readable: Whether :meth:`fileno` is; if not, only the time asks for it.
+            readable: Whether :meth:`fileno` is readable; if not, the time of the last result has come.
 
         Returns:
-            When to call it again at the latest, on the monotonic clock [ns]; None: never, but :meth:`end` once.
+            Latest time of the next call, on the monotonic clock [ns]; None: call :meth:`end` instead.
         """
 
     def end(self) -> None:
-        """Release its resources."""
+        """Release the link's resources."""
 
 
-AHEAD_NS: Final = nanoseconds(0.05)  #: a pose may be stamped so far ahead: two hosts' clocks are known no better
+AHEAD_NS: Final = nanoseconds(0.05)  #: a pose may be this far in the future: two hosts' clocks are not known better
 
 
 @dataclass(frozen=True, slots=True)
 class ExternalPose:
-    """Where something outside of the vehicle, such as motion capture, saw it.
+    """A vehicle's pose as measured from outside, for example by motion capture.
 
     Args:
-        position_m: Of the body's origin in world axes, x east, y north, z up [m].
+        position_m: Position of the body's origin in world axes, x east, y north, z up [m].
         quaternion: (x, y, z, w), rotates body axes (x forward, y left, z up) to world axes.
-        captured_ns: When it was measured, on this host's monotonic clock.
-        position_std_m: Standard deviation of the position [m], 0 or more; None if it is not known.
-        attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if it is not known.
+        captured_ns: Time of the measurement, on this host's monotonic clock.
+        position_std_m: Standard deviation of the position [m], 0 or more; None if unknown.
+        attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if unknown.
 
     Raises:
         UsageError: A number is not finite, a standard deviation is negative, or the quaternion's length differs from 1
@@ -189,13 +189,13 @@ class ExternalPose:
         check_pose(self.position_m, self.quaternion, self.position_std_m, self.attitude_std_rad)
 
     def bounded(self, now_ns: int) -> ExternalPose:
-        """Return the pose with a time that is not in the future; drivers take no other.
+        """Return the pose with a time that is not in the future, as drivers require.
 
         Args:
             now_ns: The present time, on this host's monotonic clock.
 
         Raises:
-            DriverError: It is stamped more than 50 ms ahead: a wrong clock, and all that follow would look old.
+            DriverError: Its time is more than 50 ms ahead: the clock is wrong, and all later poses would look old.
         """
         ahead_ns = self.captured_ns - now_ns
         if ahead_ns > AHEAD_NS:
@@ -204,23 +204,23 @@ class ExternalPose:
 
 
 class Driver(ABC):
-    """Base class of drivers: owns the life cycle; a subclass writes what is abstract and, if it flies, ``_apply``.
+    """Base class of drivers. It owns the life cycle; subclasses implement the abstract methods and, to fly, ``_apply``.
 
-    No I/O happens before :meth:`open`. Times given to the sink are ``time.monotonic_ns`` of this host. ``_open(sink)``
-    starts threads and waits for nothing, ``_close()`` joins them and forgets what was in force, and ``_apply(action)``
-    does what :meth:`apply` says. The attributes ``uri`` and ``_sink`` are this class's own.
+    No I/O happens before :meth:`open`. Times passed to the sink are ``time.monotonic_ns`` of this host. ``_open(sink)``
+    starts threads and does not wait, ``_close()`` joins them and clears all set-points, and ``_apply(action)``
+    implements :meth:`apply`. The attributes ``uri`` and ``_sink`` belong to this class.
 
     Args:
         uri: The vehicle's address with its options.
 
     Attributes:
-        shared: Whether others may fly the vehicle too. If so, one that is found in the air is theirs and left alone.
+        shared: Whether others may also fly the vehicle. If so, a vehicle found in the air is theirs and left alone.
         parameters_without_authority: Names of parameters that any pilot may write: those that move nothing that flies.
         serve_link: Set by a host before :meth:`open`, for a thread that serves several vehicles; None: the driver has
-            a thread of its own.
+            its own thread.
 
     Raises:
-        UsageError: A subclass raises it for an option that it does not know; see :func:`reject_unknown_options`.
+        UsageError: Raised by a subclass for an unknown option; see :func:`reject_unknown_options`.
     """
 
     shared = True
@@ -228,61 +228,61 @@ class Driver(ABC):
     serve_link: Callable[[ServedLink], None] | None = None
 
     def __init__(self, uri: VehicleUri) -> None:
-        """Store the address. A subclass reads its options here, and does no I/O."""
+        """Store the address. Subclasses read their options here, without I/O."""
         self.uri = uri
-        self.__lock = threading.Lock()  # of this class alone: a driver may well have a _lock of its own
+        self.__lock = threading.Lock()  # private to this class: subclasses may have their own _lock
         self._sink: Sink | None = None
 
-    # What it can do --------------------------------------------------------------------------------------------
+    # Abilities ------------------------------------------------------------------------------------------------
 
     @abstractmethod
     def capabilities(self) -> Capabilities:
         """Return what the vehicle can do.
 
-        May be called before :meth:`open`. The proxy emulates actions that are not named in software where it can.
+        May be called before :meth:`open`. The proxy emulates missing actions in software where it can.
         """
 
     def parameters(self) -> list[Parameter]:
-        """Return the vehicle's own parameters with their present values, those known so far.
+        """Return the vehicle's own parameters known so far, with their present values.
 
         Names are dotted and lower-case. May be called before the vehicle has answered.
         """
         return []
 
     def set_parameter(self, name: str, value: Value) -> Value:  # noqa: ARG002
-        """Write one parameter and return the value that is now in force.
+        """Write one parameter and return the value then in force.
 
         Called on the proxy's request thread; may take up to a second.
 
         Args:
-            name: A name that :meth:`parameters` lists.
-            value: Type and range were checked against :meth:`parameters`.
+            name: A name from :meth:`parameters`.
+            value: The value; type and range have been checked against :meth:`parameters`.
 
         Returns:
-            The value in force, which a vehicle may have rounded.
+            The value in force, which the vehicle may have rounded.
 
         Raises:
-            ParameterError: The vehicle refuses it; with the vehicle's own reason.
+            ParameterError: The vehicle refuses the value; the text gives its reason.
         """
         raise ParameterError(f"{name} cannot be written", code=Refusal.READ_ONLY)
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, sink: Sink) -> None:
-        """Start to talk to the vehicle. Returns at once; the state of the link goes to the sink.
+        """Start to communicate with the vehicle. Returns at once; the sink gets the state of the link.
 
-        A vehicle that does not answer is no error: the driver keeps trying.
+        An unreachable vehicle is not an error: the driver keeps trying.
 
         Args:
             sink: Receives everything that the vehicle reports, until :meth:`close` returns.
 
         Raises:
-            UsageError: The driver is open already, or for something else that trying again can't mend.
-            MissingExtraError: A package that this vehicle needs is not installed.
+            UsageError: The driver is already open, or another error occurred that a retry can't fix.
+            MissingExtraError: A package that the driver needs is not installed.
         """
         with self.__lock:
             if self._sink is not None:
-                raise UsageError(f"{self.uri} is open already")
+                raise UsageError(f"{self.uri} is already open")
             self._sink = sink
         try:
             self._open(sink)
@@ -293,7 +293,7 @@ class Driver(ABC):
     def close(self) -> None:
         """Stop threads and release resources. Idempotent.
 
-        Does not land the vehicle: the proxy does that before. The sink is not called after it returns.
+        Does not land the vehicle: the proxy does so beforehand. The sink is not called after this returns.
         """
         with self.__lock:
             was_open, self._sink = self._sink is not None, None
@@ -303,54 +303,53 @@ class Driver(ABC):
     # Flying ----------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, *, new: bool = True) -> AnyAction:
-        """Make the vehicle perform an action until the next call.
+        """Execute an action until the next call.
 
-        Must not block longer than a few milliseconds. The proxy makes one call at a time, with actions that
-        :meth:`capabilities` names and with finite numbers.
+        Must not block for more than a few milliseconds. The proxy makes one call at a time, only with actions in
+        :meth:`capabilities`, and with finite numbers.
 
         Args:
-            action: A set-point or a one-time action. A take-off without telemetry is refused, and not kept for
+            action: A set-point or a one-time action. A take-off without telemetry is refused rather than kept for
                 later.
-            new: Whether an application newly asked for it. If not, it is the library's repeat of an earlier request, or
-                what became of one, and keeps in force what is in force: it never takes the vehicle back from somebody
-                else.
+            new: Whether it is a new request of an application. Otherwise it is the library's repeat or continuation of
+                an earlier request, and must not take the vehicle back from another controller.
 
         Returns:
-            What was applied, after the vehicle's limits.
+            The action after the vehicle's limits.
 
         Raises:
-            DriverError: The vehicle can't do it; the text is shown to people.
+            DriverError: The vehicle can't execute it; the text is shown to people.
         """
         return self._apply(action) if new else self._repeat(action)
 
     def check(self, action: AnyAction) -> None:  # noqa: B027  most vehicles refuse nothing
-        """Refuse what the software autopilot is asked for, where the vehicle is sure not to do it.
+        """Refuse a request to the software autopilot that the vehicle is sure not to follow.
 
-        Called before the software autopilot begins with an action that the vehicle does not take itself; a vehicle that
-        can't be armed refuses the take-off. Returns at once.
+        Called before the software autopilot starts an action that the vehicle does not support itself. For example, a
+        vehicle that can't be armed refuses the take-off. Returns at once.
 
         Args:
             action: Take-off, hover, land, velocity or position.
 
         Raises:
-            DriverError: The vehicle would not do it; the text is shown to people.
+            DriverError: The vehicle would not follow; the text is shown to people.
         """
 
     def left_to(self) -> str:
-        """Return what others made of the vehicle since it was last commanded from here, such as ``RTL``.
+        """Return what others made the vehicle do since the last command from here, such as ``RTL``.
 
-        For vehicles that report it. The proxy asks several times a second and leaves alone what others fly; a new
-        action takes the vehicle over and ends this. May be called from any thread; returns at once.
+        For vehicles that report it. The proxy asks several times a second, and leaves alone what others fly; a new
+        action takes the vehicle over and ends this. Thread-safe; returns at once.
 
         Returns:
-            The driver's word for it, empty if nothing was changed.
+            The driver's word for it; empty if nothing changed.
         """
         return ""
 
     def failsafe(self, action: Hover | Land) -> bool:
-        """Apply an action while nobody is in command. Never raises.
+        """Apply an action while no pilot is in command. Never raises.
 
-        A failure is emitted as an event, and the proxy tries again.
+        The driver emits a failure as an event, and the proxy retries.
 
         Args:
             action: Hover or land.
@@ -361,37 +360,37 @@ class Driver(ABC):
         sink = self._sink
         try:
             self._alone(action)
-        except Exception as error:  # noqa: BLE001  a failsafe must come back whatever the driver's code does
+        except Exception as error:  # noqa: BLE001  a failsafe must return whatever the driver's code does
             if sink is not None:
                 sink.event(EventKind.DRIVER_ERROR, f"failsafe {action.name} failed: {error!r}", Severity.ERROR)
             return False
         return True
 
-    # What some vehicles can do besides ---------------------------------------------------------------------------
+    # Abilities of some vehicles --------------------------------------------------------------------------------------
 
     def external_pose(self, pose: ExternalPose) -> None:  # noqa: ARG002
-        """Send the vehicle its pose as motion capture measured it, for flight without GPS.
+        """Send the vehicle its pose from motion capture, for flight without GPS.
 
-        May be called from any thread; returns at once.
+        Thread-safe; returns at once.
 
         Args:
             pose: Position and orientation in world axes.
 
         Raises:
-            UnsupportedError: The vehicle accepts no poses from outside.
-            DriverError: The pose can't be sent now.
+            UnsupportedError: The vehicle does not accept external poses.
+            DriverError: The pose can't be sent at present.
         """
-        raise UnsupportedError(f"{self.uri.scheme}:// takes no poses from outside")
+        raise UnsupportedError(f"{self.uri.scheme}:// does not accept external poses")
 
     def checkup(self) -> list[Diagnostic]:
-        """Return what about the vehicle and its settings needs attention before flying.
+        """Return findings about the vehicle and its settings that need attention before flying.
 
-        ``skyloop doctor ADDRESS`` and ``drone.preflight()`` show it. Called while the driver is open, from any thread;
-        returns at once.
+        ``skyloop doctor ADDRESS`` and ``drone.preflight()`` show them. Called while the driver is open, from any
+        thread; returns at once.
         """
         return []
 
-    # To be written by a driver ---------------------------------------------------------------------------------
+    # To be implemented by drivers -------------------------------------------------------------------------------------
 
     @abstractmethod
     def _open(self, sink: Sink) -> None: ...
@@ -400,19 +399,19 @@ class Driver(ABC):
     def _close(self) -> None: ...
 
     def _apply(self, action: AnyAction) -> AnyAction:
-        raise UsageError(f"{self.uri.scheme} takes no {action.name}")
+        raise UsageError(f"{self.uri.scheme} does not support {action.name}")
 
     def _repeat(self, action: AnyAction) -> AnyAction:
-        """Apply a repeat; see :meth:`apply`. Override it where somebody else may fly the vehicle too."""
+        """Apply a repeat; see :meth:`apply`. Override it where others may fly the vehicle, too."""
         return self._apply(action)
 
     def _alone(self, action: Hover | Land) -> AnyAction:
-        """Apply what a failsafe asks for; see :meth:`failsafe`. Override it where that differs from a pilot's wish."""
+        """Apply a failsafe's action; see :meth:`failsafe`. Override it where that differs from a pilot's request."""
         return self._apply(action)
 
 
 def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
-    """Raise an error for an option of the URI that the driver does not know.
+    """Raise an error for an unknown option of the URI.
 
     Args:
         uri: The vehicle's address.
@@ -427,23 +426,23 @@ def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
 
 
 def checked_value(parameter: Parameter, value: Value) -> Value:
-    """Return a new value of a parameter that is no vector, as a float where it is one.
+    """Check a new value of a scalar parameter; return it, converted to float for a float parameter.
 
     Raises:
-        ParameterError: It is of another type, out of range, or none of the choices.
+        ParameterError: The value is of the wrong type, out of range, or not one of the choices.
     """
     name, kind = parameter.name, parameter.type
     if kind in (ParameterType.FLOAT, ParameterType.INT) and not parameter.choices:
         whole = kind is ParameterType.INT
         if isinstance(value, bool) or not isinstance(value, int | float) or (whole and value % 1):
-            raise ParameterError(f"{name} takes a {'whole ' * whole}number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
+            raise ParameterError(f"{name} must be a {'whole ' * whole}number: {value!r:.60}", code=Refusal.WRONG_TYPE)
         low = -sys.float_info.max if parameter.minimum is None else parameter.minimum
         high = sys.float_info.max if parameter.maximum is None else parameter.maximum
-        if not low <= value <= high:  # NaN, infinities and ints of any size, too
-            raise ParameterError(f"{name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+        if not low <= value <= high:  # also rejects NaN, infinities and huge ints
+            raise ParameterError(f"{name} must be from {low:g} to {high:g}, got {value!r}", code=Refusal.OUT_OF_RANGE)
         return value if whole else float(value)
     if type(value) is not type(parameter.value):
-        raise ParameterError(f"{name} takes a {kind.value}, not {value!r:.60}", code=Refusal.WRONG_TYPE)
+        raise ParameterError(f"{name} must be a {kind.value}, got {value!r:.60}", code=Refusal.WRONG_TYPE)
     if parameter.choices and value not in parameter.choices:
         names = [str(choice) for choice in parameter.choices]
         raise ParameterError(str(UnknownNameError(name, str(value), names)), code=Refusal.OUT_OF_RANGE)

@@ -1,4 +1,4 @@
-"""Connections that carry bytes in order, without waiting: TCP and serial ports."""
+"""Ordered byte connections that never block: TCP and serial ports."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from skyloop.errors import MissingExtraError
 from skyloop.files import wait_readable
 
 CONNECT_S: Final = 1.0
-STUCK_NS: Final = nanoseconds(0.5)  #: a connection that has no room for so long is no longer read
+STUCK_NS: Final = nanoseconds(0.5)  #: a connection without room for this long counts as no longer read
 _MOST: Final = 65_536  # bytes read at once
-_BITS: Final = 10  # that a serial line takes for a byte
-_DRAIN_S: Final = 0.1  # that closing a connection may take, while a new one is to be opened
-END_S: Final = 0.5  #: the same for good: a TCP packet that is lost is sent again 0.2 s later
-_UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection ends: nothing older is delivered
-_OVERDUE_NS: Final = nanoseconds(0.1)  # a line is stalled if bytes wait so long after it should have carried them
-_TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and sends what was lost again by then
-#: Size of the longest frame of MAVLink and MSP [bytes]. Parsers of flight controllers read as many bytes as a frame
-#: announces and don't look for another frame among them, so a frame that may be cut is filled up before a stop.
+_BITS: Final = 10  # on a serial line for each byte
+_DRAIN_S: Final = 0.1  # time for closing a connection while a new one is to be opened
+END_S: Final = 0.5  #: the same at the final end: TCP resends a lost packet 0.2 s later
+_UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection ends, so that nothing older is delivered
+_OVERDUE_NS: Final = nanoseconds(0.1)  # a line is stalled if bytes still wait this long after they were due
+_TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and has resent lost packets by then
+#: Size of the longest frame of MAVLink and MSP [bytes]. Flight controllers' parsers read as many bytes as a frame
+#: announces without looking for another frame inside, so a possibly cut frame is padded before a stop is sent.
 _LONGEST: Final = 280
 
 
 class Rank(IntEnum):
-    """How important a packet is: the first is sent whatever is under way, the last only on a line that is free."""
+    """Priority of a packet: the first is always sent at once, the last only on an idle line."""
 
     STOP = 0  #: emergency stops, which empty the output buffer of a serial port
     COMMAND = 1  #: modes, arming: rare, small, never held back
     SETPOINT = 2
     QUERY = 3  #: requests, parameters
-    POSE = 4  #: poses from outside, which come often and are large
+    POSE = 4  #: external poses, which are frequent and large
 
 
-#: How far the line may be behind for a packet to be sent [ns].
+#: How far the line may lag for a packet of this rank to be sent [ns].
 _PATIENCE_NS: Final = {
     Rank.SETPOINT: nanoseconds(0.1),
     Rank.QUERY: nanoseconds(0.06),
@@ -50,27 +50,27 @@ _PATIENCE_NS: Final = {
 
 
 class LinePace:
-    """Tells how far a line is behind, so that what is sent is new when it arrives. Pure.
+    """Estimates how far a line lags, so that packets are fresh on arrival. Pure.
 
     Args:
-        bytes_per_s: Of the line; None: it is as fast as needed.
-        overdue_ns: How late what was written may be before the line counts as stalled.
+        bytes_per_s: Speed of the line; None: never a bottleneck.
+        overdue_ns: How late written bytes may be before the line counts as stalled.
     """
 
     def __init__(self, bytes_per_s: float | None, overdue_ns: int = _OVERDUE_NS) -> None:
         self._overdue_ns = overdue_ns
         self._ns_per_byte = 0.0 if bytes_per_s is None else 1e9 / bytes_per_s
-        self._free_ns = 0  # when all that was written has been carried
+        self._free_ns = 0  # when all written bytes will have been sent
         self._written = 0  # bytes
-        self._mark = 0  # so many of them
-        self._due_ns: int | None = None  # should have been carried by then; None: nothing waited
+        self._mark = 0  # this many of them
+        self._due_ns: int | None = None  # should have been sent by then; None: none waited
 
     def admits(self, rank: Rank, now_ns: int) -> bool:
-        """Return whether a packet may be sent now; if not, it would wait behind others and arrive late."""
+        """Return whether a packet may be sent now; otherwise it would queue behind others and arrive late."""
         return rank <= Rank.COMMAND or self._free_ns - now_ns <= _PATIENCE_NS[rank]
 
     def stalled(self, now_ns: int) -> bool:
-        """Return whether the line carries nothing, going by the size of the output buffer."""
+        """Return whether the line is stuck, judged by the size of the output buffer."""
         return self._due_ns is not None and now_ns > self._due_ns
 
     def on_waiting(self, size: int, now_ns: int) -> None:
@@ -82,33 +82,33 @@ class LinePace:
         self._free_ns = max(self._free_ns, now_ns + round(size * self._ns_per_byte))
 
     def on_written(self, size: int, now_ns: int) -> None:
-        """Note that so many bytes were written."""
+        """Note the number of bytes written."""
         self._free_ns = max(self._free_ns, now_ns) + round(size * self._ns_per_byte)
         self._written += size
 
 
-_NOT_READ: Final = "the vehicle no longer reads what is sent"
+_NOT_READ: Final = "the vehicle no longer reads what we send"
 
 
 class ByteStream(ABC):
     """An open connection. Not thread-safe.
 
-    ``dropped`` counts the packets that were not sent, because the line was behind or stalled, or had no room. Drivers
-    repeat each, or send a newer one. What the far end's own buffer holds is seen by none of this, nor is a
-    pseudo-terminal's, whose size the system gives as 0: sessions hold set-points back where nothing is heard.
+    ``dropped`` counts packets that were not sent because the line lagged, was stalled, or had no room. Drivers repeat
+    each of them, or send a newer one. This does not see the far end's own buffer, nor a pseudo-terminal's, whose size
+    the system reports as 0: sessions hold set-points back while they receive nothing.
     """
 
     def __init__(self, pace: LinePace, clock: Clock) -> None:
         self.dropped = 0
-        self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for what was written to leave
+        self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for written bytes to leave
         self._pace = pace
         self._clock = clock
         self._stuck_ns = STUCK_NS
         self._full_ns: int | None = None  # since when there is no room, or the line is stalled
         self._whole = _LONGEST  # bytes written since a frame may have been cut
-        self._rest = b""  # of a frame of which only the beginning found room; it makes the receiver discard that frame
-        self._cleared = False  # a full buffer was emptied for a stop, and nothing shows whether it is read since
-        self._after_stop = 1 << 62  # bytes written since a stop: where more than that wait, it is among them
+        self._rest = b""  # of a frame of which only the start was written; makes the receiver discard it
+        self._cleared = False  # a full buffer was emptied for a stop, and nothing shows yet that it is read again
+        self._after_stop = 1 << 62  # bytes written since a stop; if more than that wait, the stop is among them
 
     @abstractmethod
     def fileno(self) -> int:
@@ -116,21 +116,21 @@ class ByteStream(ABC):
 
     @abstractmethod
     def read(self) -> bytes:
-        """Return what came, possibly nothing.
+        """Return the received bytes, possibly none.
 
         Raises:
-            OSError: Nothing more will come.
+            OSError: The connection has ended.
         """
 
     def write(self, data: bytes, rank: Rank = Rank.SETPOINT) -> None:
-        """Send a packet, or drop it where there is no room or the line is behind. Never waits.
+        """Send a packet, or drop it if there is no room or the line lags. Never waits.
 
         Raises:
-            OSError: It can't be sent, or no whole packet could be for :data:`STUCK_NS`.
+            OSError: The packet can't be sent, or no whole packet could be sent for :data:`STUCK_NS`.
         """
         now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
         self._pace.on_waiting(waiting, now_ns)
-        if stop and _LONGEST < waiting <= self._after_stop:  # less is sent no later than what fills up a cut frame
+        if stop and _LONGEST < waiting <= self._after_stop:  # below that, padding takes as long
             self._discard()
         stalled = self._cleared or self._pace.stalled(now_ns)
         sent, whole = 0, False
@@ -154,11 +154,11 @@ class ByteStream(ABC):
         self._check_room(now_ns, room=whole and not stalled)
 
     def _left_of(self, packet: bytes, sent: int) -> bytes:
-        """Return what is to be written before the next packet: the end of a frame of which the beginning was sent.
+        """Return the bytes to write before the next packet: the end of a frame whose start was sent.
 
-        By then the frame is old. Its last byte, of a checksum, is inverted, and the receiver discards it; without its
-        end, the receiver would take the next packet for that. (A vehicle that ignores signatures carries out a signed
-        frame that was cut within its signature.)
+        By then the frame is old. Its last byte, part of a checksum, is inverted so that the receiver discards it;
+        without its end, the receiver would take the next packet for the missing part. (A vehicle that ignores
+        signatures executes a signed frame that was cut within its signature.)
         """
         if sent <= len(self._rest):
             return self._rest[sent:]
@@ -182,17 +182,17 @@ class ByteStream(ABC):
             raise ConnectionError(_NOT_READ)
 
     def _waiting(self) -> int:
-        """Return how many bytes are in the output buffer; 0 where that is not available."""
+        """Return how many bytes are in the output buffer; 0 where unavailable."""
         return 0
 
     def _discard(self) -> bool:
-        """Empty the output buffer, which may cut a frame; return whether it did, as far as that is known."""
+        """Empty the output buffer, which may cut a frame; return whether that worked, as far as known."""
         return False
 
     def _drain(self) -> bool:
-        """Wait a moment for what was written to leave; return whether it did."""
+        """Wait a moment for written bytes to leave; return whether they did."""
         until_s = time.monotonic() + self.drain_s
-        # On a line that carries nothing only a stop is waited for: it emptied the buffer, and may leave yet.
+        # On a stuck line only a stop is worth waiting for: the buffer was emptied for it, so it may still leave.
         patient = self._full_ns is None or self._cleared or self._waiting() > self._after_stop
         while patient and (self._waiting() or self._cleared) and time.monotonic() < until_s:
             time.sleep(0.005)
@@ -200,7 +200,7 @@ class ByteStream(ABC):
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
-        """Write what there is room for and return how many bytes that were; raise BlockingIOError for none."""
+        """Write as many bytes as fit and return their number; raise BlockingIOError if none do."""
 
     @abstractmethod
     def close(self) -> None:
@@ -208,10 +208,10 @@ class ByteStream(ABC):
 
 
 class TcpStream(ByteStream):
-    """A client of a TCP server, by its numeric address: looking up a name would block. Connected is not yet served.
+    """A TCP connection to a numeric address (a name look-up would block). A connected server may not serve yet.
 
     Raises:
-        OSError: It can't be reached within :data:`CONNECT_S`.
+        OSError: No connection within :data:`CONNECT_S`.
     """
 
     def __init__(self, host: str, port: int, clock: Clock = monotonic_ns) -> None:
@@ -219,7 +219,7 @@ class TcpStream(ByteStream):
         self._stuck_ns = nanoseconds(_UNACKNOWLEDGED_MS / 1000)  # a packet that is lost twice takes 0.6 s
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # not on macOS
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # missing on macOS
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNACKNOWLEDGED_MS)
         self._socket.setblocking(False)
 
@@ -228,41 +228,41 @@ class TcpStream(ByteStream):
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """Return what came, possibly nothing."""
+        """Return the received bytes, possibly none."""
         try:
             data = self._socket.recv(_MOST)
         except BlockingIOError:
             return b""
         if not data:
-            raise ConnectionError("the vehicle ended the connection")
+            raise ConnectionError("the vehicle closed the connection")
         return data
 
     def _write(self, data: bytes) -> int:
         return self._socket.send(data)
 
     def close(self) -> None:
-        """Close the connection. What was not received is discarded: the system would go on sending it for minutes."""
+        """Close the connection and discard unreceived data, which the system would otherwise resend for minutes."""
         if not self._drain():
             with suppress(OSError):
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
 
     def _waiting(self) -> int:
-        with suppress(Exception):  # not available, or the connection is gone
+        with suppress(Exception):  # unavailable, or the connection is gone
             import fcntl
             import termios
 
-            self._socket.getpeername()  # of one that is gone the system still counts what was not received
+            self._socket.getpeername()  # raises if the connection is gone, where unreceived bytes still count
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count
         return 0
 
 
 class SerialStream(ByteStream):
-    """A serial port, through pyserial, opened for this process alone, with an empty output buffer.
+    """A serial port, opened with pyserial for exclusive use and with an empty output buffer.
 
     Raises:
-        OSError: It can't be opened.
+        OSError: The port can't be opened.
         MissingExtraError: pyserial is not installed.
     """
 
@@ -274,7 +274,7 @@ class SerialStream(ByteStream):
         super().__init__(LinePace(line_speed(path, baud)), clock)
         self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
         self._discard()
-        self._whole = 0  # by the connection before
+        self._whole = 0  # the previous connection may have cut a frame
 
     def fileno(self) -> int:
         """Return the descriptor."""
@@ -282,40 +282,40 @@ class SerialStream(ByteStream):
         return number
 
     def read(self) -> bytes:
-        """Return what came, possibly nothing."""
+        """Return the received bytes, possibly none."""
         if not wait_readable(self, 0.0):
             return b""
-        data = os.read(self.fileno(), _MOST)  # pyserial's own waits by select.select, which knows low numbers only
+        data = os.read(self.fileno(), _MOST)  # pyserial's waits in select.select: only descriptors below 1024
         if not data:
             raise ConnectionError("the port was unplugged, or another program reads it")
         return data
 
     def _write(self, data: bytes) -> int:
-        return os.write(self.fileno(), data)  # pyserial's own tries again and again while there is no room
+        return os.write(self.fileno(), data)  # pyserial's write() keeps retrying while there is no room
 
     def _waiting(self) -> int:
-        with suppress(Exception):  # not available, or the port is gone, which writing reports
+        with suppress(Exception):  # unavailable, or the port is gone, which write() reports
             waiting: int = self._port.out_waiting
             return waiting
         return 0
 
     def _discard(self) -> bool:
         before = self._waiting()
-        with suppress(Exception):  # the error of a terminal is no OSError
+        with suppress(Exception):  # termios.error is not an OSError
             self._port.reset_output_buffer()
-            if not before or self._waiting() < before:  # not every driver can empty it
+            if not before or self._waiting() < before:  # not every port driver can empty it
                 self._whole, self._rest = 0, b""
                 return True
         return False
 
     def close(self) -> None:
-        """Close the port. What nobody reads is thrown away: the system would wait for it, with some ports for 30 s."""
+        """Close the port and discard unread data, for which the system would otherwise wait, on some ports for 30 s."""
         if not self._drain():
             self._discard()
         self._port.close()
 
 
 def line_speed(path: str, baud: int) -> float | None:
-    """Return how many bytes a second a serial port carries; None for one over USB, whose bit rate means nothing."""
+    """Return a serial port's speed in bytes per second; None for USB, where the bit rate means nothing."""
     device = Path(path).resolve().name
     return None if re.match(r"ttyACM|(cu|tty)\.usbmodem", device) else baud / _BITS

@@ -1,8 +1,8 @@
-"""A camera in the options of a vehicle's address: where its video comes from, and its intrinsics.
+"""Camera options of a vehicle's address: the video's source, and the intrinsics.
 
-Video comes from the address of a stream or from a device, as FFmpeg opens them. Of the intrinsics, ``calibration``
-names the file of a calibration; or ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion`` (k1, k2, p1, p2[, k3[, k4,
-k5, k6]]) give the numbers.
+The video's source is the address of a stream or a device, opened by FFmpeg. The intrinsics are either ``calibration``,
+the name of a calibration file, or the numbers ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion`` (k1, k2, p1, p2[,
+k3[, k4, k5, k6]]).
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from skyloop.errors import UsageError
 from skyloop.messages import Intrinsics
 
 DEVICE_FORMAT: Final = "v4l2"
-RTP_PORT: Final = 5600  #: which PX4, ArduPilot's companions and QGroundControl use
-_PAYLOAD: Final = 96  # GStreamer's, of rtph264pay and rtph265pay
+RTP_PORT: Final = 5600  #: the port of PX4, ArduPilot's companions and QGroundControl
+_PAYLOAD: Final = 96  # GStreamer's default for rtph264pay and rtph265pay
 _RTP_OPTIONS: Final = frozenset({"payload", "codec"})
 _CODECS: Final = {"h264": "H264", "h265": "H265"}
-#: FFmpeg gathers as little as it can before the first picture: the rate of pictures is not needed.
+#: FFmpeg probes as little as possible before the first picture: the frame rate is not needed.
 _LIVE: Final = {"fpsprobesize": "0"}
-#: A packet that is late is waited for so long before the others go on without it: a few pictures of a radio link.
+#: How long to wait for a late packet before later ones are used: a few pictures of a radio link.
 _REORDER: Final = {"max_delay": "50000", "reorder_queue_size": "100"}
 _RTSP: Final = {**_LIVE, "allowed_media_types": "video"}
 _WAYS: Final[Mapping[str, Mapping[str, str]]] = {
@@ -42,23 +42,23 @@ _LISTENING: Final = frozenset({"udp", "rtp"})
 
 @dataclass(frozen=True, slots=True)
 class CameraSource:
-    """What FFmpeg opens, and how."""
+    """A video source for FFmpeg, with its options."""
 
     name: str = field(repr=False)  #: address or path, with its secrets
-    scheme: str  #: of the address; empty for a device
-    options: Mapping[str, str] = field(default_factory=dict)  #: FFmpeg's
-    sdp: str = ""  #: RFC 4566, for a session that nobody describes
-    fallback: Mapping[str, str] | None = None  #: options for a server that refuses the first ones' protocol
-    loses: bool = False  #: parts of pictures may get lost on the way, unnoticed
+    scheme: str  #: scheme of the address; empty for a device
+    options: Mapping[str, str] = field(default_factory=dict)  #: FFmpeg's options
+    sdp: str = ""  #: RFC 4566, for a session without a server to describe it
+    fallback: Mapping[str, str] | None = None  #: options for a server that refuses the first protocol
+    loses: bool = False  #: parts of pictures may get lost unnoticed
 
     @property
     def host(self) -> str | None:
-        """The host to look up; None if there is none, or packets come from wherever they do."""
+        """The host to look up; None if there is none, or packets may come from any host."""
         return None if self.scheme in ("", *_LISTENING) else urlsplit(self.name).hostname
 
     @property
     def shown(self) -> str:
-        """The address without what may be a secret: user, password and query."""
+        """The address without possible secrets: user, password and query."""
         return without_secrets(self.name)
 
 
@@ -72,10 +72,10 @@ def source_of(text: str, where: str) -> CameraSource:
 
     Args:
         text: The address, or a device's path.
-        where: The beginning of errors: of what it is the address.
+        where: Names the address at the start of error messages.
 
     Raises:
-        UsageError: It is neither the address of a stream that can be opened nor a device.
+        UsageError: The text is neither a supported stream's address nor a device.
     """
     scheme, separator, _ = text.partition("://")
     if not separator and Path(text).is_relative_to("/dev"):
@@ -89,7 +89,7 @@ def source_of(text: str, where: str) -> CameraSource:
     except ValueError:
         named = False
     if not named:
-        raise UsageError(f"{where} names no host: it looks like {scheme}://192.168.1.10:8554/live")
+        raise UsageError(f"{where} names no host, as in {scheme}://192.168.1.10:8554/live")
     if scheme == "rtp":
         return CameraSource(text, scheme, _WAYS[scheme], _sdp_of(text, where), loses=True)
     fallback = {**_RTSP, **_REORDER, "rtsp_transport": "udp"} if scheme == "rtsp" else None
@@ -97,7 +97,7 @@ def source_of(text: str, where: str) -> CameraSource:
 
 
 def _sdp_of(text: str, where: str) -> str:
-    """Describe RTP that comes to a port of this host: ``rtp://[ADDRESS][:PORT][?payload=96&codec=h264]``.
+    """Return the SDP of RTP sent to a port of this host: ``rtp://[ADDRESS][:PORT][?payload=96&codec=h264]``.
 
     Raises:
         UsageError: The address or an option makes no sense.
@@ -111,10 +111,10 @@ def _sdp_of(text: str, where: str) -> str:
     except ValueError:
         raise UsageError(
             f"{where} is {without_secrets(text)!r}, which needs an IP address of this host or a multicast group, "
-            f"or none: rtp://:{RTP_PORT}"
+            f"or nothing, as in rtp://:{RTP_PORT}"
         ) from None
     if unknown := options.keys() - _RTP_OPTIONS:
-        raise UsageError(f"{where}: rtp:// has the options codec and payload, not {', '.join(sorted(unknown))}")
+        raise UsageError(f"{where}: rtp:// has the options codec and payload, got {', '.join(sorted(unknown))}")
     if codec not in _CODECS:
         raise UsageError(f"{where}: codec is {codec!r} and must be one of {', '.join(_CODECS)}")
     if not payload.isascii() or not payload.isdigit() or not 0 <= int(payload) <= 127:
@@ -134,7 +134,7 @@ def check_intrinsics(uri: VehicleUri) -> None:
     """Check the intrinsics of an address.
 
     Raises:
-        UsageError: An option makes no sense, options don't go together, or the calibration can't be read.
+        UsageError: An option makes no sense, options contradict each other, or the calibration can't be read.
     """
     if "calibration" in uri.options:
         _calibration(uri)
@@ -143,7 +143,7 @@ def check_intrinsics(uri: VehicleUri) -> None:
 
 
 def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None:
-    """Return the intrinsics of an address for frames of a size.
+    """Return the intrinsics in an address for frames of the given size.
 
     Args:
         uri: The vehicle's address.
@@ -151,10 +151,10 @@ def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None
         height: [px]
 
     Returns:
-        None unless the address gives the focal length, or a calibration made with frames of this shape.
+        None unless the address gives the focal length, or a calibration for frames of this shape.
 
     Raises:
-        UsageError: An option makes no sense, options don't go together, or the calibration can't be read.
+        UsageError: An option makes no sense, options contradict each other, or the calibration can't be read.
     """
     if "calibration" in uri.options:
         calibration = _calibration(uri)
@@ -162,7 +162,7 @@ def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None
     distortion = _distortion(uri)
     if "fx" not in uri.options:
         for option in sorted(INTRINSICS_OPTIONS & uri.options.keys()):
-            raise UsageError(f"{uri}: option {option} needs fx as well")
+            raise UsageError(f"{uri}: option {option} also needs fx")
         return None
     fx = uri.number("fx", 0.0, minimum=1e-3)
     return Intrinsics(
@@ -176,7 +176,7 @@ def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None
 
 def _calibration(uri: VehicleUri) -> Calibration:
     for option in sorted(INTRINSICS_OPTIONS & uri.options.keys() - {"calibration"}):
-        raise UsageError(f"{uri}: option {option} does not go with calibration, which has it already")
+        raise UsageError(f"{uri}: option {option} can't be combined with calibration, which includes it")
     return load_calibration(uri.reveal("calibration") or "")
 
 

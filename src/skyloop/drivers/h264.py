@@ -1,6 +1,6 @@
-"""As much of H.264 as it takes to separate pictures, and to see what is missing, reordered or of another size. Pure.
+"""Just enough of H.264 to separate pictures, and to detect missing, reordered or resized ones. Pure.
 
-ITU-T H.264: 7.3 and 7.4 (units, parameter sets, headers of slices), 7.4.3 (numbers of pictures), Annex B, Annex E.
+ITU-T H.264: 7.3 and 7.4 (units, parameter sets, slice headers), 7.4.3 (picture numbers), Annex B, Annex E.
 """
 
 from __future__ import annotations
@@ -13,42 +13,42 @@ from skyloop.errors import DecodeError
 
 SLICE, IDR, SPS, PPS = 1, 5, 7, 8  #: types of NAL units
 START: Final = b"\0\0\0\1"
-MAX_SETS: Final = 8  #: parameter sets of a kind that are remembered; cameras send one
+MAX_SETS: Final = 8  #: remembered parameter sets of each kind; cameras send one
 _ANY_START: Final = re.compile(rb"\x00\x00\x01")
-_HEADER_BYTES: Final = 32  # more than the beginning of a slice header takes
-_SET_BYTES: Final = 512  # more than a sequence parameter set takes, scaling lists included
+_HEADER_BYTES: Final = 32  # more than the start of a slice header needs
+_SET_BYTES: Final = 512  # more than a sequence parameter set needs, scaling lists included
 _CHROMA_PROFILES: Final = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128})
 _ALL_COLOURS: Final = 3  # chroma_format_idc of 4:4:4
-_MAX_BLOCKS: Final = 1024  # to a side, 16384 pixels
+_MAX_BLOCKS: Final = 1024  # per side, 16384 pixels
 _MAX_CYCLE: Final = 255
 _B: Final = 1  # slice_type, modulo 5
 
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """What a sequence parameter set says that is needed here."""
+    """The relevant fields of a sequence parameter set."""
 
     frame_number_bits: int
-    width: int  #: of the picture to show [px]
+    width: int  #: width of the displayed picture [px]
     height: int
     interlaced: bool = False  #: pictures may be fields
-    colour_planes: bool = False  #: coded one by one
-    gaps_allowed: bool = False  #: in the numbers of pictures, where a sender leaves some out
+    colour_planes: bool = False  #: the colour planes are coded separately
+    gaps_allowed: bool = False  #: in picture numbers, where a sender leaves some out
 
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """The beginning of a slice's header."""
+    """The start of a slice header."""
 
     is_key: bool
-    is_first: bool  #: of its picture
+    is_first: bool  #: first slice of its picture
     is_reference: bool
     frame_number: int
-    is_b: bool = False  #: may build on later pictures
+    is_b: bool = False  #: may refer to later pictures
 
 
 def units(stream: bytes) -> list[bytes]:
-    """The NAL units of a piece of stream in Annex B form. What comes before the first start code is left out."""
+    """Return the NAL units of stream data in Annex B form. Bytes before the first start code are skipped."""
     return [unit.rstrip(b"\0") for unit in _ANY_START.split(stream)[1:] if unit.rstrip(b"\0")]
 
 
@@ -57,7 +57,7 @@ def unit_type(unit: bytes) -> int:
 
 
 def parse_sequence(unit: bytes) -> Sequence:
-    """A sequence parameter set. Raises :class:`DecodeError`."""
+    """Parse a sequence parameter set. Raises :class:`DecodeError`."""
     bits = _Bits(unit[1:_SET_BYTES])
     profile = bits.take(8)
     bits.take(16)
@@ -75,13 +75,13 @@ def parse_sequence(unit: bytes) -> Sequence:
                     _skip_scaling_list(bits, 16 if number < 6 else 64)
     frame_number_bits = bits.exp_golomb() + 4
     _skip_order(bits)
-    bits.exp_golomb()  # reference frames
+    bits.exp_golomb()  # number of reference frames
     gaps_allowed = bool(bits.take(1))
     columns, rows = bits.exp_golomb() + 1, bits.exp_golomb() + 1
     frames_only = bits.take(1)
     rows *= 2 - frames_only
     if frame_number_bits > 16 or columns > _MAX_BLOCKS or rows > _MAX_BLOCKS or chroma > _ALL_COLOURS:
-        raise DecodeError("numbers in a sequence parameter set that can't be")
+        raise DecodeError("impossible numbers in a sequence parameter set")
     if not frames_only:
         bits.take(1)
     bits.take(1)
@@ -93,16 +93,16 @@ def parse_sequence(unit: bytes) -> Sequence:
         width -= across * (left + right)
         height -= down * (top + bottom)
     if width < 1 or height < 1:
-        raise DecodeError("a sequence parameter set that leaves nothing of its pictures")
+        raise DecodeError("a sequence parameter set crops its pictures to nothing")
     return Sequence(frame_number_bits, width, height, not frames_only, planes, gaps_allowed)
 
 
 def parse_slice(unit: bytes, sequence: Sequence) -> Slice:
-    """The beginning of a slice's header. Raises :class:`DecodeError`."""
+    """Parse the start of a slice header. Raises :class:`DecodeError`."""
     bits = _Bits(unit[1:_HEADER_BYTES])
     first = bits.exp_golomb()
     kind = bits.exp_golomb()
-    bits.exp_golomb()  # parameter set
+    bits.exp_golomb()  # number of the parameter set
     if sequence.colour_planes:
         bits.take(2)
     number = bits.take(sequence.frame_number_bits)
@@ -110,7 +110,7 @@ def parse_slice(unit: bytes, sequence: Sequence) -> Slice:
 
 
 def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
-    """How many reference pictures are missing between two that came one after the other, by their numbers (7.4.3)."""
+    """Return how many reference pictures are missing between two consecutive ones, by their numbers (7.4.3)."""
     if now.is_key:
         return 0
     turns = 1 << sequence.frame_number_bits
@@ -118,7 +118,7 @@ def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
 
 
 def _skip_order(bits: _Bits) -> None:
-    """Picture order, of any of its three types."""
+    """Skip the picture order count, of any of its three types."""
     kind = bits.exp_golomb()
     if kind == 0:
         bits.exp_golomb()
@@ -128,7 +128,7 @@ def _skip_order(bits: _Bits) -> None:
         bits.exp_golomb()
         cycle = bits.exp_golomb()
         if cycle > _MAX_CYCLE:
-            raise DecodeError("a cycle in a sequence parameter set that is too long")
+            raise DecodeError("the cycle in a sequence parameter set is too long")
         for _ in range(cycle):
             bits.exp_golomb()
 
@@ -150,7 +150,7 @@ class _Bits:
 
     def take(self, count: int) -> int:
         if count > self._left:
-            raise DecodeError("a NAL unit that ends too early")
+            raise DecodeError("a NAL unit ends too early")
         self._left -= count
         return self._value >> self._left & ((1 << count) - 1)
 
@@ -159,44 +159,44 @@ class _Bits:
         while not self.take(1):
             zeros += 1
             if zeros > 31:
-                raise DecodeError("a number in a NAL unit that is too large")
+                raise DecodeError("a number in a NAL unit is too large")
         return (1 << zeros | self.take(zeros)) - 1
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """An access unit, and what the stream shows about it."""
+    """An access unit, and the inspector's findings."""
 
-    data: bytes  #: in Annex B form, of a key picture with its parameter sets
-    is_key: bool  #: decoding can begin here: an IDR picture whose parameter sets are known
-    after_gap: bool  #: between the picture before and this one something is missing, or there was none before
+    data: bytes  #: in Annex B form; a key picture with its parameter sets
+    is_key: bool  #: decoding can start here: an IDR picture with known parameter sets
+    after_gap: bool  #: pictures are missing before this one, or it is the first
     width: int  #: [px]
     height: int
-    reason: str = ""  #: why no stream of such pictures is handed on; empty if it can be
+    reason: str = ""  #: why pictures of this stream can't be forwarded undecoded; empty if they can
 
 
 class Inspector:
-    """Looks at the access units of one stream, one after the other, without decoding.
+    """Inspects the access units of one stream, in order and without decoding.
 
-    Remembers parameter sets, which a stream may send once, and puts them in front of each key picture. Of a stream
-    with several sequence parameter sets, the last one counts.
+    It remembers parameter sets, which a stream may send only once, and puts them in front of each key picture. If a
+    stream has several sequence parameter sets, the last one counts.
 
     Args:
-        parameters: Sets that came beside the stream (of SDP or a container), in Annex B form.
+        parameters: Parameter sets from outside the stream (SDP or a container), in Annex B form.
     """
 
     def __init__(self, parameters: bytes = b"") -> None:
-        self._sets: dict[int, dict[bytes, bytes]] = {SPS: {}, PPS: {}}  # of each type, by its beginning
+        self._sets: dict[int, dict[bytes, bytes]] = {SPS: {}, PPS: {}}  # for each type, by start of the unit
         self._sequence: Sequence | None = None
         self._before: Slice | None = None
         for unit in units(parameters):
             self._remember(unit)
 
     def inspect(self, data: bytes) -> Unit | None:
-        """Look at the next access unit, in Annex B form.
+        """Inspect the next access unit, in Annex B form.
 
         Returns:
-            None if it holds no picture, or one whose headers are damaged or unknown; the next one is after a gap then.
+            None if it holds no picture, or its headers are damaged or unknown; then the next one follows a gap.
         """
         found = units(data)
         kinds = {unit_type(unit) for unit in found}
@@ -222,7 +222,7 @@ class Inspector:
         return Unit(data, is_key, gap, self._sequence.width, self._sequence.height, self._reason(heads))
 
     def restart(self) -> None:
-        """Pictures were left out: none continues the last one."""
+        """Note that pictures were left out: the next one does not continue the last."""
         self._before = None
 
     def _is_missing(self, before: Slice, now: Slice) -> bool:
@@ -232,7 +232,7 @@ class Inspector:
     def _reason(self, heads: list[Slice]) -> str:
         assert self._sequence is not None
         if any(head.is_b for head in heads):
-            return "pictures build on later ones (B-frames)"
+            return "pictures refer to later ones (B-frames)"
         return "pictures are interlaced" if self._sequence.interlaced else ""
 
     def _remember(self, unit: bytes) -> None:
@@ -243,7 +243,7 @@ class Inspector:
             try:
                 sequence = parse_sequence(unit)
             except DecodeError:
-                return  # a damaged one: that of before counts, and the decoder has the last word
+                return  # a damaged set: the previous one counts, and the decoder decides
             if sequence != self._sequence:
                 self._sequence, self._before = sequence, None
                 for known in self._sets.values():
@@ -256,7 +256,7 @@ class Inspector:
 
 
 def _set_number(unit: bytes) -> bytes:
-    """The number of a parameter set, as the key that it is remembered by."""
+    """Return the number of a parameter set, the key it is stored under."""
     bits = _Bits(unit[4 if unit_type(unit) == SPS else 1 :][:_HEADER_BYTES])
     try:
         return bytes([bits.exp_golomb() % 256])

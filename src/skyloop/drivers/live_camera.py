@@ -1,7 +1,7 @@
-"""A camera that is reached over the network or is a device of this machine, through PyAV when it is started.
+"""A camera on the network or a device of this machine, opened with PyAV on start.
 
-Its frames are shown, and its H.264 is handed on as it came: at once where it can't have lost anything on the way, else
-once a decoder that refuses damage has decoded it.
+It publishes frames, and forwards H.264 undecoded: at once if nothing can have been lost on the way, otherwise only
+after a decoder that rejects damage has decoded it.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from skyloop.messages import EventKind, Intrinsics, Severity, Value
 if TYPE_CHECKING:
     from skyloop.drivers.live_container import ContainerStream
 
-STALLED_S: Final = 1.5  #: a stream that is silent for so long, or for three of its periods, is reopened
-_WHERE: Final = "camera"  # what events are about
-OPEN_S: Final = 5.0  #: for the connection, the handshake and the first picture
+STALLED_S: Final = 1.5  #: a stream silent for this long, or for three of its periods, is reopened
+_WHERE: Final = "camera"  # source of the events
+OPEN_S: Final = 5.0  #: time for connecting, the handshake and the first picture
 
 
 @dataclass(frozen=True, slots=True)
 class LiveCameraSettings:
-    """A camera. Size and rate are what is announced before the first picture comes, and asked of a device."""
+    """A camera's settings. Size and rate are announced before the first picture, and requested from a device."""
 
     source: CameraSource
     name: str
     width: int  #: [px]
     height: int
     fps: float
-    stream: bool = True  #: whether its H.264 is handed on as it comes
-    device_options: dict[str, str] = field(default_factory=dict)  #: FFmpeg's, besides those of size and rate
-    purpose: str = "a camera"  #: what PyAV is needed for, as the error says it
+    stream: bool = True  #: whether its H.264 is forwarded undecoded
+    device_options: dict[str, str] = field(default_factory=dict)  #: FFmpeg's options besides size and rate
+    purpose: str = "a camera"  #: the use of PyAV, for error messages
 
 
 class LiveCamera:
-    """Shows the camera's newest picture from :meth:`start` to :meth:`stop`, and reconnects for ever.
+    """Publishes the camera's newest picture from :meth:`start` to :meth:`stop`, and keeps reconnecting.
 
     Args:
-        settings: Of the camera.
-        sink: The proxy's.
-        intrinsics: Returns those for a width and height.
-        configure: Called with a device's path once it is open, on the reading thread; returns what it could not set.
-        absent: Returns what to say of a device that is not there.
-        on_event: Called with each event and its text, on either thread; None: the sink gets them.
+        settings: The camera's settings.
+        sink: The proxy's sink.
+        intrinsics: Returns the intrinsics for a width and height.
+        configure: Called on the reading thread with an opened device's path; returns the settings that failed.
+        absent: Returns the error text for a missing device.
+        on_event: Called with each event and its text, on either thread; None: events go to the sink.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class LiveCamera:
         self._intrinsics = intrinsics
         self._configure = configure
         self._absent = absent
-        self._checks = settings.source.loses  # whether pictures are decoded before they are handed on
+        self._checks = settings.source.loses  # whether pictures are decoded before they are forwarded
         self._stopped = False
         self._reported: list[str] = []
         relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
@@ -89,11 +89,11 @@ class LiveCamera:
         )
 
     def start(self) -> None:
-        """Start to receive. Returns at once."""
+        """Start receiving. Returns at once."""
         self._video.start()
 
     def stop(self) -> None:
-        """Stop receiving. Idempotent; takes up to 4 s. The sink is not called after it."""
+        """Stop receiving. Idempotent; takes up to 4 s. The sink is not called afterwards."""
         self._stopped = True
         self._video.stop()
 
@@ -113,7 +113,7 @@ class LiveCamera:
         if not source.scheme:
             return self._open_device(open_stream)
         if source.host:
-            # FFmpeg would call an unknown one an error of input or output.
+            # FFmpeg would report an unknown name as an I/O error.
             socket.getaddrinfo(source.host, None, type=socket.SOCK_STREAM)
         if source.sdp:
             return open_stream(source.sdp.encode(), format_name="sdp", options=dict(source.options))
@@ -160,7 +160,7 @@ class LiveCamera:
     def _show(self, picture: Picture) -> None:
         picture.show(self._sink, self._settings.name, self._intrinsics(picture.width, picture.height))
 
-    # On either ---------------------------------------------------------------------------------------------------
+    # On either thread --------------------------------------------------------------------------------------------
 
     def _hand_on(self, coded: Coded) -> None:
         from skyloop.drivers.live_container import Piece

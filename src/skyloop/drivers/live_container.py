@@ -1,6 +1,6 @@
-"""Live video that PyAV opens, from the network or a device, for :class:`skyloop.drivers.live_video.LiveVideo`.
+"""Live video through PyAV, from the network or a device, for :class:`skyloop.drivers.live_video.LiveVideo`.
 
-Every error of opening and reading is an OSError that says why in words.
+Every error of opening and reading is an OSError with a readable reason.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.codeccontext import VideoCodecContext
 
-HOPELESS_S: Final = 3.0  #: how long nothing can be decoded before it is reported
-STRICT_S: Final = 15.0  #: how long nothing of H.264 is without fault before damage is no longer looked for
-#: How many pictures FFmpeg holds back: where one ends shows when the next begins, and a transport stream's packets end
-#: in the same way once more.
+HOPELESS_S: Final = 3.0  #: time without any decodable picture before it is reported
+STRICT_S: Final = 15.0  #: time without undamaged H.264 before damage is tolerated
+#: How many pictures FFmpeg holds back: it sees the end of a picture only when the next one starts, and a transport
+#: stream's packets add the same delay once more.
 _HELD_BACK: Final = {"rtsp": 1, "sdp": 1, "h264": 1, "hevc": 1, "mpegts": 2}
-_REORDERED_NS: Final = 1_000_000_000  # a step back of the stamps up to this is one of B pictures, not a clock set back
-_STAMPS: Final = 128  # capture times that are kept: two a picture, more than any decoder holds back
+_REORDERED_NS: Final = 1_000_000_000  # smaller backward steps of the timestamps are B pictures, not a clock set back
+_STAMPS: Final = 128  # stored capture times: two per picture, more than any decoder holds back
 _NO_STAMPS: Final[Any] = av.format.Flags.no_timestamps.value
 
 
 class ProtocolRefusedError(ConnectionError):
-    """Raised when a server does not want the protocol that was asked for."""
+    """Raised when a server refuses the requested protocol."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """A picture's bytes, and what it takes to decode them and to know when they were captured."""
+    """A picture's bytes, with all that decoding and timing need."""
 
     packet: av.Packet[av.VideoStream]
-    context: VideoCodecContext  # of its connection
-    number: int  # of the connection, from 0
-    unit: Unit | None = None  # as H.264 in Annex B form; None: it is none, or its headers are not known
-    reason: str = ""  # why it can't be handed on as it came; empty if it can
-    reordered: bool = False  # of H.264: pictures build on later ones
+    context: VideoCodecContext  # codec context of its connection
+    number: int  # number within the connection, from 0
+    unit: Unit | None = None  # as H.264 in Annex B form; None: not H.264, or its headers are unknown
+    reason: str = ""  # why it can't be forwarded undecoded; empty if it can
+    reordered: bool = False  # H.264 only: pictures refer to later ones
 
     @property
     def is_h264(self) -> bool:
@@ -62,24 +62,24 @@ class Piece:
 
 
 class ContainerStream:
-    """One connection to whatever PyAV opens.
+    """One connection to a source that PyAV can open.
 
     Args:
-        name: What FFmpeg opens: an address or a path; or the content of a file.
-        number: Of the connection.
+        name: An address or path for FFmpeg, or the content of a file.
+        number: Number of the connection.
         clock: Monotonic, ns.
-        format_name: FFmpeg's format; None: it finds out.
-        options: FFmpeg's.
-        open_s: For the connection, the handshake and the size of the pictures, all together; a device that hangs takes
-            longer.
-        read_s: For the next picture. FFmpeg can't be interrupted earlier, so :meth:`read` takes up to this.
+        format_name: FFmpeg's format; None: detect it.
+        options: FFmpeg's options.
+        open_s: Time limit for the connection, the handshake and the size of the pictures together; a hanging device
+            takes longer.
+        read_s: Time limit for the next picture. FFmpeg can't be interrupted earlier, so :meth:`read` takes up to this.
 
     Raises:
-        ProtocolRefusedError: The server does not want the protocol that was asked for.
-        OSError: It can't be opened, or holds no video that is known here.
+        ProtocolRefusedError: The server refuses the requested protocol.
+        OSError: The source can't be opened, or has no supported video.
     """
 
-    broken = 0  # FFmpeg does not report what it throws away
+    broken = 0  # FFmpeg does not report discarded pictures
     lost_bytes = 0
 
     def __init__(
@@ -106,7 +106,7 @@ class ContainerStream:
                 timeout=(open_s, read_s),
             )
         except Exception as error:
-            if clock() - begun_ns >= nanoseconds(open_s):  # which FFmpeg takes for damage, in the midst of a handshake
+            if clock() - begun_ns >= nanoseconds(open_s):  # FFmpeg reports a time-out in a handshake as damaged data
                 raise TimeoutError(f"no answer, or no frame, within {open_s:g} s") from error
             raise _os_error(error) from error
         try:
@@ -116,10 +116,10 @@ class ContainerStream:
             self._container.close()
             raise
         held_back = _HELD_BACK.get(self._container.format.name, 0)
-        self._came: deque[int] = deque(maxlen=held_back + 1)  # when FFmpeg gave the last ones
+        self._came: deque[int] = deque(maxlen=held_back + 1)  # arrival times of the last pictures from FFmpeg
         self._number = 0
         self._live_clock = LiveClock()
-        self._newest_ns: int | None = None  # stamp
+        self._newest_ns: int | None = None  # newest timestamp
         self._offset_ns = 0
         self._captured_newest_ns = 0
 
@@ -128,7 +128,7 @@ class ContainerStream:
         try:
             packet = next(self._packets, None)
         except av.error.ExitError as error:
-            raise TimeoutError(f"nothing came for {self._read_s:g} s") from error
+            raise TimeoutError(f"nothing received for {self._read_s:g} s") from error
         except Exception as error:
             raise _os_error(error) from error
         if packet is None or not packet.size:
@@ -137,7 +137,7 @@ class ContainerStream:
         self._came.append(now_ns)
         unit = self._units.of(packet)
         captured_ns = min(self._captured_ns(packet), now_ns)
-        if self._units.in_order:  # a stamp that was learned meanwhile does not set the time back
+        if self._units.in_order:  # a timestamp learned since then must not set the time back
             captured_ns = self._captured_newest_ns = max(captured_ns, self._captured_newest_ns)
         units = self._units
         piece = Piece(packet, self._context, self._number, unit, units.reason, not units.in_order)
@@ -153,22 +153,22 @@ class ContainerStream:
         """Return the first video, ready to be read and decoded."""
         videos = self._container.streams.video
         if not videos:
-            raise ConnectionError("what comes holds no video")
+            raise ConnectionError("the source has no video")
         context = videos[0].codec_context
         if context is None:
-            raise ConnectionError("what comes is in a codec that is not known here")
+            raise ConnectionError("the video's codec is not supported")
         if not (context.width and context.height):
-            raise ConnectionError("the stream has no frame size: it is damaged, or no video")
+            raise ConnectionError("the stream has no frame size: it is damaged, or not video")
         limit_memory(context)
         return context, self._container.demux(videos[0])
 
     def _captured_ns(self, packet: av.Packet[av.VideoStream]) -> int:
-        """Return when a picture was captured: by its stamp and the smallest delay seen lately, else when it came."""
+        """Return a picture's capture time: from its timestamp and the smallest recent delay, else its arrival."""
         stamp_ns = _stamp_ns(packet)
         if stamp_ns is None or self._container.format.flags & _NO_STAMPS:
             return self._came[0]
         back_ns = 0 if self._newest_ns is None else self._newest_ns - stamp_ns
-        if not self._units.in_order and 0 < back_ns < _REORDERED_NS:  # of a picture that others build on
+        if not self._units.in_order and 0 < back_ns < _REORDERED_NS:  # of a picture that others refer to
             return stamp_ns + self._offset_ns
         if self._newest_ns is None or back_ns:
             self._newest_ns = stamp_ns
@@ -177,23 +177,23 @@ class ContainerStream:
 
 
 class Units:
-    """The H.264 of a stream in Annex B form, whatever it comes in.
+    """A stream's H.264 in Annex B form, whatever its container.
 
-    ``reason`` says why its pictures can't be handed on as they came; empty as long as they can.
+    ``reason`` says why its pictures can't be forwarded undecoded; empty while they can.
     """
 
     def __init__(self, stream: av.VideoStream, context: VideoCodecContext) -> None:
         self._is_h264 = context.name == H264
         self.reason = "" if self._is_h264 else f"the video is {context.name}, not H.264"
-        self.in_order = self._is_h264  #: no picture built on a later one so far
+        self.in_order = self._is_h264  #: no picture has referred to a later one so far
         self._filter: av.BitStreamFilterContext | None = None
         parameters = bytes(context.extradata or b"")
-        if self._is_h264 and parameters[:1] == b"\1":  # sizes in place of start codes, as in MP4
+        if self._is_h264 and parameters[:1] == b"\1":  # sizes instead of start codes, as in MP4
             self._filter, parameters = av.BitStreamFilterContext("h264_mp4toannexb", stream), b""
         self._inspector = Inspector(parameters)
 
     def of(self, packet: av.Packet[av.VideoStream]) -> Unit | None:
-        """Return a packet's picture; None if it is none. From the first that can't be handed on there is a reason."""
+        """Return a packet's picture; None if it has none. Sets ``reason`` at the first that can't be forwarded."""
         if not self._is_h264:
             return None
         data = self._annex_b(packet)
@@ -208,7 +208,7 @@ class Units:
     def _annex_b(self, packet: av.Packet[av.VideoStream]) -> bytes | None:
         if self._filter is None:
             return bytes(packet)
-        copy = av.Packet(bytes(packet))  # the filter takes what it is given
+        copy = av.Packet(bytes(packet))  # the filter consumes its input
         try:
             return b"".join(bytes(part) for part in self._filter.filter(copy))
         except (av.error.FFmpegError, ValueError):
@@ -216,16 +216,16 @@ class Units:
 
 
 class LiveDecoder:
-    """Decodes one connection after the other.
+    """Decodes one connection after another.
 
-    H.264 that shows damage is not shown, and nothing that builds upon it, up to the next key picture, with which a
-    fresh decoder begins: what an old one remembers of damage may show. A stream of which nothing can be shown in that
-    way for :data:`STRICT_S` (an encoder with faults of its own, or one that sends no key pictures) is left to FFmpeg's
-    own judgement, up to the next key that is without fault.
+    Damaged H.264 is not shown, nor is anything that refers to it, up to the next key picture. Decoding then starts with
+    a fresh decoder, because an old one may show remembered damage. If nothing can be shown under these rules for
+    :data:`STRICT_S` (a faulty encoder, or one that sends no key pictures), FFmpeg alone judges, up to
+    the next flawless key picture.
 
     Args:
-        on_whole: Called with each frame that was decoded and shows no damage. On the decoding thread.
-        on_forgiving: Called once with a text when damage is no longer looked for.
+        on_whole: Called with each decoded frame without damage, on the decoding thread.
+        on_forgiving: Called once with a text when damage is tolerated.
     """
 
     def __init__(
@@ -245,19 +245,19 @@ class LiveDecoder:
         """Forget the stream so far: the next picture does not continue it."""
         self._before: Piece | None = None
         self._failing_ns: int | None = None  # since when no piece could be decoded
-        self._barren_ns: int | None = None  # since when no picture of H.264 came out
-        self._strict: VideoCodecContext | None = None  # None: H.264 waits for a key
-        self._shown_ns = 0  # capture time of the newest picture: a later one is not captured earlier
-        self._reorders = False  # it holds pictures back that build on later ones
+        self._barren_ns: int | None = None  # since when no H.264 picture came out
+        self._strict: VideoCodecContext | None = None  # None: H.264 waits for a key picture
+        self._shown_ns = 0  # capture time of the newest picture: later ones can't have been captured earlier
+        self._reorders = False  # it holds back pictures that refer to later ones
         self._forgiving: VideoCodecContext | None = None
-        # Capture times of what was given to a decoder, by whether that is the strict one and the stamp it was given.
+        # Capture times of decoder inputs, by whether it was the strict decoder and the timestamp passed.
         self._captured: dict[tuple[bool, int | None], int] = {}
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
         """See :class:`skyloop.drivers.live_video.Decoder`."""
         piece = coded.data
         if not isinstance(piece, Piece):
-            raise TypeError("a piece of a live stream is wanted")
+            raise TypeError("expected a piece of a live stream")
         before, self._before = self._before, piece
         follows = not piece.number or (before is not None and before.number + 1 == piece.number)
         self._note_stamp(piece, coded)
@@ -276,15 +276,15 @@ class LiveDecoder:
 
     def _of_other(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
         if not follows:
-            piece.context.flush_buffers()  # what was left out would show as a smear
+            piece.context.flush_buffers()  # left-out pictures would otherwise show as a smear
         return self._judged(piece.context, piece.packet, coded)
 
     def _of_h264(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
         unit = piece.unit
-        if unit is None:  # parameters alone, or noise
+        if unit is None:  # only parameters, or noise
             self._note_failure(coded)
             return None
-        surprised = piece.reordered and not self._reorders  # what it builds on would be shown before it
+        surprised = piece.reordered and not self._reorders  # the picture it refers to would be shown before it
         if not follows or unit.after_gap or surprised:
             self._strict = None
             if self._forgiving is not None:
@@ -309,7 +309,7 @@ class LiveDecoder:
             self._reorders = piece.reordered or bool(piece.context.has_b_frames)
             self._strict = new_decoder(H264, "a camera", low_delay=not self._reorders)
         packet = av.Packet(unit.data)
-        packet.pts = piece.number  # which comes out with the picture; not each packet of a stream has a stamp
+        packet.pts = piece.number  # comes out again with the picture; not every packet of a stream has a timestamp
         try:
             images = self._strict.decode(packet)
         except (av.error.FFmpegError, ValueError):
@@ -320,14 +320,14 @@ class LiveDecoder:
             return None
         self._on_whole(coded)
         if not images:
-            self.waited += 1  # it is held back for others that are shown before it
+            self.waited += 1  # held back in favour of others that are shown before it
             return None
         return images[-1]
 
     def _judged(
         self, context: VideoCodecContext, packet: av.Packet[av.VideoStream], coded: Coded
     ) -> av.VideoFrame | None:
-        """Decode a piece. Return its picture, None if there is none that FFmpeg calls good."""
+        """Decode a piece. Return its picture; None if there is none that FFmpeg considers good."""
         try:
             images = context.decode(packet)
         except (av.error.FFmpegError, ValueError):
@@ -349,7 +349,7 @@ class LiveDecoder:
         now_ns = coded.arrived_ns
         self._failing_ns = now_ns if self._failing_ns is None else self._failing_ns
         if now_ns - self._failing_ns > nanoseconds(HOPELESS_S):
-            raise UnsupportedError(f"for {HOPELESS_S:g} s, nothing that came could be decoded")
+            raise UnsupportedError(f"nothing received could be decoded for {HOPELESS_S:g} s")
         self.damaged += 1
 
     def _forgive(self, piece: Piece) -> None:
@@ -361,8 +361,7 @@ class LiveDecoder:
         if not self._forgave:
             self._forgave = True
             self._on_forgiving(
-                f"for {STRICT_S:g} s no key picture came without a fault: frames are shown with what damage they have "
-                "until one does"
+                f"no flawless key picture arrived for {STRICT_S:g} s: frames are shown with their damage until one does"
             )
 
 
@@ -373,9 +372,9 @@ def _stamp_ns(timed: av.Packet[av.VideoStream] | av.VideoFrame) -> int | None:
 
 
 def _os_error(error: Exception) -> OSError:
-    """Return an error in words, without the address, which may hold a password."""
+    """Return an error with a readable text and without the address, which may contain a password."""
     if isinstance(error, OSError) and error.errno == errno.EPROTONOSUPPORT:
         return ProtocolRefusedError(error.strerror)
     if isinstance(error, av.error.InvalidDataError):
-        return ConnectionError("what comes is no video that is known here")
+        return ConnectionError("the source has no supported video")
     return ConnectionError(getattr(error, "strerror", None) or str(error) or repr(error))

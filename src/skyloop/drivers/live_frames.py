@@ -1,4 +1,4 @@
-"""Frames of a live stream as they arrived: which are decoded and shown, and which are handed on as they are."""
+"""Frames of a live stream on arrival: which are decoded and shown, and which are forwarded undecoded."""
 
 from __future__ import annotations
 
@@ -12,59 +12,59 @@ from skyloop.drivers.h264 import Unit
 from skyloop.messages import EventKind, Intrinsics, Severity
 from skyloop.messages.frame import Chain
 
-LATE_NS: Final = 50_000_000  #: a frame that waited longer than this since it came is late
+LATE_NS: Final = 50_000_000  #: a frame that has waited longer than this is late
 MAX_FRAMES: Final = 120  #: 4 s; key frames of the vehicles are half a second or a second apart
-KEYLESS: Final = 600  #: pictures without a key after which it is reported that nothing can be handed on
+KEYLESS: Final = 600  #: pictures without a key picture before the stream is reported as not forwardable
 
 
 @dataclass(frozen=True, slots=True)
 class Coded:
-    """An encoded frame as it arrived."""
+    """An encoded frame on arrival."""
 
-    data: object  #: what the vehicle's decoder takes
-    is_key: bool  #: whether decoding can begin here
+    data: object  #: input of the vehicle's decoder
+    is_key: bool  #: whether decoding can start here
     captured_ns: int  #: on this host's clock
     arrived_ns: int
-    connection: int  #: grows with each connection; a frame builds on none of another
+    connection: int  #: grows with each connection; frames never refer to another connection's
 
 
 class FrameBacklog:
     """Frames in the order of arrival, at most :data:`MAX_FRAMES`. The newest wins.
 
-    While frames are wanted and decoding keeps up, every frame is decoded and shown. When decoding is late, what stands
-    before the newest key frame is left out; the rest must all be decoded, as each builds on the one before, but only
-    the newest is shown. While no frame is wanted, those since the newest key frame are kept, so that one can be shown
-    at once when somebody wants it.
+    While frames are wanted and decoding keeps up, every frame is decoded and shown. When decoding is late, frames
+    before the newest key frame are dropped; the rest must all be decoded, as each refers to the previous one, but only
+    the newest is shown. While no frames are wanted, those since the newest key frame are kept, so that the first
+    subscriber sees one at once.
 
-    ``skipped`` counts the frames that were wanted and not shown because newer ones had arrived.
+    ``skipped`` counts wanted frames that were not shown because newer ones had arrived.
     """
 
     def __init__(self) -> None:
         self.skipped = 0
-        self._frames: deque[tuple[Coded, bool]] = deque()  # and whether it was wanted when it came
+        self._frames: deque[tuple[Coded, bool]] = deque()  # and whether it was wanted on arrival
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def put(self, frame: Coded, *, wanted: bool) -> None:
-        """Add a frame that arrived."""
+        """Add a received frame."""
         if frame.is_key and not wanted:
             self._drop(len(self._frames))
         elif len(self._frames) == MAX_FRAMES:
-            self._drop(1)  # those that build upon it wait for the next key frame, as after any loss
+            self._drop(1)  # frames that refer to it wait for the next key frame, as after any loss
         self._frames.append((frame, wanted))
 
     def take(self, now_ns: int) -> tuple[Coded, bool]:
         """Remove the frame to decode next.
 
         Args:
-            now_ns: On the clock of ``arrived_ns``.
+            now_ns: The present time, on the clock of ``arrived_ns``.
 
         Returns:
             The frame, and whether to show it.
 
         Raises:
-            IndexError: There is none.
+            IndexError: The backlog is empty.
         """
         if self._late(now_ns):
             keys = [n for n, (frame, _) in enumerate(self._frames) if frame.is_key]
@@ -84,26 +84,26 @@ class FrameBacklog:
 
 
 class StreamRelay:
-    """Hands H.264 on while somebody wants it, beginning with a key picture, and after a gap with the next one.
+    """Forwards H.264 while someone wants it, starting with a key picture, and after a gap with the next one.
 
-    Whether pictures are decoded as well makes no difference. Not thread-safe.
+    It does not matter whether pictures are also decoded. Not thread-safe.
     """
 
     def __init__(self, sink: Sink, intrinsics: Callable[[str, int, int], Intrinsics | None]) -> None:
         self._sink = sink
         self._intrinsics = intrinsics
         self._chain = Chain()
-        self._source: tuple[str, int] | None = None  # camera and connection of the picture before
+        self._source: tuple[str, int] | None = None  # camera and connection of the previous picture
 
     def wanted(self, camera: str) -> bool:
-        """Return whether a camera's stream is wanted. If not, the next one that is begins with a key picture."""
+        """Return whether a camera's stream is wanted. If not, it restarts later with a key picture."""
         wanted = self._sink.wants_stream(camera)
         if not wanted:
             self.restart()
         return wanted
 
     def restart(self) -> None:
-        """Begin with the next key picture."""
+        """Restart with the next key picture."""
         self._source = None
 
     def take(
@@ -116,18 +116,18 @@ class StreamRelay:
         connection: int,
         picture: bool = True,
     ) -> bool:
-        """Hand a picture on, if it is wanted and can be decoded after the last one.
+        """Forward a picture if it is wanted and can be decoded after the last one.
 
         Args:
-            camera: That the vehicle shows now.
+            camera: The camera that the vehicle shows at present.
             unit: The picture, undamaged.
-            captured_ns: As of the decoded frame.
-            number: Counts the pictures of the connection; one that was left out is missing in the numbers.
-            connection: Its number.
-            picture: False for parameters alone, which are not handed on.
+            captured_ns: As in the decoded frame.
+            number: Number of the picture within the connection; left-out pictures leave gaps.
+            connection: Number of the connection.
+            picture: False for parameters alone, which are not forwarded.
 
         Returns:
-            Whether it was handed on.
+            Whether the picture was forwarded.
         """
         if not self.wanted(camera):
             return False
@@ -150,9 +150,9 @@ class StreamRelay:
 
 
 class CheckedRelay:
-    """Hands on the H.264 of one camera whose stream is not known beforehand, and reports once why it does not.
+    """Forwards the H.264 of a camera with an unknown stream, and reports once why it can't.
 
-    Used by one thread at a time.
+    Not thread-safe.
     """
 
     def __init__(self, relay: StreamRelay, sink: Sink, camera: str, where: str) -> None:
@@ -160,7 +160,7 @@ class CheckedRelay:
         self._sink = sink
         self._camera = camera
         self._where = where
-        self._refused = (-1, "")  # connection, and why
+        self._refused = (-1, "")  # connection, and reason
         self._waited = 0
         self._reported = ""
 
@@ -170,14 +170,14 @@ class CheckedRelay:
         return self._relay.wanted(self._camera)
 
     def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:
-        """Hand on a picture that came undamaged; see :meth:`StreamRelay.take`.
+        """Forward an undamaged picture; see :meth:`StreamRelay.take`.
 
         Args:
-            unit: The picture; None: its headers are not known.
-            reason: Why it can't be handed on, which counts for the rest of the connection; empty if it can.
-            captured_ns: As of the decoded frame.
-            number: Counts the pictures of the connection.
-            connection: Its number.
+            unit: The picture; None: its headers are unknown.
+            reason: Why it can't be forwarded, for the rest of the connection; empty if it can.
+            captured_ns: As in the decoded frame.
+            number: Number of the picture within the connection.
+            connection: Number of the connection.
         """
         if not self.wanted:
             return
@@ -191,10 +191,10 @@ class CheckedRelay:
         )
         self._waited = 0 if taken else self._waited + 1
         if self._waited == KEYLESS:
-            self._report(f"of {KEYLESS} pictures none was a key (IDR) with its parameters: let the encoder send some")
+            self._report(f"{KEYLESS} pictures without a key picture (IDR) with parameters: configure the encoder")
 
     def _report(self, why: str) -> None:
         if why != self._reported:
             self._reported = why
-            text = f"{self._where}: {why}: only decoded frames are available, nothing is handed on as it came"
+            text = f"{self._where}: {why}: only decoded frames are available, not the original stream"
             self._sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, where=self._where)

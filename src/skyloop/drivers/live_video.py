@@ -1,8 +1,8 @@
 """Receives a vehicle's live video, decodes it, and shows the newest picture.
 
-Two threads: one reads frames from the socket at once, so that no picture grows old in a buffer of the kernel, and
-reconnects for ever; the other decodes what is wanted. Between them stands the
-:class:`~skyloop.drivers.live_frames.FrameBacklog`, which decides what is left out when decoding is late.
+One thread reads frames from the socket as they arrive, so that no picture ages in a kernel buffer, and keeps
+reconnecting. The other decodes wanted frames. Between them, the
+:class:`~skyloop.drivers.live_frames.FrameBacklog` decides which frames to drop when decoding is late.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from skyloop.drivers.live_frames import Coded, FrameBacklog
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
 
-RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: waits between attempts to connect; the last one is repeated
-REFUSALS: Final = 3  #: frames in a row of an unsupported codec before it is reported; one may be a flipped bit
+RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: waits between connection attempts; the last one repeats
+REFUSALS: Final = 3  #: consecutive frames of an unsupported codec before it is reported; one may be a flipped bit
 _CLOSE_S: Final = 2.0
 
 
 class Decoded(NamedTuple):
-    """A picture that a decoder made."""
+    """A decoded picture."""
 
-    number: int  #: counts the vehicle's pictures
+    number: int  #: number of the vehicle's picture
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
-    captured_ns: int | None = None  #: None: as the frame that was decoded last
+    captured_ns: int | None = None  #: None: as for the frame decoded last
 
 
 class Stream(Protocol):
@@ -40,16 +40,16 @@ class Stream(Protocol):
 
     @property
     def broken(self) -> int:
-        """Frames that were begun and not finished, or stale."""
+        """Frames that were incomplete or stale."""
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes that belong to no whole frame."""
+        """Bytes outside whole frames."""
 
     def read(self) -> list[Coded]:
-        """Return the frames that arrived.
+        """Return the received frames.
 
-        Returns after a tenth of a second at most if it can: :meth:`LiveVideo.stop` waits for it.
+        Should return within a tenth of a second: :meth:`LiveVideo.stop` waits for it.
 
         Raises:
             OSError: The connection is lost.
@@ -59,11 +59,11 @@ class Stream(Protocol):
 
 
 class Decoder(Protocol):
-    """Decodes the frames of one connection after the other."""
+    """Decodes the frames of one connection after another."""
 
     @property
     def waited(self) -> int:
-        """Frames left out because what they build on was never received, or because a newer one was shown before."""
+        """Frames left out because their reference was never received, or a newer one had been shown."""
 
     @property
     def damaged(self) -> int:
@@ -73,14 +73,14 @@ class Decoder(Protocol):
         """Forget the stream so far: the next frame does not continue it."""
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """Decode a frame. Raises nothing else, whatever a frame holds.
+        """Decode a frame. Raises nothing else, whatever the frame contains.
 
         Args:
             coded: The frame.
             show: Whether its picture is wanted.
 
         Returns:
-            The picture; None if there is none, or it is not wanted.
+            The picture; None if there is none or it is not wanted.
 
         Raises:
             UnsupportedError: The codec is not supported.
@@ -89,29 +89,29 @@ class Decoder(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A picture of whichever camera the vehicle is switched to."""
+    """A picture of the vehicle's selected camera."""
 
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
     width: int  #: [px]
     height: int
-    captured_ns: int  #: on this host's monotonic clock; of a vehicle that gives no stamp, when it came
-    number: int  #: counts the vehicle's pictures, 32 bits
+    captured_ns: int  #: on this host's monotonic clock; the arrival time for vehicles without timestamps
+    number: int  #: number of the vehicle's picture, 32 bits
 
     def show(self, sink: Sink, camera: str, intrinsics: Intrinsics | None) -> None:
-        """Publish it as a frame of a camera."""
+        """Publish the picture as a frame of a camera."""
         sink.frame(camera, self.pixels, self.captured_ns, width=self.width, height=self.height, intrinsics=intrinsics)
 
 
 class VideoEvent(Enum):
-    """What a receiver reports besides pictures."""
+    """A receiver's reports other than pictures."""
 
-    STREAMING = "streaming"  #: frames come
-    LOST = "lost"  #: no connection, or no more; reported once for each reason, tried again for ever
-    UNSUPPORTED = "unsupported"  #: frames come in another codec, or are noise; reported once for each row of them
-    FAULT = "fault"  #: an error of this program, reported once; the video goes on
+    STREAMING = "streaming"  #: frames arrive
+    LOST = "lost"  #: no connection, or no longer; reported once for each reason, retried for ever
+    UNSUPPORTED = "unsupported"  #: frames use another codec, or are noise; reported once for each run of them
+    FAULT = "fault"  #: an error of this program, reported once; the video continues
 
     def publish(self, sink: Sink, where: str, text: str) -> None:
-        """Publish it as an event."""
+        """Publish this as an event."""
         kind, severity = _EVENTS[self]
         sink.event(kind, f"{where} {self.value}: {text}", severity, where=where)
 
@@ -126,22 +126,22 @@ _EVENTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class VideoCounters:
-    """What became of the frames, all connections together."""
+    """Counts of frames over all connections, by what happened to them."""
 
     received: int = 0
     frames: int = 0  #: shown
-    waited: int = 0  #: left out up to the next key frame, or because a newer one was shown before
-    damaged: int = 0  #: broken off, stale at the start of a connection, or not to be decoded
-    refused: int = 0  #: of a kind that is not decoded here
-    skipped: int = 0  #: wanted, but newer ones were there
-    lost_bytes: int = 0  #: of the stream that belong to no whole frame
-    reconnects: int = 0  #: connections on which frames came, after the first such
+    waited: int = 0  #: left out up to the next key frame, or because a newer one had been shown
+    damaged: int = 0  #: cut off, stale at the start of a connection, or undecodable
+    refused: int = 0  #: of an unsupported kind
+    skipped: int = 0  #: wanted, but newer ones had arrived
+    lost_bytes: int = 0  #: outside whole frames
+    reconnects: int = 0  #: connections with frames, after the first such
 
     def telemetry(self, of: str) -> dict[str, Value]:
         """Return the counters for feedback's ``native``.
 
         Args:
-            of: Prefix of their names, before a dot.
+            of: Prefix of the names, before a dot.
         """
         return {f"{of}.{name}": getattr(self, name) for name in self.__dataclass_fields__}
 
@@ -149,21 +149,22 @@ class VideoCounters:
 class LiveVideo:
     """The video of one vehicle.
 
-    While nobody wants pictures nothing is decoded, but the stream is read and the frames since its newest key frame are
-    kept, so that a picture is there with the first frame after somebody does. No I/O happens before :meth:`start`.
+    While no one wants pictures, nothing is decoded, but the stream is read and the frames since its newest key frame
+    are kept, so that a new subscriber gets a picture at once. No I/O happens before :meth:`start`.
 
     Args:
-        place: Where the video comes from, for people.
-        connect: Opens the connection of this number, counted from 0; raises OSError if it can't. On the reading thread.
-        make_decoder: Makes the decoder; raises MissingExtraError if none is installed. On the thread of :meth:`start`.
+        place: The video's source, for people.
+        connect: Opens a connection, given its number from 0; raises OSError on failure. On the reading thread.
+        make_decoder: Creates the decoder; raises MissingExtraError if none is installed. On the thread of
+            :meth:`start`.
         show: Called with each picture on the decoding thread; must return quickly.
         on_event: Called with each event and its text on either thread; must return quickly.
-        wants: Whether anybody wants pictures. Called on the reading thread.
-        wants_checked: Whether frames are to be decoded though nobody wants pictures, as the decoder hands on what is
-            whole. Called on the reading thread.
-        came: Called with every whole frame as it arrived, on the reading thread.
+        wants: Whether anyone wants pictures. Called on the reading thread.
+        wants_checked: Whether to decode frames even though no one wants pictures, because the decoder forwards whole
+            ones. Called on the reading thread.
+        came: Called with every whole frame on arrival, on the reading thread.
         clock: Monotonic, ns.
-        name: Of the reading thread, and the beginning of the decoding one's.
+        name: Name of the reading thread, and prefix of the decoding thread's.
     """
 
     def __init__(
@@ -192,10 +193,10 @@ class LiveVideo:
         self._clock = clock
         self._name = name
         self._stop = threading.Event()
-        self._came = threading.Condition()  # guards the backlog and the counts of the reading thread
+        self._came = threading.Condition()  # guards the backlog and the reading thread's counts
         self._backlog = FrameBacklog()
-        self._wanted = False  # when the last frame came
-        self._shows = False  # pictures are wanted, not only checked frames
+        self._wanted = False  # when the last frame arrived
+        self._shows = False  # pictures are wanted, not only decoding for the check
         self._received = self._connections = self._broken = self._lost_bytes = 0
         self._stream: Stream | None = None
         self._shown = self._refused = 0
@@ -205,7 +206,7 @@ class LiveVideo:
     def start(self) -> None:
         """Start both threads. Returns at once."""
         if self._threads:
-            raise UsageError("this receiver was started before")
+            raise UsageError("this receiver has already been started")
         self._decoder = self._make_decoder()
         self._threads = [
             threading.Thread(target=self._read, name=self._name, daemon=True),
@@ -215,9 +216,9 @@ class LiveVideo:
             thread.start()
 
     def stop(self) -> None:
-        """Stop both threads. Idempotent; no callback is called after it, unless it is called from one.
+        """Stop both threads. Idempotent; no callback runs afterwards, unless this is called from one.
 
-        Takes up to 4 s; a connection that takes longer to open or read is left to end by itself, unseen.
+        Takes up to 4 s; a connection that takes longer to open or read is left to end unseen.
         """
         self._stop.set()
         with self._came:
@@ -228,7 +229,7 @@ class LiveVideo:
 
     @property
     def counters(self) -> VideoCounters:
-        """The counters so far; from any thread."""
+        """The counters so far. Thread-safe."""
         with self._came:
             stream, decoder = self._stream, self._decoder
             return VideoCounters(
@@ -242,7 +243,7 @@ class LiveVideo:
                 reconnects=max(0, self._connections - 1),
             )
 
-    # The thread that reads ---------------------------------------------------------------------------------------
+    # The reading thread ------------------------------------------------------------------------------------------
 
     def _read(self) -> None:
         failures = 0
@@ -253,7 +254,7 @@ class LiveVideo:
                 self._follow()
             except OSError as error:
                 reason = error.strerror or str(error)
-            except Exception as error:  # noqa: BLE001  nor may a surprise of a demuxer end it in silence
+            except Exception as error:  # noqa: BLE001  no error of a demuxer may end this thread silently
                 reason = repr(error)
             else:
                 return
@@ -266,7 +267,7 @@ class LiveVideo:
             failures += 1
 
     def _follow(self) -> None:
-        """Serve one connection from beginning to end."""
+        """Serve one connection from start to end."""
         stream = self._connect(self._connections)
         with self._came:
             self._stream = stream
@@ -298,7 +299,7 @@ class LiveVideo:
                 self._broken += stream.broken
                 self._lost_bytes += stream.lost_bytes
 
-    # The thread that decodes -------------------------------------------------------------------------------------
+    # The decoding thread -----------------------------------------------------------------------------------------
 
     def _decode(self, decoder: Decoder) -> None:
         connection = -1
@@ -324,7 +325,7 @@ class LiveVideo:
                 self._refused += 1
                 if refusals == REFUSALS:
                     self._emit(VideoEvent.UNSUPPORTED, str(error))
-            except Exception as error:  # noqa: BLE001  a surprise of a codec or a callback must not end the video
+            except Exception as error:  # noqa: BLE001  no error of a codec or a callback may end the video
                 decoder.restart()
                 if repr(error) != reported:
                     reported = repr(error)

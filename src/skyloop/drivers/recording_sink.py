@@ -1,4 +1,4 @@
-"""A sink for tests that keeps what a driver reports, and checks of samples and of parameters' values."""
+"""A sink for tests that keeps a driver's reports, and checks of samples and parameter values."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ _CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 
 @dataclass(frozen=True, slots=True)
 class SeenFrame:
-    """A frame as the driver handed it over.
+    """A frame as published by the driver.
 
     Args:
-        camera: Its name.
+        camera: Name of the camera.
         pixels: A copy, uint8, shape (height, width, 3), (height, width), or (bytes,) for JPEG; empty if it was
             malformed or pixels are not kept.
-        captured_ns: As the driver gave it.
-        arrived_ns: When the call came. Both on this host's monotonic clock.
+        captured_ns: As passed by the driver.
+        arrived_ns: Time of the call. Both are on this host's monotonic clock.
         width: [px]
         height: [px]
-        encoding: Of the pixels.
-        intrinsics: As the driver gave them.
+        encoding: Encoding of the pixels.
+        intrinsics: As passed by the driver.
     """
 
     camera: str
@@ -79,13 +79,13 @@ class SeenEvent:
 
 
 class RecordingSink:
-    """A :class:`skyloop.drivers.base.Sink` that keeps recent samples and frames and every link state, and counts all.
+    """A :class:`skyloop.drivers.base.Sink` that keeps recent samples and frames and all link states.
 
-    ``problems`` holds, in words, whatever broke the contract of :class:`skyloop.drivers.base.Sink`. Thread-safe.
+    ``problems`` lists violations of the contract of :class:`skyloop.drivers.base.Sink`, in words. Thread-safe.
 
     Args:
         watch: Names of the cameras whose frames are wanted; None: all.
-        keep: How many feedback samples, frames, pictures and events are kept; of frames with pixels at most 64.
+        keep: How many feedback samples, frames, pictures and events are kept; at most 64 frames with pixels.
         keep_pixels: Whether frames keep a copy of their pixels.
         record: Whether encoded pictures are wanted, of every camera.
     """
@@ -99,7 +99,7 @@ class RecordingSink:
         self.feedbacks: deque[Feedback] = deque(maxlen=keep)
         self.frames: deque[SeenFrame] = deque(maxlen=keep if not keep_pixels else min(keep, 64))
         self.links: list[tuple[LinkState, str]] = []
-        self.remedy = ""  #: of the newest link state
+        self.remedy = ""  #: remedy in the newest link state
         self.events: deque[SeenEvent] = deque(maxlen=keep)
         self.problems: list[str] = []
         self.calls = 0
@@ -109,7 +109,7 @@ class RecordingSink:
         self._newest_ns: dict[str, int] = {}
         self._changed = threading.Condition()
 
-    # What a driver calls ---------------------------------------------------------------------------------------
+    # Called by the driver ------------------------------------------------------------------------------------------
 
     def feedback(self, feedback: Feedback) -> None:
         """Keep a sample, and note a problem if its time is in the future or runs backwards."""
@@ -160,18 +160,18 @@ class RecordingSink:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Keep an encoded picture, and note a problem if the first one is no key picture or it is no Annex B."""
+        """Keep an encoded picture, and note a problem if it is not Annex B, or the first is not a key picture."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time(f"encoded frame of {camera}", captured_ns, now_ns)
             if not key and all(seen.camera != camera for seen in self.pictures):
-                self.problems.append(f"encoded frame of {camera}: the first one is no key picture")
+                self.problems.append(f"encoded frame of {camera}: the first one is not a key picture")
             if not data.startswith((b"\0\0\1", b"\0\0\0\1")):
                 self.problems.append(f"encoded frame of {camera}: not H.264 in Annex B form")
             self.pictures.append(SeenPicture(camera, data, captured_ns, width, height, key, intrinsics))
             self._notify()
 
-    def wants_stream(self, camera: str) -> bool:  # noqa: ARG002  (of all cameras or of none)
+    def wants_stream(self, camera: str) -> bool:  # noqa: ARG002  (all cameras or none)
         """Return ``record``."""
         return self.record
 
@@ -188,16 +188,16 @@ class RecordingSink:
             self.events.append(SeenEvent(EventKind(kind), text, Severity(severity), data))
             self._notify()
 
-    # What a test calls -----------------------------------------------------------------------------------------
+    # Called by the test --------------------------------------------------------------------------------------------
 
     @property
     def newest(self) -> Feedback | None:
-        """The newest feedback, None while there was none."""
+        """The newest feedback; None before the first."""
         return self.feedbacks[-1] if self.feedbacks else None
 
     @property
     def link_state(self) -> LinkState | None:
-        """The newest state of the link, None while none was reported."""
+        """The newest state of the link; None before the first report."""
         return self.links[-1][0] if self.links else None
 
     def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
@@ -208,7 +208,7 @@ class RecordingSink:
             timeout_s: [s]
 
         Returns:
-            Whether it held; False after the time-out.
+            Whether the condition held; False after the time-out.
         """
         end = time.monotonic() + timeout_s
         with self._changed:
@@ -230,7 +230,7 @@ class RecordingSink:
             self.problems.append(f"{what}: captured {(captured_ns - now_ns) / 1e6:.1f} ms in the future")
         before_ns = self._newest_ns.get(what)
         if before_ns is not None and captured_ns < before_ns:
-            self.problems.append(f"{what}: captured {(before_ns - captured_ns) / 1e6:.1f} ms before the one before it")
+            self.problems.append(f"{what}: captured {(before_ns - captured_ns) / 1e6:.1f} ms before the previous one")
         self._newest_ns[what] = captured_ns
 
     def _shaped(
@@ -253,7 +253,7 @@ class RecordingSink:
         return pixels.reshape((height, width, 3) if channels == 3 else (height, width)).copy()
 
 
-#: Plausible range of each number of feedback, in its unit: outside of it, it is most likely in another unit.
+#: Plausible range of each number of feedback: outside it, the number most likely has the wrong unit.
 PLAUSIBLE: dict[str, tuple[float, float]] = {
     "battery": (0.0, 1.0),
     "battery_v": (0.0, 60.0),
@@ -269,13 +269,13 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
 
 
 def implausible(feedback: Feedback) -> list[str]:
-    """Check a sample for numbers that are not finite or so large that they must be in another unit.
+    """Check a sample for numbers that are not finite, or so large that they must have the wrong unit.
 
     Args:
         feedback: The sample.
 
     Returns:
-        The problems in words, empty if there are none.
+        The problems in words; empty if there are none.
     """
     problems = []
     for name, (low, high) in PLAUSIBLE.items():
@@ -287,7 +287,7 @@ def implausible(feedback: Feedback) -> list[str]:
             if isinstance(number, bool) or not isinstance(number, (int, float)):
                 problems.append(f"{name} is a {type(number).__name__} and must be a float")
             elif not math.isfinite(number):
-                problems.append(f"{name} is {number} and must be finite, or None if it is not known")
+                problems.append(f"{name} is {number} and must be finite, or None if unknown")
             elif not low <= number <= high:
                 problems.append(f"{name} is {number:g}, outside {low:g} to {high:g}: is it in SI units?")
     return problems
@@ -303,20 +303,20 @@ _TYPES: Final[dict[ParameterType, tuple[type, ...]]] = {
 
 
 def mismatch(parameter: Parameter, value: Value) -> str:
-    """Say why a value does not fit a parameter's description.
+    """Return why a value does not fit a parameter's description.
 
     Args:
         parameter: The description: type, choices, range.
-        value: To be checked.
+        value: The value to check.
 
     Returns:
-        The end of a sentence about the value, empty if it fits.
+        The predicate of a sentence about the value; empty if it fits.
     """
     expected = _TYPES[parameter.type]
     if not isinstance(value, expected) or (isinstance(value, bool) and bool not in expected):
         return f"is not of type {parameter.type}"
     if parameter.choices and value not in parameter.choices:
-        return f"is none of {parameter.choices}"
+        return f"is not one of {parameter.choices}"
     numbers = value if isinstance(value, tuple) else (value,)
     for number in numbers:
         if isinstance(number, (str, bool)):

@@ -1,6 +1,6 @@
 """Finds drivers by the entry-point group ``skyloop.drivers``: the entry point's name is the URI scheme.
 
-A driver's module is imported only when a vehicle of its scheme is asked for.
+A driver's module is imported only when a vehicle of its scheme is requested.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.errors import DriverError, SkyloopError, UnknownNameError
 
 GROUP: Final = "skyloop.drivers"
-#: By scheme and where packages are. To read what all packages claim takes 20 ms, and a host has thousands of drones.
+#: Cached by scheme and package folders: reading all packages' claims takes 20 ms, and a host has thousands of drones.
 _loaded: Final[dict[tuple[str, tuple[str, ...]], type[Driver]]] = {}
 
 
@@ -32,7 +32,7 @@ def driver_class(scheme: str) -> type[Driver]:
 
     Raises:
         UnknownNameError: No installed package claims the scheme.
-        DriverError: Two packages claim it, or the class can't be loaded; the text names the packages.
+        DriverError: Two packages claim the scheme, or the class can't be loaded; the text names the packages.
         MissingExtraError: A package that the driver needs is not installed.
     """
     known = scheme, tuple(sys.path)
@@ -50,7 +50,7 @@ def driver_class(scheme: str) -> type[Driver]:
 
 
 def make_driver(uri: str | VehicleUri) -> Driver:
-    """Return a driver for a vehicle's address, not opened.
+    """Return an unopened driver for a vehicle's address.
 
     Args:
         uri: The address, as text or parsed.
@@ -68,7 +68,7 @@ def make_driver(uri: str | VehicleUri) -> Driver:
 def _claims() -> dict[str, list[EntryPoint]]:
     claims: dict[str, dict[tuple[str, str], EntryPoint]] = defaultdict(dict)
     for entry in entry_points(group=GROUP):
-        # One package may be found twice, in two folders of sys.path; that is no second claim.
+        # One package may be found in two folders of sys.path; that is not a second claim.
         claims[entry.name][entry.value, _package(entry)] = entry
     return {scheme: list(found.values()) for scheme, found in claims.items()}
 
@@ -76,13 +76,13 @@ def _claims() -> dict[str, list[EntryPoint]]:
 def _load(entry: EntryPoint) -> type[Driver]:
     try:
         loaded = entry.load()
-    except SkyloopError:  # its text names what is missing and how to install it
+    except SkyloopError:  # its text names the missing package and how to install it
         raise
     except Exception as error:
-        raise DriverError(f"the driver for {entry.name}:// of {_owner(entry)} cannot be loaded: {error!r}") from error
+        raise DriverError(f"the driver for {entry.name}:// from {_owner(entry)} cannot be loaded: {error!r}") from error
     if not (isinstance(loaded, type) and issubclass(loaded, Driver)):
         raise DriverError(
-            f"the driver for {entry.name}:// of {_owner(entry)} is not a class of skyloop.drivers.base.Driver"
+            f"the driver for {entry.name}:// from {_owner(entry)} is not a subclass of skyloop.drivers.base.Driver"
         )
     return loaded
 

@@ -1,4 +1,4 @@
-"""The contract of :mod:`skyloop.drivers.base` as tests: subclass, name the vehicle, run with pytest.
+"""The contract of :mod:`skyloop.drivers.base` as tests: subclass it, name the vehicle, and run it with pytest.
 
 ::
 
@@ -8,10 +8,10 @@
         uri = "mydrone://127.0.0.1?port=5556"
 
 The vehicle at that address must answer and, if it can fly, stand on the ground with room around it: the suite takes
-off, moves about a metre along each axis, turns, and lands. **Never run it against a real vehicle that is not tied
-down or netted in.** A vehicle that can't fly is not asked to.
+off, moves about a metre along each axis, turns, and lands. **Never run it with a real vehicle that is not tied down or
+in a net.** A vehicle that can't fly is not commanded.
 
-Tests of what a vehicle does not have are skipped. Nothing here needs pytest to be imported.
+Tests of missing abilities are skipped. The module does not import pytest.
 """
 
 from __future__ import annotations
@@ -62,22 +62,22 @@ _PARAMETER_NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
 class DriverSuite:
     """Base class of a driver's tests. Set :attr:`uri`, or override :meth:`make`; everything else has a default.
 
-    Override the class attributes below for a vehicle that is slower or moves less, and :meth:`vehicle_disappears` and
-    :meth:`vehicle_appears` to have the loss of the link tested. To give each test a fake vehicle of its
-    own, start it in a fixture and override :meth:`new_driver`.
+    Override the class attributes below for a slower vehicle or one that moves less, and :meth:`vehicle_disappears` and
+    :meth:`vehicle_appears` to test the loss of the link. To give each test its own fake vehicle, start it in a fixture
+    and override :meth:`new_driver`.
 
     Attributes:
         uri: The address of the vehicle to test with.
-        connect_timeout_s: How long the link may take to come up [s]. All names in ``_timeout_s`` are such times.
-        close_grace_s: How long threads that were joined may take to vanish from the system's tables [s].
-        speed: Commanded forward, backward, left and right in the flight [m/s].
-        climb: Commanded up and down [m/s].
-        tilt: Commanded roll and pitch, of a vehicle that takes no velocities [rad].
-        yaw_rate: [rad/s]
-        distance: How far the vehicle must go each way within ``motion_timeout_s`` [m].
-        turn: How far it must turn [rad].
-        near: How near it must come to a commanded position [m].
-        stand_s: How long the vehicle is watched where it must not start its motors [s].
+        connect_timeout_s: How long the link may take to come up [s]. All names ending in ``_timeout_s`` are such times.
+        close_grace_s: How long joined threads may take to vanish from the system's tables [s].
+        speed: Commanded speed forward, backward, left and right [m/s].
+        climb: Commanded speed up and down [m/s].
+        tilt: Commanded roll and pitch, for a vehicle that does not support velocities [rad].
+        yaw_rate: Commanded yaw rate [rad/s].
+        distance: How far the vehicle must move in each direction within ``motion_timeout_s`` [m].
+        turn: How far the vehicle must turn [rad].
+        near: How close it must get to a commanded position [m].
+        stand_s: How long the suite watches a vehicle that must not start its motors [s].
         feedback_age_s: Greatest age of a sample when it arrives [s].
         frame_age_s: Greatest age of a frame when it arrives [s].
         untouched_parameters: Names of parameters that the suite must not write.
@@ -95,10 +95,10 @@ class DriverSuite:
     motion_timeout_s: ClassVar[float] = 6.0
     emergency_timeout_s: ClassVar[float] = 3.0
     lost_timeout_s: ClassVar[float] = 5.0
-    close_grace_s: ClassVar[float] = 2.0  #: for threads that were joined to vanish from the system's tables
+    close_grace_s: ClassVar[float] = 2.0  #: for joined threads to vanish from the system's tables
 
-    #: What the flight test commands: speed and climb [m/s], tilt [rad], yaw rate [rad/s]; how far the vehicle must go
-    #: (distance [m]) and turn [rad]; and how near [m] it must come to a place that it is to fly to.
+    #: Commands of the flight test: speed and climb [m/s], tilt [rad], yaw rate [rad/s]; how far the vehicle must move
+    #: (distance [m]) and turn [rad]; and how close [m] it must get to a commanded position.
     speed: ClassVar[float] = 0.4
     climb: ClassVar[float] = 0.4
     tilt: ClassVar[float] = 0.08
@@ -107,28 +107,28 @@ class DriverSuite:
     turn: ClassVar[float] = 0.2
     near: ClassVar[float] = 0.15
 
-    #: How long the vehicle is watched where it must not start its motors [s].
+    #: How long the suite watches a vehicle that must not start its motors [s].
     stand_s: ClassVar[float] = 2.0
 
-    #: How old a sample or frame may be when it arrives [s].
+    #: How old a sample or frame may be on arrival [s].
     feedback_age_s: ClassVar[float] = 0.5
     frame_age_s: ClassVar[float] = 1.0
 
     #: Parameters that the suite must not write.
     untouched_parameters: ClassVar[frozenset[str]] = frozenset()
 
-    # To be written or overridden in a driver's test ---------------------------------------------------------
+    # To be implemented or overridden by a driver's test ------------------------------------------------------
 
     def make(self, uri: VehicleUri) -> Driver:
-        """Return a new driver, not opened. The default finds its class by the entry point of the URI's scheme.
+        """Return a new, unopened driver. The default finds its class by the entry point of the URI's scheme.
 
         Args:
-            uri: The address of the vehicle to test with, or one with an option that must be refused.
+            uri: The address of the vehicle to test with, perhaps with an option that must be refused.
         """
         return make_driver(uri)
 
     def vehicle_disappears(self) -> None:
-        """Take the vehicle away from the open driver: switch off its radio, or stop its emulator.
+        """Make the vehicle disappear for the open driver: switch off its radio, or stop its emulator.
 
         Raises:
             unittest.SkipTest: Unless overridden.
@@ -146,7 +146,7 @@ class DriverSuite:
     # Helpers -------------------------------------------------------------------------------------------------------
 
     def new_driver(self) -> Driver:
-        """Return a new driver for :attr:`uri`, not opened."""
+        """Return a new, unopened driver for :attr:`uri`."""
         return self.make(parse_uri(self.uri))
 
     @contextmanager
@@ -161,7 +161,7 @@ class DriverSuite:
             The open driver and its sink.
 
         Raises:
-            AssertionError: The link was not reported UP within :attr:`connect_timeout_s`, or, at the end, the driver
+            AssertionError: The link was not UP within :attr:`connect_timeout_s`, or the driver
                 broke the contract of :class:`skyloop.drivers.base.Sink`.
         """
         driver, sink = self.new_driver(), RecordingSink(watch=watch, record=record)
@@ -174,27 +174,27 @@ class DriverSuite:
             driver.close()
         assert not sink.problems, "; ".join(sink.problems[:5])
 
-    # Before it is opened -------------------------------------------------------------------------------------------
+    # Before opening ------------------------------------------------------------------------------------------------
 
     def test_constructor_does_no_io(self) -> None:
-        """A constructor starts no thread and opens no descriptor, and closing what was never opened does nothing."""
-        self.new_driver()  # imports and caches of the first time are no resource of the driver
+        """A constructor starts no thread and opens no descriptor, and close() without open() does nothing."""
+        self.new_driver()  # fill import caches first: they are not the driver's resources
         before = _resources()
         drivers = [self.new_driver() for _ in range(3)]
         assert _resources() == before, "a constructor started a thread or opened a descriptor"
         for driver in drivers:
-            driver.close()  # closing what was never opened does nothing
+            driver.close()  # close() without open() does nothing
 
     def test_capabilities_before_open(self) -> None:
-        """Capabilities are known before the driver is opened and make sense."""
+        """Capabilities are known before open() and make sense."""
         capabilities = self.new_driver().capabilities()
         assert capabilities.vehicle, "capabilities need the vehicle's family name"
         unknown = capabilities.actions - set(ACTION_NAMES.values())
-        assert not unknown, f"actions {sorted(unknown)} are none of {sorted(ACTION_NAMES.values())}"
+        assert not unknown, f"actions {sorted(unknown)} are not in {sorted(ACTION_NAMES.values())}"
         if not capabilities.actions:
-            assert capabilities.why_not, "a vehicle that takes no actions must say why in why_not"
+            assert capabilities.why_not, "a vehicle without actions must give a reason in why_not"
         names = [camera.name for camera in capabilities.cameras]
-        assert len(names) == len(set(names)), f"two cameras have one name: {names}"
+        assert len(names) == len(set(names)), f"two cameras have the same name: {names}"
         for camera in capabilities.cameras:
             assert camera.fps > 0, f"{camera.name}: fps must be positive"
             assert camera.width > 0, f"{camera.name}: width must be positive"
@@ -203,7 +203,7 @@ class DriverSuite:
                 _check_rotation(camera.name, camera.rotation)
 
     def test_unknown_option_is_refused(self) -> None:
-        """The constructor refuses an option that the driver does not know, and names it."""
+        """The constructor refuses an unknown option and names it."""
         good = parse_uri(self.uri)
         options = {name: good.reveal(name) or "" for name in good.options} | {"no_such_option_at_all": "1"}
         try:
@@ -211,7 +211,7 @@ class DriverSuite:
         except UsageError as error:
             reported = str(error)
         else:
-            raise AssertionError("an option that the driver does not know must raise UsageError in the constructor")
+            raise AssertionError("an unknown option must raise UsageError in the constructor")
         assert "no_such_option_at_all" in reported, f"the error must name the option: {reported}"
 
     # Life cycle ----------------------------------------------------------------------------------------------------
@@ -233,10 +233,10 @@ class DriverSuite:
                 driver.open(RecordingSink())
             except UsageError:
                 return
-            raise AssertionError("opening a driver that is open must raise UsageError")
+            raise AssertionError("opening an open driver must raise UsageError")
 
     def test_can_be_opened_again(self) -> None:
-        """A driver that was closed can be opened again with another sink."""
+        """A closed driver can be opened again with another sink."""
         driver = self.new_driver()
         for _ in range(2):
             sink = RecordingSink()
@@ -247,7 +247,7 @@ class DriverSuite:
 
     def test_gives_threads_and_descriptors_back(self) -> None:
         """Opening and closing leaves no threads or descriptors behind."""
-        with self.opened() as (_, sink):  # what libraries keep for themselves is kept from here on
+        with self.opened() as (_, sink):  # resources that libraries keep for themselves exist from here on
             self.wait_for_feedback(sink)
         gc.collect()
         before = _resources()
@@ -260,10 +260,10 @@ class DriverSuite:
             time.sleep(0.02)
         assert not _exceeds(_resources(), before), f"threads and descriptors: {before} before, {_resources()} after"
 
-    # What it reports -----------------------------------------------------------------------------------------------
+    # Reports -------------------------------------------------------------------------------------------------------
 
     def test_feedback(self) -> None:
-        """Feedback comes, is recent, plausible in SI units, and leaves the proxy's fields alone."""
+        """Feedback arrives, is recent, plausible in SI units, and leaves the proxy's fields alone."""
         with self.opened() as (_, sink):
             arrived = sink.wait(lambda: sink.feedback_count >= 10, self.feedback_timeout_s + 5.0)
             assert arrived, f"{sink.feedback_count} samples of feedback in {self.feedback_timeout_s + 5.0} s"
@@ -273,33 +273,33 @@ class DriverSuite:
             problems = implausible(feedback)
             assert not problems, "; ".join(problems)
             assert FlightState(feedback.state) is feedback.state
-            assert (feedback.seq, feedback.published_ns, feedback.lease) == (0, 0, 0), "those fields are the proxy's"
-            assert feedback.owner is None, "the owner is the proxy's to fill"
+            assert (feedback.seq, feedback.published_ns, feedback.lease) == (0, 0, 0), "these fields are the proxy's"
+            assert feedback.owner is None, "the owner belongs to the proxy"
         age_s = (now_ns - samples[-1].captured_ns) / 1e9
         assert age_s <= self.feedback_age_s + 1.0, f"the newest feedback is {age_s:.2f} s old"
 
     def test_frames(self) -> None:
-        """Frames come, are recent, and have the announced cameras' names and sizes."""
+        """Frames arrive, are recent, and have the announced cameras' names and sizes."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera")
         with self.opened() as (_, sink):
             some = sink.wait(lambda: sum(sink.frame_counts.values()) >= 5, self.frame_timeout_s)
-            assert some, f"frames of {dict(sink.frame_counts)} within {self.frame_timeout_s} s"
+            assert some, f"got frames of {dict(sink.frame_counts)} within {self.frame_timeout_s} s"
             frames = list(sink.frames)
         ages_s = []
         for frame in frames:
             camera = cameras.get(frame.camera)
-            assert camera is not None, f"frames of camera {frame.camera!r}, which capabilities() does not name"
-            assert frame.encoding in set(Encoding), f"{frame.encoding!r} is no encoding"
+            assert camera is not None, f"frames of camera {frame.camera!r}, which is not in capabilities()"
+            assert frame.encoding in set(Encoding), f"{frame.encoding!r} is not an encoding"
             assert (frame.width, frame.height) == (camera.width, camera.height), (
-                f"{frame.camera}: {frame.width}×{frame.height} came, {camera.width}×{camera.height} is announced"
+                f"{frame.camera}: {frame.width}×{frame.height} arrived, not {camera.width}×{camera.height}"
             )
             ages_s.append((frame.arrived_ns - frame.captured_ns) / 1e9)
         assert statistics.median(ages_s) <= self.frame_age_s, f"frames are {statistics.median(ages_s):.2f} s old"
 
     def test_pictures_as_they_come(self) -> None:
-        """Encoded pictures come and have the announced cameras' names and sizes."""
+        """Encoded pictures arrive and have the announced cameras' names and sizes."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras if camera.stream}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera with an encoded stream")
@@ -311,7 +311,7 @@ class DriverSuite:
             camera = cameras.get(picture.camera)
             assert camera is not None, f"encoded frames of camera {picture.camera!r}, which announces no stream"
             assert (picture.width, picture.height) == (camera.width, camera.height), (
-                f"{picture.camera}: {picture.width}×{picture.height} came, {camera.width}×{camera.height} is announced"
+                f"{picture.camera}: {picture.width}×{picture.height} arrived, not {camera.width}×{camera.height}"
             )
 
     def test_link_lost_and_found(self) -> None:
@@ -328,12 +328,12 @@ class DriverSuite:
             found = sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
             assert found, f"the link was not reported UP again; reported: {sink.links}"
 
-    # What it is commanded -----------------------------------------------------------------------------------------
+    # Commands ------------------------------------------------------------------------------------------------------
 
     def test_apply_returns_what_was_applied_at_once(self) -> None:
         """``apply`` returns a finite action within :data:`APPLY_S`.
 
-        On the ground, with actions that do not take off; the flight has its own test.
+        Runs on the ground, with actions that do not take off; the flight has its own test.
         """
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
@@ -342,7 +342,7 @@ class DriverSuite:
             harmless: list[AnyAction] = [Idle(), Land(), Hover(), *set_points]
             announced = [action for action in harmless if action.name in actions]
             if not announced:
-                raise unittest.SkipTest("the vehicle takes no actions")
+                raise unittest.SkipTest("the vehicle supports no actions")
             for action in announced:
                 times_s = []
                 for _ in range(5):
@@ -351,18 +351,18 @@ class DriverSuite:
                     times_s.append(time.perf_counter() - begun)
                     assert type(applied).__name__ in {type(known).__name__ for known in (*harmless, Takeoff())}
                     assert applied.finite, f"apply({action.name}) returned {applied}"
-                # The median: on a busy machine any single call may be held up.
+                # The median, because on a busy machine any single call may be delayed.
                 middle_s = statistics.median(times_s)
                 assert middle_s <= APPLY_S, f"apply({action.name}) took {middle_s * 1e3:.0f} ms"
 
     def test_a_repeat_keeps_what_is_in_force(self) -> None:
-        """A repeated action applies what a new one does while nobody else commands the vehicle. On the ground."""
+        """A repeated action does the same as a new one while no one else commands the vehicle. On the ground."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             assert driver.left_to() == "", f"on the ground it is left to {driver.left_to()!r}"
             announced = [action for action in (Land(), Hover()) if action.name in driver.capabilities().actions]
             if not announced:
-                raise unittest.SkipTest("the vehicle neither hovers nor lands by itself")
+                raise unittest.SkipTest("the vehicle supports neither hover nor land")
             for action in announced:
                 assert driver.apply(action, new=False) == driver.apply(action), f"a repeated {action.name} differs"
             assert driver.left_to() == ""
@@ -380,12 +380,12 @@ class DriverSuite:
     # Parameters ----------------------------------------------------------------------------------------------------
 
     def test_parameters_are_well_formed(self) -> None:
-        """Parameters have unique dotted lower-case names, and values and defaults that fit their own description."""
+        """Parameters have unique dotted lower-case names, and values and defaults within their own limits."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             parameters = driver.parameters()
         names = [parameter.name for parameter in parameters]
-        assert len(names) == len(set(names)), "two parameters have one name"
+        assert len(names) == len(set(names)), "two parameters have the same name"
         for parameter in parameters:
             assert _PARAMETER_NAME.match(parameter.name), f"{parameter.name!r} is not dotted lower case"
             for what in ("value", "default"):
@@ -395,13 +395,13 @@ class DriverSuite:
                     assert not problem, f"{parameter.name}: its {what} {value!r} {problem}"
 
     def test_parameters_round_trip(self) -> None:
-        """What is written to a parameter is in force and listed. Writes the old value back."""
+        """A written value is in force and listed. Restores the old value."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             end = time.monotonic() + self.feedback_timeout_s
             while not (writable := self._writable(driver)):  # a driver may have to request them first
                 if time.monotonic() > end:
-                    raise unittest.SkipTest(f"parameters() lists none to write within {self.feedback_timeout_s} s")
+                    raise unittest.SkipTest(f"parameters() lists no writable one within {self.feedback_timeout_s} s")
                 time.sleep(0.05)
             for parameter in writable:
                 try:
@@ -434,7 +434,7 @@ class DriverSuite:
     def test_flight(self) -> None:
         """The vehicle takes off, moves both ways along each axis with the right sign, and lands.
 
-        One that takes positions flies to some besides.
+        If it supports positions, it also flies to some.
         """
         with self.opened(watch=set()) as (driver, sink):
             flight = Flight(self, driver, sink)
@@ -452,10 +452,10 @@ class DriverSuite:
                 flight.land()
 
     def test_a_landing_withdraws_a_takeoff(self) -> None:
-        """A landing right after a take-off ends with a vehicle that is on the ground and stays there."""
+        """After a take-off and an immediate landing, the vehicle is on the ground and stays there."""
         with self.opened(watch=set()) as (driver, sink):
             if not {"takeoff", "land"} <= driver.capabilities().actions:
-                raise unittest.SkipTest("the vehicle takes no take-off and landing of its own")
+                raise unittest.SkipTest("the vehicle has no native take-off and landing")
             flight = Flight(self, driver, sink)
             flight.wake()
             driver.apply(Takeoff())
@@ -463,10 +463,10 @@ class DriverSuite:
             self._stands(sink, "a take-off that a landing withdrew")
 
     def test_a_takeoff_is_not_kept_for_a_lost_vehicle(self) -> None:
-        """A take-off requested while the link is lost does not start when the link is back."""
+        """A take-off requested while the link is lost does not start once the link is back."""
         with self.opened(watch=set()) as (driver, sink):
             if "takeoff" not in driver.capabilities().actions:
-                raise unittest.SkipTest("the vehicle takes no take-off of its own")
+                raise unittest.SkipTest("the vehicle has no native take-off")
             Flight(self, driver, sink).wake()
             self.vehicle_disappears()
             try:
@@ -481,25 +481,25 @@ class DriverSuite:
             self._stands(sink, "a take-off from before the link was back", at_once=True)
 
     def _stands(self, sink: RecordingSink, what: str, *, at_once: bool = False) -> None:
-        """Check that the vehicle stands for ``stand_s``, and unless ``at_once`` give it time to land before."""
+        """Check that the vehicle stays on the ground for ``stand_s``, after time to land unless ``at_once``."""
         if not at_once:
-            time.sleep(1.0)  # time for telemetry to show what the vehicle received
+            time.sleep(1.0)  # time for telemetry to reflect the last command
             sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.LANDED, self.land_timeout_s)
         up = (FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.LANDING)
         flies = sink.wait(lambda: sink.newest is not None and sink.newest.state in up, self.stand_s)
         assert not flies, f"the motors turn after {what}: state {sink.newest and sink.newest.state}"
 
     def test_emergency_stop_and_reset(self) -> None:
-        """An emergency stop is reported and ends only with the reset. On the ground."""
+        """An emergency stop is reported and ends only with a reset. On the ground."""
         with self.opened(watch=set()) as (driver, sink):
             actions = driver.capabilities().actions
             if not {"emergency_stop", "reset_emergency"} <= actions:
-                raise unittest.SkipTest("the vehicle takes no emergency stop with reset")
+                raise unittest.SkipTest("the vehicle has no emergency stop with reset")
             flight = Flight(self, driver, sink)
             driver.apply(EmergencyStop())
             flight.until(lambda f: f.state is FlightState.EMERGENCY, self.emergency_timeout_s, "in emergency")
             if "hover" in actions:
-                with suppress(DriverError):  # refused or ignored, as the driver likes
+                with suppress(DriverError):  # the driver may refuse or ignore it
                     driver.apply(Hover())
                 time.sleep(0.2)
                 flight.until(lambda f: f.state is FlightState.EMERGENCY, 1.0, "still in emergency after hover")
@@ -510,17 +510,17 @@ class DriverSuite:
         """Wait for the first feedback.
 
         Args:
-            sink: Of the open driver.
+            sink: The open driver's sink.
 
         Raises:
-            AssertionError: None came within :attr:`feedback_timeout_s`.
+            AssertionError: None arrived within :attr:`feedback_timeout_s`.
         """
         received = sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
         assert received, f"no feedback within {self.feedback_timeout_s} s of the link being up"
 
 
 def _resources() -> tuple[int, int]:
-    """Threads and open descriptors of this process; no descriptors counted where /proc is missing."""
+    """Return the numbers of threads and open descriptors of this process (0 descriptors without /proc)."""
     descriptors = Path("/proc/self/fd") if sys.platform == "linux" else Path("/dev/fd")
     count = len(list(descriptors.iterdir())) if descriptors.exists() else 0
     return threading.active_count(), count
@@ -535,4 +535,4 @@ def _check_rotation(name: str, rotation: tuple[float, ...]) -> None:
     for i in range(3):
         for j in range(3):
             dot = sum(a * b for a, b in zip(rows[i], rows[j], strict=True))
-            assert abs(dot - (i == j)) < 1e-6, f"{name}: its rotation is no rotation matrix"
+            assert abs(dot - (i == j)) < 1e-6, f"{name}: its rotation is not a rotation matrix"

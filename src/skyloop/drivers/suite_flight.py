@@ -1,4 +1,4 @@
-"""The driver suite's flight: take-off, both ways along each axis, landing, judged by the vehicle's feedback."""
+"""The driver suite's flight: take-off, both directions of each axis, landing, judged by the vehicle's feedback."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from skyloop.messages.geometry import wrap_angle
 if TYPE_CHECKING:
     from skyloop.drivers.suite import DriverSuite
 
-NEAR_RAD = 0.3  #: so near is a vehicle turned to the commanded heading
-#: How far the vehicle went from the first sample to the second, with sign; None if it does not report it.
+NEAR_RAD = 0.3  #: tolerance of the commanded heading
+#: How far the vehicle moved between two samples, with sign; None if it does not report that.
 Measure = Callable[[Feedback, Feedback], float | None]
 
 
 class Flight:
-    """One flight of the suite, with native take-off and landing where the vehicle has them, else with set-points.
+    """One flight of the suite, with native take-off and landing if the vehicle has them, otherwise with set-points.
 
     Args:
-        suite: Gives speeds, distances and time-outs.
-        driver: Open, with its link up.
-        sink: Of the driver.
+        suite: Provides speeds, distances and time-outs.
+        driver: An open driver with its link up.
+        sink: The driver's sink.
 
     Raises:
-        unittest.SkipTest: The vehicle takes neither velocity nor attitude set-points.
-        AssertionError: No feedback comes.
+        unittest.SkipTest: The vehicle supports neither velocity nor attitude set-points.
+        AssertionError: No feedback arrives.
     """
 
     def __init__(self, suite: DriverSuite, driver: Driver, sink: RecordingSink) -> None:
@@ -41,7 +41,7 @@ class Flight:
         self.sink = sink
         self.actions = driver.capabilities().actions
         if not self.actions & {"velocity", "attitude"}:
-            raise unittest.SkipTest("the vehicle takes no set-points")
+            raise unittest.SkipTest("the vehicle supports no set-points")
         suite.wait_for_feedback(sink)
 
     def until(self, condition: Callable[[Feedback], bool], timeout_s: float, what: str) -> Feedback:
@@ -68,10 +68,10 @@ class Flight:
         return sink.newest
 
     def wake(self) -> None:
-        """Wait until the vehicle is awake, where its link says that it wakes up.
+        """Wait until the vehicle is awake, if its link reports that it is waking up.
 
         Raises:
-            AssertionError: It was not awake within the suite's ``takeoff_timeout_s``.
+            AssertionError: The vehicle was not awake within the suite's ``takeoff_timeout_s``.
         """
         links, timeout_s = self.sink.links, self.suite.takeoff_timeout_s
         assert self.sink.wait(lambda: not links[-1][1].startswith(WAKING_UP), timeout_s), links[-1]
@@ -80,7 +80,7 @@ class Flight:
         """Take off and wait until the vehicle hovers or flies; without a native take-off, climb to 0.6 m.
 
         Raises:
-            AssertionError: It was not awake, or not up within the suite's ``takeoff_timeout_s``.
+            AssertionError: The vehicle was not awake, or not in the air within the suite's ``takeoff_timeout_s``.
         """
         if "takeoff" in self.actions:
             self.wake()
@@ -94,10 +94,10 @@ class Flight:
         self.set_point()
 
     def land(self) -> None:
-        """Land and wait for it; without a native landing, descend until the vehicle is landed or below 0.1 m.
+        """Land and wait for the landing; without a native one, descend until the vehicle is landed or below 0.1 m.
 
         Raises:
-            AssertionError: It was not down within the suite's ``land_timeout_s``.
+            AssertionError: The vehicle had not landed within the suite's ``land_timeout_s``.
         """
         if "land" in self.actions:
             self.driver.apply(Land())
@@ -112,9 +112,9 @@ class Flight:
         )
 
     def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
-        """Apply a velocity if the vehicle takes it, else the attitude that accelerates that way.
+        """Apply a velocity if the vehicle supports it, otherwise the attitude that accelerates that way.
 
-        Called once: the driver must keep it in force.
+        Sent once: the driver must keep it in force.
 
         Args:
             forward: [m/s], body axes; for an attitude only the sign counts, and the suite's ``tilt`` is the angle.
@@ -130,10 +130,10 @@ class Flight:
         self.driver.apply(Attitude(roll=roll, pitch=pitch, climb=up, yaw_rate=turn))
 
     def moves_along_axes(self) -> None:
-        """Move both ways along each axis: the sign is right only if both are.
+        """Move in both directions along each axis: only then is the sign known to be right.
 
         Raises:
-            AssertionError: The vehicle did not go the suite's ``distance`` or ``turn`` within ``motion_timeout_s``.
+            AssertionError: The vehicle did not move the suite's ``distance`` or ``turn`` within ``motion_timeout_s``.
         """
         suite = self.suite
         for sign in (1.0, -1.0):
@@ -143,14 +143,14 @@ class Flight:
             self._goes("left", _aside, sign * suite.distance, left=sign * suite.speed)
 
     def goes_to_places(self) -> None:
-        """Fly to a place aside and above and turn, then back, for a vehicle that flies to places by itself.
+        """Fly to a position aside and above, turn, and fly back, if the vehicle supports positions.
 
         Raises:
-            AssertionError: It was not there, or not turned, within the suite's ``motion_timeout_s``.
+            AssertionError: It had not arrived, or not turned, within the suite's ``motion_timeout_s``.
         """
         suite, start = self.suite, self.sink.newest
         assert start is not None
-        assert start.position_m is not None, "a vehicle that takes positions reports its own"
+        assert start.position_m is not None, "a vehicle that supports positions must report its own"
         x, y, z = start.position_m
         turn = 0.0 if start.yaw_rad is None else start.yaw_rad + suite.turn
         away = Position(x + suite.distance, y - suite.distance, z + suite.distance, turn, speed=suite.speed)
@@ -160,16 +160,16 @@ class Flight:
             def is_there(feedback: Feedback, place: Position = place) -> bool:
                 near = feedback.position_m is not None and math.dist(feedback.position_m, place.place) <= suite.near
                 turned = feedback.yaw_rad is None or abs(wrap_angle(turn - feedback.yaw_rad)) <= NEAR_RAD
-                return near and turned  # without a yaw it keeps the one that it has
+                return near and turned  # without a yaw, it keeps its heading
 
             self.until(is_there, suite.motion_timeout_s, f"at {place}")
 
     def _goes(self, axis: str, measure: Measure, goal: float, **set_point: float) -> None:
-        """Command, wait until the vehicle has gone as far as the goal on its side, then stop."""
+        """Command, wait until the vehicle has passed the goal, then stop."""
         start = self.sink.newest
         assert start is not None
         if measure(start, start) is None:
-            return  # the vehicle does not report what this axis would be judged by
+            return  # the vehicle does not report the measure of this axis
         self.set_point(**set_point)
 
         def far_enough(feedback: Feedback) -> bool:
@@ -181,7 +181,7 @@ class Flight:
         self._settle()
 
     def _settle(self) -> None:
-        """Wait until the vehicle is slow again, where it reports its speed. One that takes only attitudes coasts."""
+        """Wait until the vehicle is slow again, if it reports its speed. One with only attitudes coasts."""
         brake = "hover" in self.actions
         if brake:
             self.driver.apply(Hover())
@@ -189,7 +189,7 @@ class Flight:
 
 
 def _told(feedback: Feedback | None) -> str:
-    """Return what a driver filled in, and how old it is, for the text of an error."""
+    """Return the fields that a driver filled in, and their age, for an error message."""
     if feedback is None:
         return "none"
     age_s = (time.monotonic_ns() - feedback.captured_ns) / 1e9
@@ -219,7 +219,7 @@ def _aside(start: Feedback, now: Feedback) -> float | None:
 
 
 def _along(start: Feedback, now: Feedback, axis: int) -> float | None:
-    """Return the way along the heading (axis 0) or to its left (1) [m]; the speed there if no position is known."""
+    """Return the distance along the heading (axis 0) or to its left (1) [m]; without a position, the speed."""
     if start.position_m is None or now.position_m is None or start.yaw_rad is None:
         return _speed_sign(now, axis)
     east, north = now.position_m[0] - start.position_m[0], now.position_m[1] - start.position_m[1]

@@ -13,20 +13,20 @@ from skyloop.address import HIDDEN, is_broken, shown_address, shown_name, withou
 from skyloop.errors import UsageError
 
 _HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
-_SHORT: Final = 4  # characters: so short a secret stands in many a word
+_SHORT: Final = 4  # characters: shorter secrets occur within ordinary words
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
 
 class VehicleUri:
-    """A parsed vehicle address that shows itself without its secrets, wherever it goes.
+    """A parsed vehicle address that never shows its secrets.
 
-    ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles have neither users nor passwords nor keys (see
-    ``skyloop.address``). Only what opens the vehicle asks for those, with :meth:`reveal_place` and :meth:`reveal`.
+    ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles contain no users, passwords or keys (see
+    ``skyloop.address``). Only code that opens the vehicle reads those, with :meth:`reveal_place` and :meth:`reveal`.
 
     Attributes:
         scheme: The driver's name.
-        place: What stands between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
-        options: Names and values as they were given, percent-decoded.
+        place: The part between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
+        options: Names and values as given, percent-decoded.
     """
 
     __slots__ = ("_given", "_secrets", "options", "place", "scheme")
@@ -37,8 +37,8 @@ class VehicleUri:
         Args:
             scheme: The driver's name.
             place: A host, a path, or nothing.
-            options: By name.
-            text: The address as it was given; empty for one that was made in code.
+            options: Options by name.
+            text: The address as given; empty if built in code.
         """
         given = dict(options or {})
         broken = is_broken(given)
@@ -81,21 +81,21 @@ class VehicleUri:
         return VehicleUri, (self.scheme, self.place, self.options, str(self))
 
     def reveal_place(self) -> str:
-        """Return the place as it was given, with its secrets: for opening it, and for nothing that is shown or kept."""
+        """Return the place with its secrets. Use it only to open the place, never to show or store it."""
         return self._given[0]
 
     def reveal(self, option: str) -> str | None:
-        """Return an option as it was given, as :meth:`reveal_place` does; None if it was not."""
+        """Return an option with its secrets, like :meth:`reveal_place`; None if it was not given."""
         return self._given[1].get(option)
 
     def reveal_text(self) -> str:
-        """Return the whole address as it was given: for the process that serves it, and for nothing else."""
+        """Return the whole address with its secrets, only for the process that serves it."""
         return self._given[2] or f"{self.scheme}://{self._given[0]}"
 
     def scrub(self, text: str) -> str:
-        """Return a text, such as that of a library's error, with the secrets of this address hidden."""
+        """Return a text, for example a library's error, with the secrets of this address hidden."""
         for given, shown in self._secrets:
-            if len(given) < _SHORT:  # within words it would hide, and show, too much
+            if len(given) < _SHORT:  # inside words it would hide, and so reveal, too much
                 text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(given)}(?![A-Za-z0-9])", HIDDEN, text)
             else:
                 text = text.replace(given, shown)
@@ -105,13 +105,13 @@ class VehicleUri:
         """Return an option as a finite number within a range.
 
         Args:
-            option: Its name.
+            option: Name of the option.
             default: Returned if the option is not given; not checked against the range.
             minimum: Smallest allowed value.
             maximum: Largest allowed value.
 
         Raises:
-            UsageError: It is not a finite number within the range.
+            UsageError: The option is not a finite number within the range.
         """
         given = self.reveal(option)
         if given is None:
@@ -131,13 +131,13 @@ class VehicleUri:
         """Return an option as a whole number within a range.
 
         Args:
-            option: Its name.
+            option: Name of the option.
             default: Returned if the option is not given.
             minimum: Smallest allowed value.
             maximum: Largest allowed value.
 
         Raises:
-            UsageError: It is not a whole number within the range.
+            UsageError: The option is not a whole number within the range.
         """
         value = self.number(option, default, minimum=minimum, maximum=maximum)
         if value != int(value):
@@ -148,11 +148,11 @@ class VehicleUri:
         """Return an option as a bool: ``1``, ``true``, ``yes`` or nothing after the name; ``0``, ``false``, ``no``.
 
         Args:
-            option: Its name.
+            option: Name of the option.
             default: Returned if the option is not given.
 
         Raises:
-            UsageError: It is another word.
+            UsageError: The option is another word.
         """
         given = self.options.get(option)
         if given is None:
@@ -167,8 +167,8 @@ def host_and_port(text: str) -> tuple[str, int] | None:
     """Return a host and its port; None for anything else.
 
     Args:
-        text: Such as ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` or ``[fe80::1%eth0]:14550``: an
-            address of IPv6 stands in brackets, which are not part of the host.
+        text: For example ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` or ``[fe80::1%eth0]:14550``: an
+            IPv6 address is in brackets, which are not part of the host.
     """
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or not 1 <= int(port) <= 65_535:
@@ -186,15 +186,15 @@ def parse_uri(text: str) -> VehicleUri:
     """Parse a vehicle's address.
 
     Args:
-        text: Such as ``ardrone://192.168.1.1?camera=front``. Place and options may be percent-encoded.
+        text: For example ``ardrone://192.168.1.1?camera=front``. Place and options may be percent-encoded.
 
     Raises:
-        UsageError: It has no scheme with ``://``, or gives an option twice.
+        UsageError: The text has no scheme with ``://``, or gives an option twice.
     """
     scheme, separator, rest = text.partition("://")
     if not separator or not _SCHEME.match(scheme):
         shown = shown_address(text)
-        raise UsageError(f"{shown!r} is not a vehicle's address: it looks like sim:// or ardrone://192.168.1.1")
+        raise UsageError(f"{shown!r} is not a vehicle's address, such as sim:// or ardrone://192.168.1.1")
     place, _, query = rest.partition("?")
     pairs = parse_qsl(query, keep_blank_values=True)
     options = dict(pairs)

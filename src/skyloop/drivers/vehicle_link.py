@@ -1,6 +1,6 @@
-"""The link of every vehicle that is reached by sockets: its thread, and sockets renewed while nothing is received.
+"""The vehicle link over sockets: its thread, and the renewal of sockets while nothing is received.
 
-What the link carries is decided by the session: see :mod:`skyloop.drivers.vehicle_session`.
+The session decides what the link carries: see :mod:`skyloop.drivers.vehicle_session`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from skyloop.drivers.base import ServedLink, Sink
 from skyloop.drivers.vehicle_session import SinkCallback, VehicleSession
 from skyloop.messages import AnyAction, EventKind, Severity
 
-NAME_WAIT_S: Final = 0.2  #: enough to look up most names
+NAME_WAIT_S: Final = 0.2  #: enough for most name look-ups
 PAUSE_S: Final = 0.03  #: after an error
-RENEW_NS: Final = nanoseconds(2.0)  #: between new sockets without data: this host's address may have changed
+RENEW_NS: Final = nanoseconds(2.0)  #: between new sockets without data, because this host's address may have changed
 MAX_DATAGRAM: Final = 65_536
-BURST: Final = 32  #: datagrams that are read before commands get their turn
+BURST: Final = 32  #: datagrams read before commands get their turn
 
 S = TypeVar("S", bound=VehicleSession)
 C = TypeVar("C", bound="Readable")
@@ -40,13 +40,13 @@ class Readable(Protocol):
 
 
 class NameLookup:
-    """Looks up a host's name on a thread of its own: a resolver without a network takes its time, often 10 s.
+    """Looks up a host's name in its own thread: without a network, a resolver often takes 10 s.
 
-    One host at a time. Used by one thread.
+    One host at a time. Not thread-safe.
 
     Args:
-        family: Of the address that is wanted.
-        wait_s: How long :meth:`address` may block [s]; 0 on a thread that others need too.
+        family: Family of the result.
+        wait_s: How long :meth:`address` may block [s]; 0 on a thread that serves others, too.
     """
 
     def __init__(self, family: socket.AddressFamily = socket.AF_INET, wait_s: float = NAME_WAIT_S) -> None:
@@ -56,7 +56,7 @@ class NameLookup:
 
     @property
     def answered(self) -> bool:
-        """Whether what was not known yet is known now: it is worth asking again."""
+        """Whether a pending look-up has finished, so that asking again is worthwhile."""
         return self._asking is not None and self._asking.answered.is_set()
 
     def address(self, host: str) -> str:
@@ -88,26 +88,26 @@ class _Question:
         except OSError as error:
             self.answer = error
         except UnicodeError:  # a label that is too long
-            self.answer = OSError(errno.EINVAL, f"{host!r:.80} is no name of a host")
+            self.answer = OSError(errno.EINVAL, f"{host!r:.80} is not a valid host name")
         finally:
             self.answered.set()
 
 
 class VehicleLink(ABC, Generic[S]):
-    """Serves a session on a thread of its own from :meth:`start` to :meth:`stop`.
+    """Serves a session in its own thread from :meth:`start` to :meth:`stop`.
 
-    All decisions are the session's, made with ``lock`` held; its callbacks are delivered with the lock free. A kind of
-    vehicle writes :meth:`_open_sockets`, :meth:`_close_sockets` and :meth:`_send_due`, and gives each socket that it
-    opens to :meth:`_watch`.
+    The session makes all decisions, with ``lock`` held; its callbacks run with the lock free. A subclass for a kind of
+    vehicle implements :meth:`_open_sockets`, :meth:`_close_sockets` and :meth:`_send_due`, and passes each socket that
+    it opens to :meth:`_watch`.
 
     Args:
-        name: Of the thread.
+        name: Name of the thread.
         session: The vehicle's protocol.
-        deliver: Called on the link's thread with what the session has for the sink.
+        deliver: Called on the link's thread with the session's callbacks for the sink.
         clock: Monotonic, ns.
-        family: Of the addresses that the host's name is looked up for.
+        family: Address family of the host's look-up.
         close_s: How long :meth:`stop` waits for the thread.
-        serve: Takes the link to a thread that serves several; None: it has one of its own.
+        serve: Hands the link to a thread that serves several; None: the link has its own.
     """
 
     def __init__(
@@ -129,10 +129,10 @@ class VehicleLink(ABC, Generic[S]):
         self._selector = selectors.DefaultSelector()
         self._awake, self._waker = socket.socketpair()
         self._lookup = NameLookup(family) if serve is None else NameLookup(family, wait_s=0.0)
-        self._awake_ns = 0  # when its thread looks again at the latest
-        self._opened_ns: int | None = None  # when sockets were opened last, or tried to
+        self._awake_ns = 0  # latest time at which its thread wakes
+        self._opened_ns: int | None = None  # when sockets were last opened, or an attempt was made
         self._close_s = close_s
-        self._within: int | None = None  # the thread that serves it just now
+        self._within: int | None = None  # the thread that serves it at the moment
         self._ended = threading.Event()
         self._serve_elsewhere = serve
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -148,7 +148,7 @@ class VehicleLink(ABC, Generic[S]):
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread, close the sockets and end the session: every caller that waits for an answer gets none."""
+        """Stop the thread, close the sockets and end the session; callers that wait for an answer get none."""
         self._stopping.set()
         self._wake()
         if self._within != threading.get_ident():
@@ -157,10 +157,10 @@ class VehicleLink(ABC, Generic[S]):
             self.session.close()
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Have the session accept an action, send it at once if its pace allows; return what is applied. Any thread."""
+        """Pass an action to the session, and send it at once if its pace allows; return the result. Thread-safe."""
         return self._decide(partial(self.session.command, action))
 
-    # For a kind's methods that the proxy's threads call ----------------------------------------------------------
+    # For methods of subclasses that the proxy's threads call ------------------------------------------------------
 
     def _decide(self, decide: Callable[[int], AnyAction]) -> AnyAction:
         with self.lock:
@@ -176,9 +176,9 @@ class VehicleLink(ABC, Generic[S]):
     def _wait_for_answer(
         self, ask: Callable[[Callable[[str | None], None]], None], within_s: float, otherwise: str | None
     ) -> str | None:
-        """Ask the vehicle and wait for its answer; ``otherwise`` if none comes in time. Any thread but the link's.
+        """Ask the vehicle and return its answer, or ``otherwise`` if none arrives in time. Not on the link's thread.
 
-        ``ask`` is called with the lock held, and given the function that takes the answer.
+        ``ask`` is called with the lock held; its argument is the function that receives the answer.
         """
         done = threading.Event()
         answers: list[str | None] = []
@@ -197,32 +197,32 @@ class VehicleLink(ABC, Generic[S]):
 
     @abstractmethod
     def _open_sockets(self) -> None:
-        """Replace the sockets by new ones. On the link's thread, with the lock free.
+        """Replace the sockets with new ones. On the link's thread, with the lock free.
 
         Raises:
-            OSError: They can't be opened; tried again.
+            OSError: They can't be opened; the link retries.
         """
 
     @abstractmethod
     def _close_sockets(self) -> None:
-        """Close what :meth:`_open_sockets` opened. With the lock held."""
+        """Close the sockets of :meth:`_open_sockets`. With the lock held."""
 
     @abstractmethod
     def _send_due(self, now_ns: int) -> None:
-        """Send what is due. With the lock held, on any thread."""
+        """Send everything due. With the lock held, on any thread."""
 
     def _renewal_ns(self) -> int | None:
-        """Return how long after they were opened last the sockets are opened again; None: not as things stand.
+        """Return how long after their last opening the sockets are opened again; None: not in the present state.
 
-        By default what suits UDP: while nothing is received. Called with the lock held.
+        The default suits UDP: while nothing is received. Called with the lock held.
         """
         return None if self.session.is_receiving else RENEW_NS
 
     def _poll(self, now_ns: int) -> None:
-        """Do what follows another pace than the session's. With the lock held, on the link's thread."""
+        """Do work at a pace other than the session's. With the lock held, on the link's thread."""
 
     def _watch(self, source: Readable, ready: Callable[[], None]) -> None:
-        """Have a function called on the link's thread, with the lock free, whenever a source has something to read."""
+        """Call a function on the link's thread, with the lock free, whenever a source is readable."""
         self._selector.register(source, selectors.EVENT_READ, ready)
 
     def _forget(self, source: Readable) -> None:
@@ -234,7 +234,7 @@ class VehicleLink(ABC, Generic[S]):
     def _read_datagrams(
         self, port: socket.socket, handle: Callable[[bytes, int], None], sender: str | None = None
     ) -> None:
-        """Handle at most :data:`BURST` datagrams that arrived; with a ``sender``, only those from that address."""
+        """Handle at most :data:`BURST` received datagrams; with a ``sender``, only those from that address."""
         for _ in range(BURST):
             try:
                 datagram, source = port.recvfrom(MAX_DATAGRAM)
@@ -249,7 +249,7 @@ class VehicleLink(ABC, Generic[S]):
                     handle(datagram, self._clock())
 
     def _send_datagram(self, port: socket.socket, datagram: bytes) -> None:
-        """Send a datagram, noting a failure in the session. With the lock held."""
+        """Send a datagram; report failures to the session. With the lock held."""
         try:
             port.send(datagram)
         except BlockingIOError:
@@ -273,7 +273,7 @@ class VehicleLink(ABC, Generic[S]):
                 self.session.failed(error)
 
     def _step(self, *, wait: bool = True, look: bool = True) -> None:
-        self._renew()  # before the wait, so that no socket is closed between being ready and being read
+        self._renew()  # before the wait, so that no socket is closed between becoming readable and being read
         with self.lock:
             self._awake_ns = self.session.due_ns
             wait_ns = self._awake_ns - self._clock() if wait else 0
@@ -294,14 +294,14 @@ class VehicleLink(ABC, Generic[S]):
             while not self._stopping.is_set():
                 try:
                     self._step()
-                except Exception as error:  # noqa: BLE001  whatever happens, the vehicle must keep getting commands
+                except Exception as error:  # noqa: BLE001  commands must keep flowing to the vehicle
                     self._deliver([partial(_report_failure, error)])
                     self._stopping.wait(PAUSE_S)
         finally:
             self.end()
 
     def end(self) -> None:
-        """Close everything, on the thread that serves it: nothing is delivered any more."""
+        """Close everything, on the serving thread; nothing is delivered afterwards."""
         with self.lock:
             self._close_sockets()
         self._selector.close()
@@ -309,14 +309,14 @@ class VehicleLink(ABC, Generic[S]):
         self._waker.close()
         self._ended.set()
 
-    # On a thread that serves several -----------------------------------------------------------------------------
+    # On a shared thread -----------------------------------------------------------------------------------------------
 
     def fileno(self) -> int:
-        """Return what is readable when there is something to read."""
+        """Return a descriptor that becomes readable when there is work."""
         return self._selector.fileno()
 
     def serve(self, *, readable: bool) -> int | None:
-        """Do what there is to do; see :class:`skyloop.drivers.base.ServedLink`."""
+        """Do all pending work; see :class:`skyloop.drivers.base.ServedLink`."""
         if self._stopping.is_set():
             return None
         self._within = threading.get_ident()
@@ -332,8 +332,8 @@ class VehicleLink(ABC, Generic[S]):
             return self._awake_ns
 
     def _wake(self) -> None:
-        """End the wait of the link's thread. From any thread."""
-        with suppress(OSError):  # it is awake, or it ended
+        """Wake the link's thread. Thread-safe."""
+        with suppress(OSError):  # it is awake, or it has ended
             self._waker.send(b"\0")
 
     def _drain_wakeups(self) -> None:
@@ -343,38 +343,38 @@ class VehicleLink(ABC, Generic[S]):
 
 
 class ConnectionLink(VehicleLink[S], Generic[S, C]):
-    """A link over one connection, which is opened again where it broke, and where nothing comes on it.
+    """A link over one connection, which is reopened when it breaks or stays silent.
 
-    A kind of vehicle writes :meth:`_connect`, :meth:`_read` and :meth:`_send_due`.
+    A subclass for a kind of vehicle implements :meth:`_connect`, :meth:`_read` and :meth:`_send_due`.
     """
 
-    RETRY_NS: ClassVar[int]  #: between attempts to connect
+    RETRY_NS: ClassVar[int]  #: between connection attempts
 
-    _silent_ns: int | None = None  # one on which nothing comes for so long is opened again; None: not for that
+    _silent_ns: int | None = None  # silence after which the connection is reopened; None: never for silence
     _connection: C | None = None
-    _broken = False  # nothing can be sent any more
+    _broken = False  # nothing more can be sent
 
     @abstractmethod
     def _connect(self) -> C:
         """Open a connection. On the link's thread, with the lock free.
 
         Raises:
-            OSError: It can't be opened; tried again.
+            OSError: It can't be opened; the link retries.
         """
 
     @abstractmethod
     def _read(self, connection: C) -> None:
-        """Give the session what came. On the link's thread, with the lock free.
+        """Pass received data to the session. On the link's thread, with the lock free.
 
         Raises:
-            OSError: Nothing more will come.
+            OSError: The connection has ended.
         """
 
     def _on_end(self, connection: C) -> None:
-        """Send what is due before the connection is closed for good. With the lock held."""
+        """Send everything due before the connection is closed for good. With the lock held."""
 
     def _on_broken(self, error: OSError, now_ns: int) -> None:
-        """Handle that nothing more can be sent. With the lock held."""
+        """Handle a connection that accepts no more data. With the lock held."""
         self._broken = True
         self.session.broken(error, now_ns)
 

@@ -1,6 +1,6 @@
-"""Shared parts of the vehicles' sessions: the state of the vehicle link, the reasons for it, and pending events.
+"""Shared parts of the vehicles' sessions: the state of the vehicle link, its reasons, and pending events.
 
-Pure, but for :func:`serial_trouble`, which looks at the port's device.
+Pure, except for :func:`serial_trouble`, which inspects the port's device.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import Sink
 from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severity, Value
 
-REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: least time between two reasons that are reported while nothing is received
-_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # of a port that another program has locked
+REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reported reasons while nothing is received
+_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # of a port locked by another program
 _PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # below /dev
-_MOST_PORTS: Final = 4  # that are named
+_MOST_PORTS: Final = 4  # that are listed
 
 SinkCallback: TypeAlias = Callable[[Sink], None]
 
 
 def deliver(sink: Sink, pending: Iterable[SinkCallback]) -> None:
-    """Give a sink what a session has for it."""
+    """Pass a session's pending callbacks to a sink."""
     for publish in pending:
         publish(sink)
 
@@ -59,36 +59,36 @@ def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: 
 
 
 class Arrival(Enum):
-    """What a packet's own number says of it."""
+    """A packet's place in the order, judged by its own number."""
 
     NEW = auto()
     LATE = auto()  #: others overtook it
-    RESTARTED = auto()  #: the vehicle counts from the beginning again: it was started anew
+    RESTARTED = auto()  #: the vehicle counts from the start again: it has restarted
 
 
-RESTART_RUN: Final = 5  #: so many packets that are behind, in order among themselves, show a new count
-RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: and that they did not arrive in one burst
+RESTART_RUN: Final = 5  #: this many packets behind, in order among themselves, show a new count
+RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between them: they must not be one burst
 
 
 class RestartWatch:
-    """Tells a vehicle that was started anew from packets that arrive late, by a number that grows in it. Pure.
+    """Distinguishes a restarted vehicle from late packets, by a growing number in the packets. Pure.
 
     Args:
-        tolerance: One that is behind by no more is taken as it comes.
-        wrap: The number begins at 0 again there; 0: never.
+        tolerance: Packets behind by no more than this are accepted.
+        wrap: The number restarts at 0 there; 0: never.
     """
 
     def __init__(self, tolerance: int = 0, wrap: int = 0) -> None:
         self._tolerance, self._wrap = tolerance, wrap
         self._newest: int | None = None
-        self._behind: tuple[int, int, int] | None = None  # the last that was behind, how many, when the first came
+        self._behind: tuple[int, int, int] | None = None  # the last one behind, how many, arrival of the first
 
     def forget(self) -> None:
-        """Take whatever comes next for new: the vehicle was silent."""
+        """Accept the next packet as new: the vehicle was silent."""
         self._newest = self._behind = None
 
     def update(self, number: int, now_ns: int) -> Arrival:
-        """Judge a packet that arrived now by its number."""
+        """Classify a packet that has just arrived by its number."""
         step = 0 if self._newest is None else self._step(self._newest, number)
         if step >= -self._tolerance:
             self._newest, self._behind = number if step >= 0 else self._newest, None
@@ -109,67 +109,67 @@ class RestartWatch:
         return step + self._wrap if step < 0 else step - self._wrap
 
 
-#: What is asked for while nothing is received is kept, or sent, for so long after somebody asked for it last: whoever
-#: still wants it asks again, and later it may be somebody else's flight.
+#: While nothing is received, a request is kept, or sent, for this long after its last repeat. Anyone who still wants it
+#: repeats it, and later it might interfere with someone else's flight.
 KEPT_NS: Final = nanoseconds(3.0)
 
 
 class VehicleSession(ABC):
     """The protocol of one opened driver with its vehicle. Not thread-safe.
 
-    Time comes as an argument; bytes go in and out. Calls of the proxy's sink are collected as callbacks, for
-    the caller to run when it holds no lock. A kind of vehicle sets ``_received_ns`` with each valid packet, and calls
+    Time is an argument; bytes go in and out. Calls of the proxy's sink are collected as callbacks, which the caller
+    runs when it holds no lock. A subclass for a kind of vehicle sets ``_received_ns`` with each valid packet, and calls
     :meth:`_check_silence` with each poll.
     """
 
     TIMEOUTS: ClassVar[LinkTimeouts]
 
     def __init__(self, now_ns: int) -> None:
-        self.due_ns = now_ns  #: when there is something to be sent next
+        self.due_ns = now_ns  #: when there is next something to send
         self.link_state: LinkState | None = None  #: as last reported
         self._pending: list[SinkCallback] = []
         self._opened_ns = now_ns
-        self._received_ns: int | None = None  # None: not since it was opened or lost
+        self._received_ns: int | None = None  # None: not since opening or loss
         self._unreachable = ""
-        self._remedy = ""  # of what is unreachable
+        self._remedy = ""  # remedy for unreachability
         self._reported_reason = ""
         self._reported_ns = now_ns
-        self._landing_ns: int | None = None  # when a landing was asked for last, or the vehicle was still heard since
+        self._landing_ns: int | None = None  # when a landing was last requested, or the vehicle last received since
 
     @property
     def is_receiving(self) -> bool:
-        """Whether data of the vehicle arrive, or did until just now."""
+        """Whether the vehicle's data arrive, or did until just now."""
         return self._received_ns is not None
 
     @abstractmethod
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action and return what is applied, within the limits. Raises DriverError if it can't be."""
+        """Accept an action and return what is applied, within the limits. Raises DriverError if it can't."""
 
     @abstractmethod
     def close(self) -> None:
-        """End the session: every caller that waits for an answer gets a failure."""
+        """End the session; callers that wait for an answer get a failure."""
 
     def unreachable(self, reason: str) -> None:
-        """Note why the vehicle can't be reached: nobody listens, there is no route to it, or the connection failed."""
+        """Note why the vehicle can't be reached: nothing listens, there is no route, or the connection failed."""
         self._unreachable, self._remedy = reason, ""
 
     def failed(self, error: OSError) -> None:
-        """Note an error of a socket or port, with what a person can do about it."""
+        """Note an error of a socket or port, with a remedy for people."""
         trouble = self._trouble(error)
         self._unreachable, self._remedy = trouble.reason, trouble.remedy
 
     def connected(self) -> None:  # noqa: B027  most connections need nothing
-        """Handle a new connection: nothing of an older one follows."""
+        """Handle a new connection: no data of an older one follow."""
 
     def broken(self, error: OSError, now_ns: int) -> None:
-        """Handle an open connection that takes nothing more: the vehicle is lost, whatever it still sends."""
+        """Handle an open connection that accepts no more data: the vehicle is lost, whatever it still sends."""
         self.failed(error)
         self.due_ns = now_ns
         if self._received_ns is not None:
             self._lose(f"the connection failed: {self._unreachable}", now_ns)
 
     def drain(self) -> list[SinkCallback]:
-        """Return the callbacks for the sink that are pending since the last call, in order."""
+        """Return the sink's callbacks since the last call, in order."""
         for event in self._new_events():
             self._publish_event(event)
         pending, self._pending = self._pending, []
@@ -181,15 +181,15 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def _describe_silence(self, since: str, why: str) -> str:
-        """Return the text for people while nothing is received.
+        """Return the text for people to see while nothing is received.
 
         Args:
-            since: How long, empty or a phrase that begins with a blank.
-            why: What the host says of it, empty or a phrase that begins with a blank.
+            since: The duration; empty or a phrase that starts with a blank.
+            why: The host's reason; empty or a phrase that starts with a blank.
         """
 
     def _advice(self) -> str:
-        """Return what a person can do where nothing is received and nothing has failed, as an instruction."""
+        """Return an instruction for people for when nothing is received and nothing has failed."""
         return "check the vehicle's power, and host and port in the address"
 
     def _trouble(self, error: OSError) -> LinkTrouble:
@@ -200,12 +200,12 @@ class VehicleSession(ABC):
         """Drop all state of the lost vehicle: everything starts over with its next packet."""
 
     def _keep(self, action: AnyAction, now_ns: int) -> None:
-        """Note what was accepted: a landing is kept while nothing is received, but not for ever."""
+        """Note an accepted action: a landing is kept while nothing is received, but not for ever."""
         if not isinstance(action, Idle):
             self._landing_ns = now_ns if isinstance(action, Land) else None
 
     def _forget_landing(self) -> bool:
-        """Land the vehicle no longer; return whether that was wanted."""
+        """Cancel a pending landing; return whether there was one."""
         return False
 
     def _check_landing(self, now_ns: int) -> None:
@@ -217,8 +217,8 @@ class VehicleSession(ABC):
             self._landing_ns = None
             if self._forget_landing():
                 text = (
-                    f"the landing is given up: the vehicle was not heard for {seconds(KEPT_NS):g} s since it was asked "
-                    "for last: land it again when it is heard"
+                    f"the landing was abandoned: the vehicle was silent for {seconds(KEPT_NS):g} s since the  "
+                    "last request: land it again when it is back"
                 )
                 self._publish_event(message(text, "landing_given_up", Severity.ERROR))
 
@@ -240,7 +240,7 @@ class VehicleSession(ABC):
             self._set_link_state(LinkState.DEGRADED, self._silence_text(silent_ns))
 
     def _silence_seen_ns(self, latest_ns: int) -> int:
-        """Return when :meth:`_check_silence` is to be called next, not after ``latest_ns``, so that it is in time."""
+        """Return when :meth:`_check_silence` must be called next, at most ``latest_ns``."""
         if self._received_ns is None:
             return latest_ns
         patience = self.TIMEOUTS.degraded_ns if self.link_state is LinkState.UP else self.TIMEOUTS.lost_ns
@@ -269,29 +269,29 @@ class VehicleSession(ABC):
 class LinkTrouble:
     """Why a vehicle can't be reached."""
 
-    reason: str  #: what failed; may be empty
-    remedy: str = ""  #: what to do, as an instruction to a person; may be empty
+    reason: str  #: the failure; may be empty
+    remedy: str = ""  #: an instruction for people; may be empty
 
 
 def trouble_of(error: OSError, advice: str) -> LinkTrouble:
     """Describe a socket's error."""
     if isinstance(error, socket.gaierror):
-        remedy = "correct the name in the address, or join a network that knows it"
-        return LinkTrouble(f"its name is not known: {error.strerror}", remedy)
+        remedy = "correct the name in the address, or join a network where it is known"
+        return LinkTrouble(f"its name is unknown: {error.strerror}", remedy)
     reason = error.strerror or str(error) or type(error).__name__
     if error.errno == errno.EADDRINUSE:
-        return LinkTrouble(reason, "end the other program that has this port, or give another one in the address")
+        return LinkTrouble(reason, "end the other program that uses this port, or give another one in the address")
     return LinkTrouble(reason, advice)
 
 
 def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path("/dev")) -> LinkTrouble:
-    """Describe why a serial port can't be opened, or has just gone.
+    """Describe why a serial port can't be opened, or has disappeared.
 
     Args:
-        error: As opening or reading raised it.
+        error: The error from opening or reading.
         port: Its path.
-        advice: What to do where nothing better is known.
-        devices: Where other ports are searched for, to name them.
+        advice: What to do if there is no better advice.
+        devices: Where to look for other ports, to list them.
     """
     path = Path(port)
     try:
@@ -300,10 +300,10 @@ def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path(
         return LinkTrouble(f"{port} can't be accessed", f"let this user enter {path.parent}")
     except OSError:
         there = sorted(str(found) for pattern in _PORTS for found in devices.glob(pattern))[:_MOST_PORTS]
-        known = f"; ports that are there: {', '.join(there)}" if there else ""
+        known = f"; available ports: {', '.join(there)}" if there else ""
         return LinkTrouble(f"there is no {port}", f"plug the vehicle in, or correct the port in the address{known}")
     if not stat.S_ISCHR(status.st_mode):
-        return LinkTrouble(f"{port} is no serial port", "correct the port in the address")
+        return LinkTrouble(f"{port} is not a serial port", "correct the port in the address")
     if not os.access(path, os.R_OK | os.W_OK):
         return LinkTrouble(
             f"this user may not open {port} (mode {stat.S_IMODE(status.st_mode):04o})", _permission(port, status)

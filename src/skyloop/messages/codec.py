@@ -1,8 +1,8 @@
-"""Samples to bytes and back, as pure functions; the byte tables are in ``docs/wire-format.md``.
+"""Pure functions that encode samples as bytes and decode them; ``docs/wire-format.md`` has the byte tables.
 
-A packet is a 12-byte header (signature, version, kind, reserved, length of the body) and a body: the sample's fields
-in order as one MessagePack array. msgspec encodes, decodes and checks types, lengths and ranges in C; fields added
-at the end of a sample by a later version are skipped by an older reader.
+A packet is a 12-byte header (signature, version, kind, reserved, body length) and a body: the sample's fields in order,
+as one MessagePack array. msgspec encodes, decodes and checks types, lengths and ranges in C. Older readers skip fields
+that a later version has added at the end of a sample.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SIGNATURE: Final = b"SKYL"
 VERSION: Final = 1
 HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
-MAX_BODY: Final = 60_000  #: of a sample, so that a packet fits one datagram; pixels travel apart
+MAX_BODY: Final = 60_000  #: bytes, so that a packet fits into one datagram; pixels are sent separately
 
 Sample = (
     Command
@@ -46,7 +46,7 @@ Sample = (
 
 
 class Kind(IntEnum):
-    """The kinds of packets. 0x40 and above belong to the transports and never reach this codec."""
+    """Kinds of packets. 0x40 and above belong to the transports and never reach this codec."""
 
     COMMAND = 1
     FEEDBACK = 2
@@ -99,11 +99,11 @@ def encode(sample: Sample) -> bytes:
     """Encode a sample to a packet.
 
     Raises:
-        ValueError: It is larger than :data:`MAX_BODY`, which only free text or native telemetry can cause.
+        ValueError: The body is larger than :data:`MAX_BODY`, which only free text or native telemetry can cause.
     """
     body = _encode_body(sample)
     if len(body) > MAX_BODY:
-        raise ValueError(f"{type(sample).__name__} is {len(body)} bytes, over the {MAX_BODY} that a packet may carry")
+        raise ValueError(f"{type(sample).__name__} is {len(body)} bytes, over the {MAX_BODY} of a packet")
     return _pack_header(SIGNATURE, VERSION, _KIND_NUMBERS[type(sample)], 0, len(body)) + body
 
 
@@ -111,20 +111,20 @@ def decode(packet: bytes | memoryview) -> Sample:
     """Decode a packet, in bounded time and memory.
 
     Args:
-        packet: Any bytes.
+        packet: Any bytes, from any source.
 
     Returns:
         The sample, with its types, lengths and ranges checked.
 
     Raises:
-        DecodeError: It is not the packet of a sample.
+        DecodeError: The bytes are not a packet with a valid sample.
     """
-    # One look-up settles signature, version, kind and reserved bytes; why a packet is refused is found out later.
+    # One look-up checks signature, version, kind and reserved bytes; only a failure is analysed further.
     decoder = _BY_PREFIX.get(bytes(packet[:_PREFIX_SIZE]))
     size = len(packet) - HEADER_SIZE
     if decoder is None or not 0 <= size <= MAX_BODY or _unpack_length(packet, _PREFIX_SIZE)[0] != size:
         kind = packet_kind(packet)
-        raise DecodeError(f"unknown kind {kind}: known are {', '.join(f'{k.value} {k.name}' for k in Kind)}")
+        raise DecodeError(f"unknown kind {kind}: known kinds are {', '.join(f'{k.value} {k.name}' for k in Kind)}")
     try:
         sample: Sample = decoder(memoryview(packet)[HEADER_SIZE:])
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError, OverflowError) as error:
@@ -136,19 +136,19 @@ def packet_kind(packet: bytes | memoryview) -> int:
     """Return the kind of a packet, after checking its header against its length.
 
     Raises:
-        DecodeError: The header is not one of this version, or does not fit the packet.
+        DecodeError: The header is of another version, or does not match the packet.
     """
     if len(packet) < HEADER_SIZE:
-        raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
+        raise DecodeError(f"{len(packet)} bytes are too few for the header of {HEADER_SIZE}")
     signature, version, kind, reserved, length = _unpack_header(packet)
     if signature != SIGNATURE:
         raise DecodeError(f"signature {bytes(signature)!r} is not {SIGNATURE!r}")
     if version != VERSION:
-        raise DecodeError(f"version {version} is not {VERSION}: one of the two ends needs an update")
+        raise DecodeError(f"version {version} is not {VERSION}: update the older of the two ends")
     if reserved:
-        raise DecodeError(f"reserved bytes hold {reserved:#06x} and must be 0")
+        raise DecodeError(f"reserved bytes are {reserved:#06x} and must be 0")
     if length != len(packet) - HEADER_SIZE:
-        raise DecodeError(f"header announces {length} bytes of body, {len(packet) - HEADER_SIZE} came")
+        raise DecodeError(f"header announces {length} bytes of body, got {len(packet) - HEADER_SIZE}")
     if length > MAX_BODY:
-        raise DecodeError(f"{length} bytes of body are over the {MAX_BODY} that a packet may carry")
+        raise DecodeError(f"{length} bytes of body exceed the {MAX_BODY} that a packet may carry")
     return int(kind)

@@ -1,6 +1,6 @@
-"""From an application to the vehicle: commands, their outcome, and poses measured from outside.
+"""Samples from an application to the vehicle: commands, their outcomes, and externally measured poses.
 
-A command is the full desired state each time; the newest wins. Axes are the body's (ROS REP 103): x forward, y left, z
+Each command carries the full desired state; the newest wins. Axes are the body's (ROS REP 103): x forward, y left, z
 up; yaw is counter-clockwise seen from above.
 """
 
@@ -16,16 +16,16 @@ import msgspec
 from skyloop.errors import UsageError
 from skyloop.messages.fields import Count, Refusal, TimeNs
 
-FARTHEST_M: Final = 100_000.0  #: a place farther from the origin, along any axis, is taken for a mistake
-MOST_TURNS_RAD: Final = 1000.0  #: so is a larger yaw
+FARTHEST_M: Final = 100_000.0  #: a position beyond this along any axis is treated as a mistake
+MOST_TURNS_RAD: Final = 1000.0  #: and so is a larger yaw
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
-    """Base of the commands for a vehicle."""
+    """Base class of the commands for a vehicle."""
 
     @property
     def name(self) -> str:
-        """The action's name in capabilities and on the command line, e.g. ``"reset_emergency"``."""
+        """Name of the action in capabilities and on the command line, e.g. ``"reset_emergency"``."""
         return ACTION_NAMES[type(self)]
 
     @property
@@ -35,12 +35,12 @@ class Action(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def problem(self) -> str:
-        """What makes no sense about its numbers, in words for a person; empty if they can be flown."""
+        """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
         return ""
 
 
 class Idle(Action, frozen=True, array_like=True, tag=0):
-    """Nothing is wanted: keeps the authority alive and leaves the vehicle as it is."""
+    """Do nothing: keeps the authority alive and leaves the vehicle as it is."""
 
 
 class Takeoff(Action, frozen=True, array_like=True, tag=1):
@@ -48,11 +48,11 @@ class Takeoff(Action, frozen=True, array_like=True, tag=1):
 
 
 class Hover(Action, frozen=True, array_like=True, tag=2):
-    """Stop and hold the place."""
+    """Stop and hold the position."""
 
 
 class Land(Action, frozen=True, array_like=True, tag=3):
-    """Descend where it is and stop the motors on the ground."""
+    """Descend in place and stop the motors on the ground."""
 
 
 class EmergencyStop(Action, frozen=True, array_like=True, tag=4):
@@ -60,11 +60,11 @@ class EmergencyStop(Action, frozen=True, array_like=True, tag=4):
 
 
 class ResetEmergency(Action, frozen=True, array_like=True, tag=5):
-    """Leave the emergency state, on the ground. Never sent automatically."""
+    """Leave the emergency state while on the ground. The library never sends it automatically."""
 
 
 class Attitude(Action, frozen=True, array_like=True, tag=6):
-    """Attitude with climb rate.
+    """Attitude, climb rate and yaw rate.
 
     ``roll`` [rad] right side down is positive, ``pitch`` [rad] nose down is positive (REP 103: about y left),
     ``climb`` [m/s] up, ``yaw_rate`` [rad/s] counter-clockwise.
@@ -96,10 +96,10 @@ class Velocity(Action, frozen=True, array_like=True, tag=7):
 
 
 class Position(Action, frozen=True, array_like=True, tag=8):
-    """A place to fly to and to stay at, in the world's axes of ``Feedback.position``.
+    """A position to fly to and hold, in the world axes of ``Feedback.position``.
 
-    ``x`` east, ``y`` north, ``z`` up [m]; ``yaw`` counter-clockwise from x [rad], None keeps the present heading;
-    ``speed`` [m/s] along the way and ``turn_rate`` [rad/s] are the greatest ones, None: as fast as the limits allow.
+    ``x`` east, ``y`` north, ``z`` up [m]; ``yaw`` counter-clockwise from x [rad], None keeps the present heading.
+    ``speed`` [m/s] and ``turn_rate`` [rad/s] are upper bounds; None: as fast as the limits allow.
     """
 
     x: float
@@ -118,7 +118,7 @@ class Position(Action, frozen=True, array_like=True, tag=8):
 
     @property
     def problem(self) -> str:
-        """What makes no sense about its numbers, in words for a person; empty if they can be flown."""
+        """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
         for name in ("x", "y", "z"):
             if abs(value := getattr(self, name)) > FARTHEST_M:
                 return (
@@ -134,15 +134,15 @@ class Position(Action, frozen=True, array_like=True, tag=8):
 
     @property
     def place(self) -> tuple[float, float, float]:
-        """The place: x, y, z [m]."""
+        """The position: x, y, z [m]."""
         return self.x, self.y, self.z
 
 
 class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
-    """Climb, fly to where the vehicle took off (``Feedback.start_position_m``), and land or stay there.
+    """Climb, fly to where the vehicle took off (``Feedback.start_position_m``), and land or hover there.
 
-    ``height`` [m] above the start, at least, on the way; ``land`` at the end, or hover. None: as the proxy's parameters
-    ``return.height`` and ``return.land`` say.
+    ``height`` [m] is the minimum height above the start on the way; ``land`` selects landing at the end rather than
+    hovering. None: as in the proxy's parameters ``return.height`` and ``return.land``.
     """
 
     height: float | None = None
@@ -155,7 +155,7 @@ class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
 
     @property
     def problem(self) -> str:
-        """What makes no sense about its numbers, in words for a person; empty if they can be flown."""
+        """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
         if self.height is not None and not 0.0 <= self.height <= FARTHEST_M:
             return f"height is {self.height:g} m above the start and must be from 0 to {FARTHEST_M:g} m"
         return ""
@@ -165,7 +165,7 @@ AnyAction = (
     Idle | Takeoff | Hover | Land | EmergencyStop | ResetEmergency | Attitude | Velocity | Position | ReturnToStart
 )
 
-#: Actions that set where or how fast to fly: each replaces the one before, and a program sends them periodically.
+#: Actions that set where or how fast to fly. Each replaces the previous one, and a program sends them periodically.
 SET_POINTS: Final = (Velocity, Attitude, Position, ReturnToStart)
 
 ACTION_NAMES: dict[type[Action], str] = {
@@ -186,19 +186,17 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
     """One packet of the command channel."""
 
     seq: Count  #: grows with every packet of a connection
-    lease: Count  #: number of the lease that it is sent under; 0 for none (emergency stop only)
-    intent: Count  #: grows when the *application* asks for something; repeats by the library keep it
-    sent_ns: (
-        int  #: when it was sent, on the proxy's clock; not bounded, as an emergency stop counts whatever its time is
-    )
+    lease: Count  #: number of the lease it is sent under; 0 for none (emergency stop only)
+    intent: Count  #: grows with each request of the *application*; the library's repeats keep it
+    sent_ns: int  #: time of sending on the proxy's clock; unbounded, because an emergency stop counts whatever its time
     action: AnyAction
     automatic: bool = (
-        False  #: asked for by the library, not by a person or a program: it never takes a vehicle from others
+        False  #: requested by the library, not by a person or a program: never takes a vehicle from others
     )
 
 
 class Applied(msgspec.Struct, frozen=True, array_like=True):
-    """Echo on the ``commands`` topic: what the proxy made of a command that it received."""
+    """Echo on the ``commands`` topic: a received command and what the proxy applied."""
 
     seq: Count
     lease: Count
@@ -206,14 +204,14 @@ class Applied(msgspec.Struct, frozen=True, array_like=True):
     sent_ns: TimeNs
     applied_ns: TimeNs
     asked: AnyAction
-    applied: AnyAction  #: after limits, and as the driver really applied it
+    applied: AnyAction  #: after limits, and as the driver applied it
 
 
 MAX_OUTCOME_TEXT: Final = 300  #: characters
 
 
 class Fate(StrEnum):
-    """How far an intent is, or what ended it. Nothing that is over is ever done again by a repeat."""
+    """Progress or end of an intent. A repeat never executes an intent that has ended."""
 
     UNDER_WAY = "under_way"
     COMPLETED = "completed"
@@ -231,52 +229,52 @@ class Fate(StrEnum):
     JUMPED = "jumped"
 
 
-#: The one list of what ends an intent, in words for people; ``docs/proxy.md`` has it, too.
+#: The only list of what ends an intent, as texts for people; ``docs/proxy.md`` is generated from it.
 ENDINGS: Final[dict[Fate, str]] = {
-    Fate.COMPLETED: "it was done",
+    Fate.COMPLETED: "it was carried out",
     Fate.REFUSED: "it was refused",
     Fate.REPLACED: "a newer command took its place",
-    Fate.WITHDRAWN: "its application wants it no more: the call was cancelled, failed, or ran out of time",
-    Fate.TIMED_OUT: "it did not leave the ground within 20 s, or was to hover or land and was not heard for 60 s",
-    Fate.LANDED: "the vehicle landed or disarmed, whoever made it",
-    Fate.EMERGENCY: "there was an emergency, or somebody stopped the motors",
-    Fate.AUTHORITY: "the authority was granted anew, lost or given back",
-    Fate.LINK: "the link to the vehicle broke or came back, which ends no landing, or the application's own was lost",
+    Fate.WITHDRAWN: "its application withdrew it: the call was cancelled, failed, or timed out",
+    Fate.TIMED_OUT: "it did not leave the ground within 20 s, or was silent for 60 s before it hovered or landed",
+    Fate.LANDED: "the vehicle landed or disarmed, for whatever reason",
+    Fate.EMERGENCY: "there was an emergency, or someone stopped the motors",
+    Fate.AUTHORITY: "the authority was granted again, lost or given back",
+    Fate.LINK: "the vehicle link broke or came back (which ends no landing), or the application's connection was lost",
     Fate.FAILSAFE: "a failsafe took over",
-    Fate.OTHERS: "somebody else took the vehicle",
+    Fate.OTHERS: "another controller took the vehicle",
     Fate.SLEPT: "the proxy's computer slept",
     Fate.JUMPED: "the vehicle's position jumped",
 }
 
 
 class Outcome(msgspec.Struct, frozen=True, array_like=True):
-    """What became of the newest intent of the application that commands, or commanded last."""
+    """Fate of the newest intent of the application that commands, or commanded last."""
 
-    app_id: Count = 0  #: number of the application in this run of the proxy; 0: nothing is told
-    intent: Count = 0  #: the number of the intent, as in its commands
+    app_id: Count = 0  #: number of the application in this run of the proxy; 0: no intent to report
+    intent: Count = 0  #: number of the intent, as in its commands
     fate: Fate = Fate.UNDER_WAY
-    reason: Refusal | None = None  #: why it, or a repeat of it, is refused
-    text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: the same for a person
+    reason: Refusal | None = None  #: why it, or a repeat of it, was refused
+    text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: the same, for people
 
     @property
     def over(self) -> bool:
-        """Whether it ended."""
+        """Whether the intent has ended."""
         return self.fate is not Fate.UNDER_WAY
 
     @property
     def failed(self) -> bool:
-        """Whether it ended otherwise than by being done."""
+        """Whether the intent ended without being carried out."""
         return self.over and self.fate is not Fate.COMPLETED
 
 
 class VehiclePose(msgspec.Struct, frozen=True, array_like=True):
-    """A pose for the vehicle itself, from a pilot's application. World axes x east, y north, z up."""
+    """A measured pose that the pilot's application sends to the vehicle. World axes x east, y north, z up."""
 
-    captured_ns: TimeNs  #: when it was so, on the proxy's clock
-    position_m: tuple[float, float, float]  #: of the body's origin [m]
+    captured_ns: TimeNs  #: time of the measurement, on the proxy's clock
+    position_m: tuple[float, float, float]  #: position of the body's origin [m]
     quaternion: tuple[float, float, float, float]  #: x, y, z, w, from body axes (forward, left, up) to world axes
-    position_std_m: float | None = None  #: standard deviation, if it is known
-    attitude_std_rad: float | None = None  #: standard deviation, if it is known
+    position_std_m: float | None = None  #: standard deviation, if known
+    attitude_std_rad: float | None = None  #: standard deviation, if known
 
 
 def check_pose(
@@ -290,8 +288,8 @@ def check_pose(
     Args:
         position: x, y, z [m].
         quaternion: x, y, z, w.
-        position_std_m: Standard deviation of the position [m], 0 or more; None if it is not known.
-        attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if it is not known.
+        position_std_m: Standard deviation of the position [m], 0 or more; None if unknown.
+        attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if unknown.
 
     Raises:
         UsageError: If a number is missing or not finite, a standard deviation is negative, or the quaternion's length
@@ -303,7 +301,7 @@ def check_pose(
             raise UsageError(f"{name} must have {count} finite numbers ({axes}), got {tuple(values)!r}")
     length = math.hypot(*quaternion)
     if abs(length - 1.0) > 1e-3:
-        raise UsageError(f"quaternion (x, y, z, w) of a rotation must have length 1, got {length:.4g}")
+        raise UsageError(f"quaternion (x, y, z, w) must have length 1, got {length:.4g}")
     for name, value in (("position_std_m", position_std_m), ("attitude_std_rad", attitude_std_rad)):
         if value is not None and not 0.0 <= value < math.inf:
-            raise UsageError(f"{name} is {value!r} and must be 0 or more, or None where it is not known")
+            raise UsageError(f"{name} is {value!r} and must be 0 or more, or None if unknown")

@@ -1,4 +1,4 @@
-"""The configuration channel: one typed request, one typed answer, in one transaction."""
+"""The configuration channel: each typed request gets one typed answer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skyloop.messages.relayed import MAX_CODE, ProcessorName
 Priority = Annotated[int, msgspec.Meta(ge=0, le=31)]
 LONGEST_TERM_S = 86_400.0
 Term = Annotated[float, msgspec.Meta(gt=0, le=LONGEST_TERM_S)]
-MAX_REASON = 200  #: characters of why a holder declines
+MAX_REASON = 200  #: characters of a holder's reason for declining
 ClockName = Annotated[str, msgspec.Meta(max_length=64)]
 Reason = Annotated[str, msgspec.Meta(max_length=MAX_REASON)]
 
@@ -24,13 +24,13 @@ LOWEST_PRIORITY = 31
 
 
 class Capabilities(msgspec.Struct, frozen=True, array_like=True):
-    """What a vehicle can do, known before it is opened."""
+    """What a vehicle can do, known before the driver opens it."""
 
     vehicle: str  #: the family, e.g. ``sim`` or ``ardrone2``
-    actions: frozenset[str] = frozenset()  #: names of the actions that the vehicle itself takes; empty: can't fly
+    actions: frozenset[str] = frozenset()  #: names of the actions that the vehicle itself supports; empty: can't fly
     cameras: tuple[CameraInfo, ...] = ()
     description: str = ""
-    why_not: str = ""  #: for a vehicle that can't fly: why, in words for a person
+    why_not: str = ""  #: why the vehicle can't fly, as a text for people
     software: frozenset[str] = frozenset()  #: names of the actions that the proxy's software autopilot adds
 
 
@@ -38,18 +38,18 @@ class Capabilities(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Hello(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """First request on a connection."""
+    """First request of a connection."""
 
-    name: Name  #: of the application, for people
+    name: Name  #: the application's name, for people
     role: Role = Role.PILOT
 
 
 class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
-    """Asks for the authority."""
+    """Request the authority."""
 
     priority: Priority = DEFAULT_PRIORITY
-    queue: bool = True  #: wait in the queue when another application holds it; else be refused at once
-    for_s: Term | None = None  #: for how long it is wanted, from the grant on; nil: until it is given back
+    queue: bool = True  #: wait in the queue while another application holds it; False: be refused at once
+    for_s: Term | None = None  #: how long it is needed, from the grant on [s]; nil: until it is given back
     takeover: Takeover = Takeover.NOW
 
 
@@ -58,13 +58,13 @@ class ReleaseAuthority(msgspec.Struct, frozen=True, array_like=True, tag=3):
 
 
 class GetParameter(msgspec.Struct, frozen=True, array_like=True, tag=4):
-    """Asks for a parameter."""
+    """Read a parameter."""
 
     name: ParameterName
 
 
 class SetParameter(msgspec.Struct, frozen=True, array_like=True, tag=5):
-    """Writes a parameter."""
+    """Write a parameter."""
 
     name: ParameterName
     value: Value
@@ -72,41 +72,41 @@ class SetParameter(msgspec.Struct, frozen=True, array_like=True, tag=5):
 
 
 class ListParameters(msgspec.Struct, frozen=True, array_like=True, tag=6):
-    """A page of the parameters, sorted by name."""
+    """List a page of the parameters, sorted by name."""
 
     first: Count = 0
 
 
 class Ping(msgspec.Struct, frozen=True, array_like=True, tag=7):
-    """Asks for the proxy's time, to estimate the offset between the clocks and to see that it lives."""
+    """Ask for the proxy's time, to estimate the clock offset and to check that the proxy is alive."""
 
-    sent_ns: TimeNs  #: on the asker's clock
+    sent_ns: TimeNs  #: on the requester's clock
 
 
 class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
-    """Asks for the proxy's counters."""
+    """Ask for the proxy's counters."""
 
 
 class JoinProcessor(msgspec.Struct, frozen=True, array_like=True, tag=16):
-    """Be a worker of a processor, or go on being one: asked again some times a second for as long as it works.
+    """Join the workers of a processor, or stay one: workers repeat it some times a second for as long as they run.
 
-    Answered by :class:`Done`; the worker's share of the frames comes as a :class:`ProcessorShare`.
+    The answer is :class:`Done`; the worker's share of the frames arrives as a :class:`ProcessorShare`.
     """
 
     processor: ProcessorName
-    code: Annotated[str, msgspec.Meta(max_length=MAX_CODE)]  #: of all workers of a processor the same
+    code: Annotated[str, msgspec.Meta(max_length=MAX_CODE)]  #: the same for all workers of a processor
     camera: Name
-    shared: bool = True  #: each frame to one worker; else all get all
-    ready: bool = True  #: False: frames are for others to take, for this one can't just now
+    shared: bool = True  #: each frame goes to one worker; False: every worker gets all frames
+    ready: bool = True  #: False: this worker can't take frames at present, so the others get them
 
 
 class AnswerTakeover(msgspec.Struct, frozen=True, array_like=True, tag=9):
-    """The holder's answer to an application that asks for the authority."""
+    """The holder's answer to an application that requests the authority."""
 
-    lease: Count  #: the holder's own
-    app_id: Count  #: who asked
-    grant: bool  #: hand it over now; else: not yet
-    reason: Reason = ""  #: why not, for a person
+    lease: Count  #: the holder's own lease
+    app_id: Count  #: the application that asked
+    grant: bool  #: hand the authority over now; False: not yet
+    reason: Reason = ""  #: reason for declining, for people
 
 
 AnyRequest = (
@@ -124,9 +124,9 @@ AnyRequest = (
 
 
 class Request(msgspec.Struct, frozen=True, array_like=True):
-    """One request, with the number by which its reply is recognised."""
+    """One request, with a number that identifies its reply."""
 
-    id: Count  #: chosen by the asker; comes back in the answer
+    id: Count  #: chosen by the requester; the answer repeats it
     body: AnyRequest
 
 
@@ -134,43 +134,43 @@ class Request(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Welcome(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """Answer to Hello."""
+    """The answer to ``Hello``."""
 
     app_id: Count  #: the application's number in this run of the proxy, from 1
     proxy: Name
-    run_id: Count  #: random; another number means that the proxy was restarted
+    run_id: Count  #: random; a different number means that the proxy has restarted
     pid: Count
-    uri: str  #: of the vehicle
+    uri: str  #: the vehicle's address
     now_ns: TimeNs  #: the proxy's clock
     capabilities: Capabilities
-    clock: ClockName = ""  #: which monotonic clock it reads, on its host; empty: not known
+    clock: ClockName = ""  #: which monotonic clock of the host it is; empty: unknown
 
 
 class AuthorityGranted(msgspec.Struct, frozen=True, array_like=True, tag=2):
     """The application holds the authority now."""
 
     lease: Count
-    until_ns: TimeNs = 0  #: when the time is over for which it was wanted, on the proxy's clock; 0: it is not limited
+    until_ns: TimeNs = 0  #: end of the requested time, on the proxy's clock; 0: unlimited
 
 
 class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """Waiting in line: the grant comes as an event and shows in feedback (``owner_id``, ``lease``)."""
+    """The request is queued. The grant arrives as an event and shows in feedback (``owner_id``, ``lease``)."""
 
     position: Count  #: 1 is next
     holder: str
     holder_priority: Priority
-    wait_s: float | None = None  #: expected, by how long the others stated that they want it; nil: not known
-    asked: bool = False  #: the holder is being asked to hand it over
+    wait_s: float | None = None  #: estimated from the times that the others requested [s]; nil: unknown
+    asked: bool = False  #: whether the holder is being asked to hand it over
 
 
 class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):
-    """A parameter, as it was read or is after it was written."""
+    """A parameter, as read or after a write."""
 
     parameter: Parameter
 
 
 class ParameterPage(msgspec.Struct, frozen=True, array_like=True, tag=5):
-    """A page of the parameters; ``total`` counts all of them, ``first`` is the index of the first one here."""
+    """A page of the parameters; ``total`` counts all of them, ``first`` is the index of the first one on the page."""
 
     total: Count
     first: Count
@@ -178,14 +178,14 @@ class ParameterPage(msgspec.Struct, frozen=True, array_like=True, tag=5):
 
 
 class Pong(msgspec.Struct, frozen=True, array_like=True, tag=6):
-    """Answer to Ping, with its ``sent_ns``; ``now_ns`` is the proxy's clock."""
+    """The answer to ``Ping``, with its ``sent_ns``; ``now_ns`` is the proxy's clock."""
 
     sent_ns: TimeNs
     now_ns: TimeNs
 
 
 class Done(msgspec.Struct, frozen=True, array_like=True, tag=7):
-    """It was done; there is nothing else to report."""
+    """The request succeeded and has no other result."""
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag=8):

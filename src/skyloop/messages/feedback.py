@@ -1,4 +1,4 @@
-"""Reports of a proxy: the vehicle's state, time-stamped, events, and an overview of many vehicles.
+"""Samples that a proxy reports: time-stamped vehicle state, events, and an overview of many vehicles.
 
 Unknown values are ``None``, never zero.
 """
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-MAX_LINK_TEXT = 300  #: characters of a text about the link to the vehicle
+MAX_LINK_TEXT = 300  #: characters of a text about the vehicle link
 LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
 
-#: How the reason of a link begins whose vehicle still wakes up: it is connecting or up, and can't take off yet.
+#: Start of ``link_reason`` while the vehicle still wakes up: the link is connecting or up, but it can't take off yet.
 WAKING_UP = "still waking up"
 
 NO_POSITION = "the vehicle does not report its position"
-#: What lets a vehicle know its position, for people who read the line above.
+#: How to give a vehicle its position, for people who read the line above.
 POSITION_SOURCES = (
-    "let it know its position: a simulated drone reports it unless started with position=none, a MAVLink vehicle with "
+    "make it available: a simulated drone reports it unless started with position=none, a MAVLink vehicle with "
     "GPS, optical flow or motion capture (docs/motion-capture.md)"
 )
 
@@ -47,12 +47,12 @@ POSITION_SOURCES = (
 class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     """The newest known state of a vehicle.
 
-    A driver fills the first block and leaves the second to the proxy. World axes are x east, y north, z up; a
-    vehicle without a compass takes its heading at start for east. Roll is positive right side down, pitch nose down,
-    yaw counter-clockwise from x (ROS REP 103).
+    A driver fills the first block of fields, the proxy the second. World axes are x east, y north, z up; a vehicle
+    without a compass takes its heading at start as east. Roll is positive right side down, pitch nose down, yaw
+    counter-clockwise from x (ROS REP 103).
     """
 
-    captured_ns: TimeNs  #: when the vehicle was in this state, on the proxy's clock
+    captured_ns: TimeNs  #: time of this state, on the proxy's clock
     state: FlightState = FlightState.UNKNOWN
     battery: Finite | None = None  #: charge left, 0 to 1
     battery_v: Finite | None = None  #: voltage [V]
@@ -63,40 +63,40 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     velocity_m_s: Vector | None = None  #: body's levelled axes: forward, left, up [m/s]
     angular_velocity_rad_s: Vector | None = None  #: about the body's axes [rad/s]
     acceleration_m_s2: Vector | None = None  #: specific force along the body's axes, gravity included [m/s²]
-    position_m: Vector | None = None  #: in world axes [m], if the vehicle knows it
-    native: dict[str, Value] | None = None  #: the vehicle's own telemetry, by its own names and in its own units
+    position_m: Vector | None = None  #: in world axes [m], if the vehicle knows its position
+    native: dict[str, Value] | None = None  #: the vehicle's own telemetry, with its own names and units
 
-    seq: Count = 0  #: grows by one with each sample of a proxy's run
+    seq: Count = 0  #: grows by one with each sample during a run of the proxy
     published_ns: TimeNs = 0  #: when the proxy published it
     vehicle_link: LinkState = LinkState.CONNECTING  #: the hop proxy–vehicle
     owner: str | None = None  #: name of the application that holds the authority
-    owner_id: Count = 0  #: its number in this run of the proxy; 0 for nobody
+    owner_id: Count = 0  #: its number in this run of the proxy; 0 for none
     owner_priority: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None  #: 0 is the highest
     lease: Count = 0  #: number of the lease in force; 0 for none
     failsafe: Failsafe = Failsafe.NONE
-    link_reason: LinkText = ""  #: why the hop proxy–vehicle is as it is; while it is up: see :attr:`waking_up`
+    link_reason: LinkText = ""  #: why the hop proxy–vehicle is in this state; while it is up, see :attr:`waking_up`
     link_remedy: LinkText = ""  #: what a person can do about it
     others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
-    start_position_m: Vector | None = None  #: where it took off last, in world axes [m]; None: that is not known
-    return_phase: ReturnPhase = ReturnPhase.NONE  #: how far it is on its way back there
-    skipped: Count = 0  #: samples before this one that the proxy left out, as the subscriber asked for fewer
-    outcome: Outcome | None = None  #: what became of the newest intent; None: a proxy that does not tell
+    start_position_m: Vector | None = None  #: where it last took off, in world axes [m]; None: unknown
+    return_phase: ReturnPhase = ReturnPhase.NONE  #: how far the vehicle is on its way back to the start
+    skipped: Count = 0  #: samples before this one that the proxy left out for a subscriber with a lower rate
+    outcome: Outcome | None = None  #: fate of the newest intent; None: the proxy does not report it
 
     @property
     def waking_up(self) -> bool:
-        """Whether the vehicle was started just now and can't take off yet; ``link_reason`` says what it waits for."""
+        """Whether the vehicle has just started and can't take off yet; ``link_reason`` says what it waits for."""
         return self.link_reason.startswith(WAKING_UP)
 
     @property
     def origin(self) -> EarthOrigin | None:
-        """Where the world axes begin on the earth; None where the vehicle does not know its place on it."""
+        """Place on the earth of the origin of the world axes; None where the vehicle does not know it."""
         return EarthOrigin.of(self.native)
 
     @property
     def rotation(self) -> NDArray[np.float64]:
         """Rotation from body to world axes, shape (3, 3), float64: Rz(yaw) · Ry(pitch) · Rx(roll).
 
-        Reading it raises ``ValueError`` while the attitude is not known.
+        Raises ``ValueError`` while the attitude is unknown.
         """
         from skyloop.messages.geometry import rotation_from_euler
 
@@ -114,20 +114,20 @@ _KEYS: Final = (
 
 
 class EarthOrigin(NamedTuple):
-    """The place on the earth where the world axes of ``Feedback.position_m`` begin, x to the east and y to the north.
+    """The place on the earth of the origin of ``Feedback.position_m``'s axes, x to the east and y to the north.
 
-    Autopilots project the earth onto their axes with a sphere. With theirs, a place that is converted here is the place
-    that they mean by it; with another one it would be off by up to 0.6 % of its distance.
+    Autopilots use a sphere to project the earth onto their axes. Conversions here use the vehicle's own sphere, so that
+    both mean the same place; with a different one, positions would be off by up to 0.6 % of their distance.
     """
 
     latitude_deg: float  #: [°], north positive
     longitude_deg: float  #: [°], east positive
     altitude_m: float  #: above mean sea level [m]
-    radius_m: float  #: of the sphere that the vehicle takes the earth for [m]
+    radius_m: float  #: radius of the sphere that the vehicle uses for the earth [m]
 
     @classmethod
     def of(cls, native: Mapping[str, object] | None) -> EarthOrigin | None:
-        """Return the origin that a driver has put into ``Feedback.native``; None if there is none that makes sense."""
+        """Return the origin from a driver's ``Feedback.native``; None if there is none or it makes no sense."""
         found = [native.get(key) if native else None for key in _KEYS]
         numbers = [float(one) for one in found if isinstance(one, int | float) and math.isfinite(one)]
         if len(numbers) < len(_KEYS) or not (is_on_earth(*numbers[:2]) and numbers[3] > 0.0):
@@ -135,7 +135,7 @@ class EarthOrigin(NamedTuple):
         return cls(*numbers)
 
     def native(self) -> dict[str, float]:
-        """Return what a driver puts into ``Feedback.native``."""
+        """Return the entries that a driver adds to ``Feedback.native``."""
         return dict(zip(_KEYS, self, strict=True))
 
     def position_of(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[float, float, float]:
@@ -143,7 +143,7 @@ class EarthOrigin(NamedTuple):
 
         Args:
             latitude_deg: [°], north positive.
-            longitude_deg: [°], east positive; the shorter way round is taken.
+            longitude_deg: [°], east positive; the shorter way round counts.
             altitude_m: Above mean sea level [m].
         """
         east_rad = math.radians(math.remainder(longitude_deg - self.longitude_deg, 360.0))
@@ -161,19 +161,19 @@ class EarthOrigin(NamedTuple):
 
 
 def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
-    """Return whether there is such a place, and east and north are known there; False for NaN."""
+    """Return whether the place exists and has an east and a north; False for NaN."""
     return abs(latitude_deg) < 89.9 and abs(longitude_deg) <= 180.0
 
 
 class Event(msgspec.Struct, frozen=True, array_like=True):
-    """One thing that happened. ``text`` is for people, ``kind`` and ``data`` for programs."""
+    """One event. ``text`` is for people, ``kind`` and ``data`` for programs."""
 
     kind: EventKind
     text: str
     at_ns: TimeNs  #: on the proxy's clock
     severity: Severity = Severity.INFO
-    seq: Count = 0  #: grows by one per proxy's run; 0 for events made by the client itself
-    app: str | None = None  #: the application it concerns
+    seq: Count = 0  #: grows by one during a run of the proxy; 0 for the client's own events
+    app: str | None = None  #: name of the application concerned
     data: dict[str, Value] = msgspec.field(default_factory=dict)
 
 
@@ -182,37 +182,37 @@ MAX_EVENT_TEXT: Final = 200  #: characters of the last event's text
 
 
 class VehicleOverview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
-    """What is to be known of one vehicle at a glance. What is not known is ``None``, as in :class:`Feedback`."""
+    """One vehicle's summary. Unknown values are ``None``, as in :class:`Feedback`."""
 
-    name: Annotated[str, msgspec.Meta(max_length=64)]  #: of its proxy
+    name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of its proxy
     uri: Annotated[str, msgspec.Meta(max_length=MAX_ADDRESS)] = ""  #: its address; cut if it is longer
     vehicle: Annotated[str, msgspec.Meta(max_length=64)] = ""  #: its family
-    can_fly: bool = False  #: whether it takes commands at all
-    captured_ns: TimeNs = 0  #: of its newest feedback, on the proxy's clock; 0: none has come
+    can_fly: bool = False  #: whether it accepts commands at all
+    captured_ns: TimeNs = 0  #: of its newest feedback, on the proxy's clock; 0: none yet
     state: FlightState = FlightState.UNKNOWN
     battery: Finite | None = None  #: charge left, 0 to 1
     position_m: Vector | None = None  #: in world axes [m]
     altitude_m: Finite | None = None  #: height above the ground below [m]
     yaw_rad: Finite | None = None  #: counter-clockwise from x [rad]
     vehicle_link: LinkState = LinkState.CONNECTING  #: the hop proxy–vehicle
-    link_reason: LinkText = ""  #: why it is as it is; while it is up, what a vehicle waits for that still wakes up
+    link_reason: LinkText = ""  #: reason for the link's state; while it is up, why a waking vehicle can't take off yet
     link_remedy: LinkText = ""  #: what a person can do about it
     owner: str | None = None  #: name of the application that holds the authority
     owner_priority: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None  #: 0 is the highest
     failsafe: Failsafe = Failsafe.NONE
     others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
     return_phase: ReturnPhase = ReturnPhase.NONE
-    applications: Count = 0  #: how many are connected
-    event: Event | None = None  #: the last one, without its data; those of applications that come and go are left out
+    applications: Count = 0  #: number of connected applications
+    event: Event | None = None  #: the last one, without its data; connects and disconnects of applications are left out
 
 
 class Overview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
-    """All vehicles of one process, or of one proxy, by name; a page of them where one packet can't hold all.
+    """All vehicles of one process, or of one proxy, by name; split into pages where they exceed one packet.
 
-    The pages of one overview have the same ``seq``.
+    All pages of one overview have the same ``seq``.
     """
 
-    at_ns: TimeNs  #: when it was made, on the proxy's clock
+    at_ns: TimeNs  #: time of the overview, on the proxy's clock
     seq: Count  #: grows by one with each overview
     first: Count = 0  #: index of the first row on this page
     total: Count = 0  #: rows on all pages
@@ -220,7 +220,7 @@ class Overview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
 
 
 class OverviewPages:
-    """Puts the pages of overviews together, in the order of their arrival."""
+    """Assembles overviews from their pages, in order of arrival."""
 
     def __init__(self) -> None:
         self._seq: int | None = None
@@ -229,7 +229,7 @@ class OverviewPages:
     def add(self, page: Overview) -> Overview | None:
         """Add a page; return the whole overview if this was its last page, else None.
 
-        One of which a page is missing is left out: the next one follows within a second.
+        An overview with a missing page is dropped: the next one follows within a second.
         """
         if page.first == 0:
             self._seq, self._rows = page.seq, []
@@ -244,11 +244,11 @@ class OverviewPages:
 
 
 def typical_feedback(captured_ns: int, state: FlightState = FlightState.FLYING) -> Feedback:
-    """Return feedback with as many values as a real vehicle's, for what measures the code.
+    """Return feedback with as many values as a real vehicle's, for benchmarks.
 
     Args:
-        captured_ns: When it was captured [ns].
-        state: Its flight state.
+        captured_ns: Time of capture [ns].
+        state: The flight state.
     """
     return Feedback(
         captured_ns=captured_ns,

@@ -1,6 +1,6 @@
-"""Frames of video: what travels with their pixels, encoded pictures of a stream, and the headers of picture files.
+"""Video samples: headers of frames, encoded pictures of a stream, and the size of image files.
 
-The pictures of a stream are as the vehicle sent them, or encoded by the proxy; only while somebody subscribes.
+A stream holds pictures as the vehicle sent them, or as the proxy encoded them. It runs only while it has subscribers.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-H264: Final = "h264"  #: the one codec that is recorded as it comes
-#: Bytes of a picture that fit a packet, with all that is sent beside it.
+H264: Final = "h264"  #: the only codec that is recorded without decoding
+#: Bytes of a picture that fit into a packet beside the other fields.
 MAX_PIECE: Final = 57_000
 MAX_PIECES: Final = 64
 MAX_ENCODED: Final = MAX_PIECE * MAX_PIECES  #: bytes of a whole picture
@@ -26,7 +26,7 @@ Topic = Annotated[str, msgspec.Meta(max_length=200)]
 
 
 class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
-    """A camera's intrinsics in OpenCV's convention, in pixels of the frame that they come with."""
+    """A camera's intrinsics in OpenCV's convention, in pixels of the accompanying frame."""
 
     fx: Finite
     fy: Finite
@@ -45,12 +45,12 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
 
 
 class FrameHeader(msgspec.Struct, frozen=True, array_like=True):
-    """Describes one frame; its pixels travel beside it."""
+    """Header of one frame; the pixels are sent separately."""
 
     camera: Name
-    seq: Count  #: grows by one with each frame that this camera gave, dropped ones included
-    captured_ns: TimeNs  #: middle of the exposure as near as the vehicle reports it, on the proxy's clock
-    published_ns: TimeNs  #: when the proxy had it
+    seq: Count  #: grows by one with each frame of this camera, dropped ones included
+    captured_ns: TimeNs  #: middle of the exposure, as accurately as the vehicle reports it, on the proxy's clock
+    published_ns: TimeNs  #: when the proxy received it
     width: Pixels
     height: Pixels
     encoding: Encoding
@@ -59,7 +59,7 @@ class FrameHeader(msgspec.Struct, frozen=True, array_like=True):
 
 
 class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
-    """A camera that a vehicle has. Known before the first frame."""
+    """One of the vehicle's cameras, known before the first frame."""
 
     name: Name
     width: Pixels
@@ -70,52 +70,52 @@ class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
     #: rotation from the camera's optical axes (x right, y down, z forward) to the body's axes, row by row
     rotation: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite] | None = None
     position_m: tuple[Finite, Finite, Finite] | None = None  #: of the optical centre in body axes [m]
-    stream: str = ""  #: codec in which its pictures can be had as they come, ``h264``; empty: as frames only
+    stream: str = ""  #: codec in which the pictures are available undecoded, ``h264``; empty: frames only
 
 
 class EncodedFrame(msgspec.Struct, frozen=True, array_like=True):
-    """One picture: of H.264 an access unit in Annex B form, with its parameter sets if it is a key picture.
+    """One picture; in H.264, an access unit in Annex B form, with its parameter sets if it is a key picture.
 
-    One that is larger than a packet travels in pieces, each of them one of these. A picture that is no key builds on
-    the one before, so after a gap in ``seq`` nothing can be decoded up to the next key. There are no pictures that
-    build on later ones. A frame decoded from it has the same ``captured_ns``, and a number of its own.
+    A picture larger than a packet is sent in pieces, each an ``EncodedFrame``. Each but a key picture refers to
+    the previous one, so nothing after a gap in ``seq`` can be decoded before the next key picture. No picture refers to
+    a later one. A frame decoded from it has the same ``captured_ns``, and its own ``seq``.
     """
 
     camera: Name
     seq: Count  #: grows by one with each picture of the stream, those too large for a packet included
-    captured_ns: TimeNs  #: as of the decoded frame
-    published_ns: TimeNs  #: when the proxy had it
-    width: Pixels  #: of the picture when decoded
+    captured_ns: TimeNs  #: as in the decoded frame
+    published_ns: TimeNs  #: when the proxy received it
+    width: Pixels  #: of the decoded picture
     height: Pixels
     codec: Annotated[str, msgspec.Meta(max_length=16)]  #: ``h264``
-    key: bool  #: it can be decoded without those before it
-    data: Annotated[bytes, msgspec.Meta(max_length=MAX_ENCODED)]  #: at most :data:`MAX_PIECE` of them in a packet
+    key: bool  #: decodable without earlier pictures
+    data: Annotated[bytes, msgspec.Meta(max_length=MAX_ENCODED)]  #: at most :data:`MAX_PIECE` bytes of them in a packet
     intrinsics: Intrinsics | None = None
-    topic: Topic = ""  #: that it was published on; empty: ``stream/CAMERA``, as the vehicle encoded it
+    topic: Topic = ""  #: topic it was published on; empty: ``stream/CAMERA``, as the vehicle encoded it
     piece: Annotated[int, msgspec.Meta(ge=0, lt=MAX_PIECES)] = 0
     pieces: Annotated[int, msgspec.Meta(ge=1, le=MAX_PIECES)] = 1
 
     def decoded(self, width: int, height: int) -> FrameHeader:
-        """Return the header of the frame that was decoded from it, in BGR and of this size [px]."""
+        """Return the header of the frame decoded from this picture, in BGR and of this size [px]."""
         same = (width, height) == (self.width, self.height)
         times = (self.captured_ns, self.published_ns)
-        lens = self.intrinsics if same else None  # it is for the announced size
+        lens = self.intrinsics if same else None  # the intrinsics hold for the announced size
         return FrameHeader(self.camera, self.seq, *times, width, height, Encoding.BGR8, width * height * 3, lens)
 
 
 class StreamReport(msgspec.Struct, frozen=True, array_like=True):
-    """What a subscriber tells the proxy of a stream that the proxy encodes. It may be lost: the next one tells more."""
+    """A subscriber's report on a stream that the proxy encodes. It may be lost: a later one replaces it."""
 
     topic: Topic
-    seq: Count  #: the newest picture that came whole; 0: none so far
-    wants_key: bool = False  #: it can decode nothing before the next key picture
+    seq: Count  #: newest picture received whole; 0: none yet
+    wants_key: bool = False  #: whether the subscriber can decode nothing before the next key picture
 
 
 def split(picture: EncodedFrame) -> Iterator[EncodedFrame]:
     """Yield the pieces of a picture in order; the picture itself if it fits a packet.
 
     Args:
-        picture: Whole, of at most :data:`MAX_ENCODED` bytes.
+        picture: A whole picture, of at most :data:`MAX_ENCODED` bytes.
     """
     pieces = -(-len(picture.data) // MAX_PIECE)
     if pieces <= 1:
@@ -127,13 +127,13 @@ def split(picture: EncodedFrame) -> Iterator[EncodedFrame]:
 
 
 class Pieces:
-    """Puts the pictures of one stream together again. Pieces come in order, or the picture is not whole."""
+    """Reassembles the pictures of one stream. A picture whose pieces arrive out of order is dropped."""
 
     def __init__(self) -> None:
         self._parts: list[EncodedFrame] = []
 
     def add(self, part: EncodedFrame) -> EncodedFrame | None:
-        """Take what came; return a picture that is whole now."""
+        """Add a piece; return the picture if it is complete now."""
         if part.pieces == 1:
             self._parts.clear()
             return part
@@ -152,13 +152,13 @@ class Pieces:
 
 
 class Chain:
-    """Tells which pictures of a stream can be decoded: a key, and each that follows it without a gap in the numbers."""
+    """Decides which pictures of a stream are decodable: a key picture, and its successors without a gap."""
 
     def __init__(self) -> None:
-        self._last: int | None = None  # None: wait for a key
+        self._last: int | None = None  # None: wait for a key picture
 
     def follows(self, number: int, *, key: bool) -> bool:
-        """Return whether a picture, the next that came, can be decoded; False for one that came a second time.
+        """Return whether the next picture received can be decoded; False for duplicates.
 
         Args:
             number: The picture's ``seq``.
@@ -171,16 +171,16 @@ class Chain:
         return whole
 
     def restart(self) -> None:
-        """Restart: the next picture does not continue what came before."""
+        """Start over: the next picture does not continue the previous ones."""
         self._last = None
 
 
-# The size of a picture, read from the header of its JPEG or PNG file: a decoder reserves memory for what the header
-# announces, and a file of a few kilobytes may ask for gigabytes. ITU-T T.81 (JPEG), annex B; W3C PNG, section 5.
+# The size is read from a JPEG's or PNG's header before decoding: decoders reserve memory for the announced size, so a
+# file of a few kilobytes could claim gigabytes. ITU-T T.81 (JPEG), annex B; W3C PNG, section 5.
 
-#: The largest picture that is decoded, 8K UHD: no camera of a small drone comes near, and it takes 100 MB as BGR.
+#: Largest picture that is decoded: 8K UHD, 100 MB as BGR, far beyond any camera of a small drone.
 MAX_PIXELS: Final = 7680 * 4320
-#: Of a progressive JPEG, each of which goes over the whole picture; encoders make about ten.
+#: Scans of a progressive JPEG, each of which covers the whole picture; encoders make about ten.
 MAX_SCANS: Final = 100
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
@@ -188,14 +188,14 @@ _JPEG: Final = b"\xff\xd8"
 _SCAN: Final = b"\xff\xda"
 _START_OF_FRAME: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _WITHOUT_LENGTH: Final = frozenset({0x01, *range(0xD0, 0xD8)})
-_ENDS: Final = frozenset({0xD8, 0xD9, 0xDA})  #: no head goes on behind a second start, the end, or the first scan
+_ENDS: Final = frozenset({0xD8, 0xD9, 0xDA})  #: no header continues after a second start, the end, or the first scan
 
 
 def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
-    """Return width and height [px] that the header of a JPEG or PNG announces.
+    """Return width and height [px] from the header of a JPEG or PNG.
 
     Returns:
-        None for anything else, or a damaged header.
+        None for other formats and damaged headers.
     """
     if data[:8] == _PNG:
         if data[12:16] != b"IHDR" or len(data) < 24:
@@ -208,22 +208,22 @@ def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
 
 
 def why_not_decoded(data: bytes | memoryview) -> str:
-    """Return why a picture must not be given to a decoder; empty if it may be."""
+    """Return why a picture must not be decoded; empty if it may be."""
     size = image_size(data)
     if size is None:
         return "it is neither JPEG nor PNG, or it is damaged"
     width, height = size
     if width * height > MAX_PIXELS:
-        return f"it announces {width} × {height} pixels, and at most {MAX_PIXELS} are decoded"
+        return f"it announces {width} × {height} pixels; at most {MAX_PIXELS} are decoded"
     if data[:2] == _JPEG and (scans := bytes(data).count(_SCAN)) > MAX_SCANS:
-        return f"it is a JPEG of {scans} scans, and at most {MAX_SCANS} are decoded"
+        return f"it is a JPEG of {scans} scans; at most {MAX_SCANS} are decoded"
     return ""
 
 
 def _jpeg_size(data: bytes | memoryview) -> tuple[int, int] | None:
     at = 2
     while at + 4 <= len(data):
-        if data[at] != 0xFF or data[at + 1] in (0x00, 0xFF):  # fill bytes, and what a decoder skips
+        if data[at] != 0xFF or data[at + 1] in (0x00, 0xFF):  # fill bytes, and bytes that decoders skip
             at += 1
             continue
         marker = data[at + 1]

@@ -1,6 +1,6 @@
-"""Numbers within limits, angles, and rotations as NumPy matrices and quaternions, with the axes of ROS REP 103. Pure.
+"""Pure functions for bounded numbers, angles, rotation matrices and quaternions, with the axes of ROS REP 103.
 
-NaN passes no limit: it counts as 0, or as the number of the range that is nearest to 0.
+NaN never passes a limit: it counts as 0, or as the number in the range nearest to 0.
 """
 
 from __future__ import annotations
@@ -77,13 +77,13 @@ def wrap_angle(angle: _Angle) -> _Angle:
 
 
 def turned(x: float, y: float, angle: float) -> tuple[float, float]:
-    """Turn a vector counter-clockwise [rad]: by the yaw, one in levelled body axes becomes one in world axes."""
+    """Rotate a vector counter-clockwise [rad]; by the yaw, from levelled body axes to world axes."""
     cos, sin = math.cos(angle), math.sin(angle)
     return cos * x - sin * y, sin * x + cos * y
 
 
 def within(value: float, low: float, high: float) -> float:
-    """Return the nearest value from ``low`` to ``high``; NaN counts as 0."""
+    """Return the nearest value between ``low`` and ``high``; NaN counts as 0."""
     return max(low, min(high, 0.0 if math.isnan(value) else value))
 
 
@@ -93,5 +93,5 @@ def clamped(value: float, longest: float) -> float:
 
 
 def in_16_bits(value: float) -> int:
-    """Return the nearest whole number that a signed field of 16 bits holds."""
+    """Return the nearest integer that fits into a signed 16-bit field."""
     return round(within(value, -0x8000, 0x7FFF))

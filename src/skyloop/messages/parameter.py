@@ -1,6 +1,6 @@
-"""Parameters, and two read-only ones whose text has a structure: a vehicle's checkup, and its world.
+"""Parameters, and two read-only ones with structured text: a vehicle's checkup, and its world.
 
-A parameter is typed, with unit, range and default, so that a page or a person can edit it.
+A parameter has a type, a unit, a range and a default, so that a page or a person can edit it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ParameterType(StrEnum):
 
 
 class Parameter(msgspec.Struct, frozen=True, array_like=True):
-    """One parameter with its present value and all that is needed to check a new one."""
+    """One parameter: its present value, and the rules for a new one."""
 
     name: ParameterName
     type: ParameterType
@@ -40,26 +40,26 @@ class Parameter(msgspec.Struct, frozen=True, array_like=True):
     choices: tuple[Value, ...] = ()  #: if not empty, the only values allowed
     read_only: bool = False
     description: str = ""
-    momentary: bool = False  #: writing it does something once, such as a flip: no value to be restored or repeated
+    momentary: bool = False  #: writing it triggers an action such as a flip; there is no value to restore or repeat
 
 
-# What a driver finds about its vehicle before a flight.
+# A driver's findings about its vehicle before a flight.
 
 CHECKUP: Final = "vehicle.checkup"  #: the parameter's name
-MAX_CHECKUP_TEXT: Final = 7000  #: characters of the parameter's text: its packet has to hold it
+MAX_CHECKUP_TEXT: Final = 7000  #: characters of the text, so that a parameter's packet can hold it
 
 _Text = Annotated[str, msgspec.Meta(max_length=600)]
 
 
 class Diagnostic(msgspec.Struct, frozen=True, array_like=True):
-    """Something about a vehicle or its settings that a person may want to know before flying.
+    """A finding about a vehicle or its settings that matters before a flight.
 
     Attributes:
-        what: What was examined.
-        good: Whether it is as it should be.
-        detail: What was found.
-        advice: What to do about it, empty if nothing.
-        severe: Not good, and dangerous or sure to fail: not only a safety net that is off.
+        what: The subject of the examination.
+        good: Whether the result is good.
+        detail: The result.
+        advice: What to do about it; empty if nothing.
+        severe: Whether it is dangerous or sure to fail, rather than just a disabled safety net.
     """
 
     what: _Text
@@ -73,7 +73,7 @@ _checkup_decoder = msgspec.json.Decoder(list[Diagnostic])
 
 
 def encode_checkup(diagnostics: list[Diagnostic]) -> str:
-    """Return diagnostics as a parameter's text; those that are good are left out first if it is too long."""
+    """Return diagnostics as a parameter's text; if it is too long, the good ones are left out first."""
     kept = list(diagnostics)
     while len(text := _encode_json(kept).decode()) > MAX_CHECKUP_TEXT:
         kept.remove(next((one for one in reversed(kept) if one.good), kept[-1]))
@@ -84,18 +84,18 @@ def decode_checkup(text: str) -> list[Diagnostic]:
     """Return the diagnostics of a parameter's text.
 
     Raises:
-        ValueError: It has none.
+        ValueError: The text holds none.
     """
     return _checkup_decoder.decode(text.encode())
 
 
-# What stands in a vehicle's world, for maps: walls, solids, gates, markers, starts. A driver that knows its
-# surroundings lists it. World axes are those of `Feedback.position_m`: x east, y north, z up [m]; yaw 0 faces east,
-# counter-clockwise [rad]. It is for people's eyes: nothing is steered by it.
+# A vehicle's world, for maps: walls, solids, gates, markers, starts; published by drivers that know their surroundings.
+# World axes are those of `Feedback.position_m`: x east, y north, z up [m]; yaw 0 faces east, counter-clockwise [rad].
+# It is for display only: nothing is steered by it.
 
 WORLD: Final = "world.geometry"  #: the parameter's name
-MAX_WORLD_TEXT: Final = 8000  #: characters of the text: a parameter's packet has to hold it
-MAX_THINGS: Final = 256  #: of one kind
+MAX_WORLD_TEXT: Final = 8000  #: characters of the text, so that a parameter's packet can hold it
+MAX_THINGS: Final = 256  #: of each kind
 
 _Name = Annotated[str, msgspec.Meta(max_length=64)]
 _Vec = tuple[Finite, Finite, Finite]
@@ -111,7 +111,7 @@ class Solid(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Opening(msgspec.Struct, frozen=True, array_like=True):
-    """A gate: the centre, width and height of its opening, the heading of the way through, thickness of its bars."""
+    """A gate: the centre, width and height of its opening, the direction of flight, and its bars' thickness."""
 
     name: _Name
     position: _Vec
@@ -131,7 +131,7 @@ class Card(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Start(msgspec.Struct, frozen=True, array_like=True):
-    """Where a vehicle stands at the start."""
+    """A vehicle's position and heading at the start."""
 
     name: _Name
     position: _Vec
@@ -139,7 +139,7 @@ class Start(msgspec.Struct, frozen=True, array_like=True):
 
 
 class WorldGeometry(msgspec.Struct, frozen=True):
-    """The whole of it. ``low`` and ``high`` are corners of the room; ``enclosed``: it has walls to see."""
+    """The whole world. ``low`` and ``high`` are corners of the room; ``enclosed``: it has visible walls."""
 
     name: _Name = ""
     low: _Vec | None = None
@@ -149,14 +149,14 @@ class WorldGeometry(msgspec.Struct, frozen=True):
     gates: Annotated[tuple[Opening, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
     markers: Annotated[tuple[Card, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
     starts: Annotated[tuple[Start, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
-    left_out: int = 0  #: things that the text has no room for
+    left_out: int = 0  #: number of things that the text has no room for
 
 
 _world_decoder = msgspec.json.Decoder(WorldGeometry)
 
 
 def encode_world(world: WorldGeometry) -> str:
-    """Return a world as a parameter's text; of a world that is too large the last solids and markers are left out."""
+    """Return a world as a parameter's text; if it is too long, the last solids and markers are left out."""
     while len(text := _encode_json(world).decode()) > MAX_WORLD_TEXT:
         kind = max(("solids", "markers", "gates", "starts"), key=lambda one: len(getattr(world, one)))
         things = getattr(world, kind)
@@ -170,6 +170,6 @@ def decode_world(text: str) -> WorldGeometry:
     """Return the world of a parameter's text.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The text is not a world.
     """
     return _world_decoder.decode(text.encode())

@@ -1,4 +1,4 @@
-"""Samples that applications publish through the proxy: annotations of frames, log entries, results of processors.
+"""Samples that applications publish through the proxy: annotations of frames, log entries, processors' results.
 
 The proxy relays them on the topics ``annotations``, ``logs``, ``results`` (of all processors) and ``results/NAME``.
 """
@@ -15,8 +15,8 @@ from skyloop.messages.fields import Count, Finite, Name, Pixels, Severity, TimeN
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Annotations: what a controller or processor saw in a frame, for people and recorders to look at; the newest wins.
-# Coordinates are pixels of the frame named.
+# Annotations: drawings of a controller or processor on a frame, for people and recorders; the newest wins. Coordinates
+# are pixels of that frame.
 
 Point = tuple[Finite, Finite]
 Channel = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -25,7 +25,7 @@ GREEN: Colour = (64, 220, 100)
 
 
 class Polyline(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """A line through points; closed: a polygon (a box has four points)."""
+    """A line through points; if closed, a polygon (a box has four points)."""
 
     points: Annotated[tuple[Point, ...], msgspec.Meta(max_length=512)]
     closed: bool = False
@@ -51,92 +51,92 @@ Shape = Polyline | Points | Text
 
 
 class Annotation(msgspec.Struct, frozen=True, array_like=True):
-    source: Name  #: which tracker or controller drew it; the newest per source and camera counts
+    source: Name  #: the tracker or controller that drew it; only the newest per source and camera counts
     camera: Name
-    captured_ns: TimeNs  #: of the frame that it belongs to
-    width: Pixels  #: of that frame
+    captured_ns: TimeNs  #: of the annotated frame
+    width: Pixels  #: width of that frame
     height: Pixels
     shapes: Annotated[tuple[Shape, ...], msgspec.Meta(max_length=256)] = ()
 
 
-# Log entries: text, numbers and arrays, for recorders and for people to plot.
+# Log entries: text, numbers and arrays, for recorders and plots.
 
 MAX_LOG_TEXT: Final = 4096  #: characters
 MAX_VALUES: Final = 4096  #: numbers of an array
 #: The series of poses from motion capture, in world axes: arrays of x, y, z [m], quaternion x, y, z, w, and velocity
-#: x, y, z [m/s] if it is known.
+#: x, y, z [m/s] if known.
 MOCAP: Final = "mocap"
 
 
 class LogEntry(msgspec.Struct, frozen=True, array_like=True):
-    """One entry: exactly one of ``text``, ``number`` and ``values`` is given.
+    """One entry, with exactly one of ``text``, ``number`` and ``values``.
 
-    Raises ``ValueError`` for none or several of them, and for a shape that is not that of the values.
+    Raises ``ValueError`` for none or several of them, and for a shape that does not match the values.
     """
 
-    source: Name  #: the application, or the part of it, that logged it
-    name: Annotated[str, msgspec.Meta(max_length=64)]  #: of the series; empty for text that belongs to none
+    source: Name  #: the application, or its part, that logged the entry
+    name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of the series; empty for text outside any series
     at_ns: TimeNs  #: when it was logged, on the proxy's clock
     text: Annotated[str, msgspec.Meta(max_length=MAX_LOG_TEXT)] | None = None
     number: Finite | None = None
     values: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=MAX_VALUES)] | None = None  #: an array, row by row
     shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=8)] = ()  #: of that array
-    severity: Severity = Severity.INFO  #: of a text
+    severity: Severity = Severity.INFO  #: severity of a text
 
     def __post_init__(self) -> None:
         if (self.text is not None) + (self.number is not None) + (self.values is not None) != 1:
-            raise ValueError("a log entry has exactly one of text, number and values")
+            raise ValueError("a log entry must have exactly one of text, number and values")
         values = self.values
         if self.shape if values is None else not shape_fits(self.shape, len(values), MAX_VALUES):
             raise ValueError(f"a log entry of {len(values or ())} values can't have the shape {self.shape!r:.200}")
 
 
-# Results: what a processor made of a frame, and how the workers of one processor share the frames.
+# Results: a processor's output for one frame, and how the workers of a processor share the frames.
 
 MAX_PAYLOAD: Final = 32_768  #: bytes of a result's value, packed
-MAX_CODE: Final = 128  #: characters of what identifies the code of a processor
-MAX_PARTS: Final = 1024  #: of a camera's frames, of which each worker takes one
+MAX_CODE: Final = 128  #: characters that identify a processor's code
+MAX_PARTS: Final = 1024  #: shares of a camera's frames, one per worker
 PROCESSOR_NAME: Final = r"^[A-Za-z0-9_.-]{1,64}$"
 ProcessorName = Annotated[str, msgspec.Meta(pattern=PROCESSOR_NAME, min_length=1, max_length=64)]
 
 
 class ProcessorResult(msgspec.Struct, frozen=True, array_like=True):
-    """What a processor made of one frame."""
+    """A processor's output for one frame."""
 
     processor: ProcessorName
     camera: Name
     seq: Count  #: of the frame
     captured_ns: TimeNs  #: of the frame
-    made_ns: TimeNs  #: when the result was there, on the proxy's clock
-    took_ns: Count  #: how long the worker's ``process`` ran
+    made_ns: TimeNs  #: when the result was ready, on the proxy's clock
+    took_ns: Count  #: duration of the worker's ``process`` [ns]
     number: Count  #: grows by one with each result of a worker
     payload: Annotated[bytes, msgspec.Meta(max_length=MAX_PAYLOAD)]  #: see :func:`pack`
-    worker: Count = 0  #: number of the application that sent it; written by the proxy, whatever was there
+    worker: Count = 0  #: number of the sending application; the proxy overwrites it
 
 
 class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
-    """Tells a worker which frames are its own: those with ``seq % parts == part``."""
+    """Assigns a worker its frames: those with ``seq % parts == part``."""
 
     processor: ProcessorName
     camera: Name
     part: Count  #: from 0
-    #: 0: no frame, for it stated that it can take none; 1: every frame
+    #: 0: no frames, as the worker reported that it can't take any; 1: every frame
     parts: Annotated[int, msgspec.Meta(ge=0, le=MAX_PARTS)]
-    workers: Count  #: of this processor and camera, those that can take none included
+    workers: Count  #: of this processor and camera, paused ones included
 
     def __post_init__(self) -> None:
         if self.part >= max(1, self.parts):
-            raise ValueError(f"part {self.part} of {self.parts} is none")
+            raise ValueError(f"part is {self.part} and must be below parts ({self.parts}), or 0")
 
 
-# The value of a result to bytes and back: one MessagePack value. A NumPy array is extension type 1, whose bytes are a
-# MessagePack array of its type's name, its shape and its elements (little-endian, row by row). A dataclass or
-# `msgspec.Struct` is encoded as a map and decoded as a dict.
+# A result's value is one MessagePack value. A NumPy array is extension type 1, whose bytes are a MessagePack array of
+# its type's name, its shape and its elements (little-endian, row by row). A dataclass or `msgspec.Struct` is encoded
+# as a map and decoded as a dict.
 
 ARRAY: Final = 1  #: extension type
 MAX_DIMENSIONS: Final = 8
-MAX_DEPTH: Final = 32  #: of nested lists and maps, so that walking through a value needs a bounded stack
-#: Types of arrays that travel: the same on every machine.
+MAX_DEPTH: Final = 32  #: of nested lists and maps, so that walking a value needs a bounded stack
+#: Element types that arrays may have: those that are the same on every machine.
 DTYPES: Final = (
     "bool",
     *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
@@ -155,14 +155,14 @@ class _Array(msgspec.Struct, frozen=True, array_like=True):
 
 
 def pack(value: Any) -> bytes:
-    """Encode a value.
+    """Encode a result's value.
 
     Args:
         value: None, bool, int (64 bits), float, str, bytes, list, tuple, dict, dataclass, ``msgspec.Struct`` or a NumPy
             array of :data:`DTYPES`, nested at most :data:`MAX_DEPTH` deep.
 
     Raises:
-        UsageError: It can't be encoded, or takes more than 32 768 bytes.
+        UsageError: The value can't be encoded, or takes more than 32 768 bytes.
     """
     try:
         data = _encoder.encode(value)
@@ -172,7 +172,7 @@ def pack(value: Any) -> bytes:
         raise UsageError(f"a result can't be sent: {error}; {_WHAT}") from None
     if len(data) > MAX_PAYLOAD:
         raise UsageError(
-            f"a result of {len(data)} bytes can't be sent, at most {MAX_PAYLOAD} can: send what was found in an "
+            f"a result of {len(data)} bytes can't be sent, at most {MAX_PAYLOAD} can: send what you found in an "
             "image, not the image"
         )
     return data
@@ -182,18 +182,18 @@ def unpack(payload: bytes) -> Any:
     """Decode a payload; arrays are read-only, tuples come back as lists.
 
     Raises:
-        DecodeError: It is not a value that :func:`pack` could have encoded.
+        DecodeError: :func:`pack` could not have encoded these bytes.
     """
     try:
         value = _decoder.decode(payload)
         _check_depth(value)
     except (msgspec.MsgspecError, ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise DecodeError(f"a result that can't be understood: {error}") from None
+        raise DecodeError(f"cannot decode the result: {error}") from None
     return value
 
 
 def _check_depth(value: Any) -> None:
-    """Raise ``ValueError`` for lists and maps in one another deeper than :data:`MAX_DEPTH`, without recursion."""
+    """Raise ``ValueError`` for lists and maps nested deeper than :data:`MAX_DEPTH`, without recursion."""
     level = [value]
     for _ in range(MAX_DEPTH + 1):
         inside: list[Any] = []
@@ -205,7 +205,7 @@ def _check_depth(value: Any) -> None:
         if not inside:
             return
         level = inside
-    raise ValueError(f"lists and maps in it lie more than {MAX_DEPTH} deep in one another")
+    raise ValueError(f"lists and maps are nested more than {MAX_DEPTH} deep")
 
 
 def _encode_other(value: Any) -> Any:
@@ -215,7 +215,7 @@ def _encode_other(value: Any) -> Any:
         return value.item()
     if isinstance(value, np.ndarray):
         return msgspec.msgpack.Ext(ARRAY, _pack_array(value))
-    raise TypeError(f"there is a {type(value).__module__}.{type(value).__qualname__} in it")
+    raise TypeError(f"it contains a {type(value).__module__}.{type(value).__qualname__}")
 
 
 def _pack_array(array: NDArray[Any]) -> bytes:
@@ -223,13 +223,13 @@ def _pack_array(array: NDArray[Any]) -> bytes:
 
     if array.dtype.name not in DTYPES or array.ndim > MAX_DIMENSIONS:
         raise TypeError(
-            f"there is an array of {array.ndim} dimensions of {array.dtype} in it, and arrays have at most "
+            f"it contains an array of {array.ndim} dimensions of {array.dtype}; arrays have at most "
             f"{MAX_DIMENSIONS} dimensions of {', '.join(DTYPES)}"
         )
     if array.nbytes > MAX_PAYLOAD or not shape_fits(array.shape, array.size, MAX_PAYLOAD):
         raise ValueError(
-            f"there is an array of {array.nbytes} bytes in it, of shape {array.shape}, and results have at most "
-            f"{MAX_PAYLOAD} bytes, and no axis that is longer"
+            f"it contains an array of {array.nbytes} bytes, of shape {array.shape}; results have at most "
+            f"{MAX_PAYLOAD} bytes and no longer axis"
         )
     plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return msgspec.msgpack.encode(_Array(array.dtype.name, array.shape, plain.tobytes()))
@@ -239,7 +239,7 @@ def _decode_extension(code: int, data: memoryview) -> Any:
     import numpy as np
 
     if code != ARRAY:
-        raise ValueError(f"extension type {code} is not known")
+        raise ValueError(f"extension type {code} is unknown")
     packed = _array_decoder.decode(data)
     if packed.dtype not in DTYPES:
         raise ValueError(f"an array of {packed.dtype[:40]!r}")
@@ -254,5 +254,5 @@ def _decode_extension(code: int, data: memoryview) -> Any:
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_encode_other)
 _decoder = msgspec.msgpack.Decoder(ext_hook=_decode_extension)
-_plain_decoder = msgspec.msgpack.Decoder()  # arrays of numbers stay bytes
+_plain_decoder = msgspec.msgpack.Decoder()  # leaves arrays of numbers as bytes
 _array_decoder = msgspec.msgpack.Decoder(_Array)

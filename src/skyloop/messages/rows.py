@@ -1,4 +1,4 @@
-"""A drone's state and set-points as rows of numbers, for data sets to learn from and policies that were learnt."""
+"""A drone's state and set-points as rows of numbers, for training data and learned policies."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _NUMBERS: Final[dict[str, _Number]] = {
     "velocity_up_m_s": _part(lambda feedback: feedback.velocity_m_s, 2),
 }
 
-#: What a drone knows of itself, in the axes and units of :class:`Feedback`.
+#: A drone's own state, in the axes and units of :class:`Feedback`.
 STATE: Final = tuple(_NUMBERS)
-#: The numbers of the set-points that an application steers by, by the set-point's name.
+#: The numbers of an application's set-points, by the set-point's name.
 ACTIONS: Final[dict[str, tuple[str, ...]]] = {
     "velocity": ("forward", "left", "up", "yaw_rate"),
     "attitude": ("roll", "pitch", "climb", "yaw_rate"),
@@ -45,13 +45,13 @@ def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
 
     Args:
         feedback: The state.
-        names: Of the numbers, some of :data:`STATE`.
+        names: Names of numbers, from :data:`STATE`.
 
     Returns:
-        The numbers in the order of the names; None if one of them is not known.
+        The numbers in the order of the names; None if one of them is unknown.
 
     Raises:
-        UnknownNameError: There is no such number.
+        UnknownNameError: A name is not in :data:`STATE`.
     """
     row = []
     for name in names:
@@ -72,7 +72,7 @@ def set_point(kind: str, row: Sequence[float]) -> Velocity | Attitude:
         row: Its numbers, in the order of :data:`ACTIONS`.
 
     Raises:
-        UsageError: There are more numbers, or fewer.
+        UsageError: The row has the wrong length.
     """
     names = ACTIONS[kind]
     if len(row) != len(names):

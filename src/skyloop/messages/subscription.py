@@ -1,6 +1,6 @@
-"""Requests of subscribers: the rate of feedback, and the camera, form and rate of video. Pure.
+"""Subscribers' requests: the rate of feedback, and the camera, form and rate of video. Pure.
 
-Each request has one topic, so that equal requests are encoded once for all their subscribers.
+Each request has exactly one topic, so equal requests are encoded once for all their subscribers.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from skyloop.errors import UsageError
 from skyloop.messages.relayed import MAX_PARTS
 
 FEEDBACK: Final = "feedback"
-MIN_HZ: Final = 0.001  #: a sample in a quarter of an hour; the time between two of much less has no end
+MIN_HZ: Final = 0.001  #: one sample in a quarter of an hour; keeps the period finite
 MAX_HZ: Final = 1000.0
 _FEEDBACK_RATE: Final = f"{FEEDBACK}?max_hz="
-TOLERANCE: Final = 0.1  #: of a period: a sample that comes so much too early is in time
+TOLERANCE: Final = 0.1  #: of a period: a sample early by up to this much is still in time
 
 VideoEncoding = Literal["raw", "jpeg", "h264"]
 DEFAULT_QUALITY: Final = 80
-MIN_KBIT_S: Final = 30  #: of an encoded stream
+MIN_KBIT_S: Final = 30  #: of a stream that the proxy encodes
 MAX_KBIT_S: Final = 50_000
 MAX_SUBSCRIBER: Final = 32  #: characters
-MIN_FPS: Final = 0.001  #: a frame in a quarter of an hour; the time between two of much less has no end
+MIN_FPS: Final = 0.001  #: one frame in a quarter of an hour; keeps the period finite
 _ENCODINGS: Final = get_args(VideoEncoding)
 _PREFIX: Final = "video/"
 _STREAM_PREFIX: Final = "stream/"
@@ -35,15 +35,15 @@ _FIELDS: Final = ("encoding", "kbit_s", "max_fps", "part", "quality", "scale", "
 
 @dataclass(frozen=True, slots=True)
 class FeedbackRequest:
-    """Feedback as one consumer wants it.
+    """Feedback as one consumer requests it.
 
-    Two requests that give the same samples are equal and have the same :attr:`topic`.
+    Requests for the same samples are equal and have the same :attr:`topic`.
 
     Raises:
         UsageError: ``max_hz`` is not within :data:`MIN_HZ` and :data:`MAX_HZ`.
     """
 
-    max_hz: float | None = None  #: at most so many samples a second; None: all
+    max_hz: float | None = None  #: most samples a second; None: all
 
     def __post_init__(self) -> None:
         rate = self.max_hz
@@ -51,7 +51,7 @@ class FeedbackRequest:
             known = isinstance(rate, int | float) and not isinstance(rate, bool)
             if not (known and MIN_HZ <= rate <= MAX_HZ):
                 raise UsageError(f"max_hz is {rate!r} and must be from {MIN_HZ} to {MAX_HZ:g} samples a second")
-            # As it is written in a topic, so that both ends have the same request.
+            # As it is written in a topic, so that both ends have an equal request.
             object.__setattr__(self, "max_hz", float(f"{rate:g}"))
 
     @property
@@ -71,27 +71,27 @@ class FeedbackRequest:
 
     @classmethod
     def parse(cls, topic: str) -> Self:
-        """Parse the request of a topic, which must be written as :attr:`topic` writes it.
+        """Parse a topic, which must be written exactly as :attr:`topic` writes it.
 
         So each request has one topic, and is encoded once.
 
         Raises:
-            UsageError: It is not a topic of feedback, or not written that way.
+            UsageError: The topic is not one of feedback, or is written differently.
         """
         if topic == FEEDBACK:
             return cls()
         try:
             if not topic.startswith(_FEEDBACK_RATE):
-                raise ValueError(f"it is {FEEDBACK}, or {_FEEDBACK_RATE} and a number")
+                raise ValueError(f"expected {FEEDBACK}, or {_FEEDBACK_RATE} and a number")
             request = cls(float(topic.removeprefix(_FEEDBACK_RATE)))
         except (ValueError, UsageError) as error:
-            raise UsageError(f"{topic[:100]!r} is no request for feedback: {error}") from None
+            raise UsageError(f"{topic[:100]!r} is not a request for feedback: {error}") from None
         if request.topic != topic:
-            raise UsageError(f"{topic[:100]!r} is no request for feedback as it must be written: {request.topic!r}")
+            raise UsageError(f"{topic[:100]!r} must be written {request.topic!r}")
         return request
 
     def union(self, other: FeedbackRequest) -> FeedbackRequest:
-        """Return the smallest request that gives what either asks for."""
+        """Return the smallest request that covers both."""
         if self.max_hz is None or other.max_hz is None:
             return PLAIN
         return self if self.max_hz >= other.max_hz else other
@@ -102,24 +102,24 @@ PLAIN: Final = FeedbackRequest()
 
 @dataclass(frozen=True, slots=True)
 class VideoRequest:
-    """Frames of one camera, as one consumer wants them.
+    """Frames of one camera as one consumer requests them.
 
-    H.264 comes on a topic of its own, :attr:`stream_topic`.
+    H.264 has its own topic, :attr:`stream_topic`.
 
-    Two requests that give the same frames are equal and have the same :attr:`topic`.
+    Requests for the same frames are equal and have the same :attr:`topic`.
 
     Raises:
-        UsageError: A value is not valid.
+        UsageError: A value is invalid.
     """
 
     camera: str
-    encoding: VideoEncoding = "raw"  #: how the pixels travel where they must be sent: as they are, as JPEG or H.264
+    encoding: VideoEncoding = "raw"  #: encoding of the pixels where they must be sent: unchanged, JPEG or H.264
     quality: int = DEFAULT_QUALITY  #: of a JPEG, 1 to 100
-    max_fps: float | None = None  #: at most so many frames in a second
-    scale: float = 1.0  #: width and height times this, above 0 and up to 1
-    part: tuple[int, int] | None = None  #: (k, n): only frames whose number leaves k when divided by n
-    kbit_s: int | None = None  #: of H.264, on average; None: as the vehicle sent it, or what the path carries
-    subscriber: str = ""  #: of H.264 whose rate follows the path to one subscriber: a name that no other has
+    max_fps: float | None = None  #: most frames a second
+    scale: float = 1.0  #: factor of width and height, above 0 and up to 1
+    part: tuple[int, int] | None = None  #: (k, n): only frames whose number modulo n is k
+    kbit_s: int | None = None  #: average of H.264; None: as the vehicle sent it, or as much as the path carries
+    subscriber: str = ""  #: for H.264 whose rate follows the path to one subscriber: its unique name
 
     def __post_init__(self) -> None:
         if not self.camera:
@@ -138,21 +138,20 @@ class VideoRequest:
             raise UsageError(f"part is {self.part!r} and must be (k, n) with 0 <= k < n <= {MAX_PARTS}")
         self._check_stream()
         if self.encoding != "jpeg" and self.quality != DEFAULT_QUALITY:
-            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # it means nothing: equal requests stay equal
+            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # unused here; the default keeps equal requests equal
         if self.part == (0, 1):
             object.__setattr__(self, "part", None)
 
     def _check_stream(self) -> None:
         if self.encoding != "h264":
             if self.kbit_s is not None or self.subscriber:
-                raise UsageError(f'kbit_s and subscriber are of encoding="h264", and the encoding is {self.encoding!r}')
+                raise UsageError(f'kbit_s and subscriber need encoding="h264", and the encoding is {self.encoding!r}')
             return
         if self.part is not None:
-            raise UsageError('part is not possible with encoding="h264": each of its frames builds on the one before')
+            raise UsageError('part is not possible with encoding="h264": each of its frames refers to the previous one')
         if self.kbit_s is not None and not (_is_whole(self.kbit_s) and MIN_KBIT_S <= self.kbit_s <= MAX_KBIT_S):
             raise UsageError(
-                f"kbit_s is {self.kbit_s!r} and must be a whole number of kilobits a second "
-                f"from {MIN_KBIT_S} to {MAX_KBIT_S}"
+                f"kbit_s is {self.kbit_s!r} and must be a whole number of kbit/s from {MIN_KBIT_S} to {MAX_KBIT_S}"
             )
         if self.subscriber and not re.fullmatch(rf"[A-Za-z0-9_-]{{1,{MAX_SUBSCRIBER}}}", self.subscriber):
             raise UsageError(
@@ -161,7 +160,7 @@ class VideoRequest:
 
     @property
     def variant(self) -> str:
-        """What follows the ``?`` of the topic; empty if the frames are to come as they are."""
+        """The part after the ``?`` of the topic; empty for unchanged frames."""
         return self._variant("" if self.encoding == "raw" else self.encoding)
 
     def _variant(self, encoding: str) -> str:
@@ -184,45 +183,45 @@ class VideoRequest:
 
     @property
     def stream_topic(self) -> str:
-        """The topic on which such H.264 comes as it is encoded, e.g. ``stream/front?kbit_s=500``.
+        """The topic of the request's H.264, e.g. ``stream/front?kbit_s=500``.
 
-        Without options it is what the vehicle itself encoded.
+        Without options it is the vehicle's own stream.
         """
         variant = self._variant("")
         return f"{_STREAM_PREFIX}{self.camera}" + (f"?{variant}" if variant else "")
 
     @property
     def plain(self) -> VideoRequest:
-        """The request for all frames of the same camera, as they are."""
+        """The request for all frames of the same camera, unchanged."""
         return VideoRequest(self.camera)
 
     @classmethod
     def parse(cls, topic: str) -> VideoRequest:
-        """Parse the request of a topic.
+        """Parse a topic of video.
 
         Raises:
-            UsageError: It is not a topic of a camera's frames.
+            UsageError: The topic is not one of a camera's frames.
         """
         prefix = _STREAM_PREFIX if topic.startswith(_STREAM_PREFIX) else _PREFIX
         camera, _, variant = topic.removeprefix(prefix).partition("?")
         if not topic.startswith(prefix) or not camera:
-            raise UsageError(f"{topic[:100]!r} is no topic of a camera's frames: it looks like video/front")
+            raise UsageError(f"{topic[:100]!r} is not a topic of a camera's frames, such as video/front")
         request = cls(camera, encoding="h264") if prefix == _STREAM_PREFIX else cls(camera)
         try:
             for field, text in parse_qsl(variant, keep_blank_values=True, strict_parsing=bool(variant)):
                 request = _with(request, field, unquote(text))
         except ValueError as error:
-            raise UsageError(f"{topic[:100]!r} is no request for video: {error}") from None
+            raise UsageError(f"{topic[:100]!r} is not a request for video: {error}") from None
         return request
 
 
 class FrameFilter:
-    """Selects the frames of one camera that a request is for, by their numbers and times of capture.
+    """Selects a request's frames from those of one camera, by number and capture time.
 
     It keeps state, so each stream of frames needs its own.
 
     Args:
-        request: Its ``part`` and ``max_fps`` count.
+        request: Only its ``part`` and ``max_fps`` count.
     """
 
     def __init__(self, request: VideoRequest) -> None:
@@ -230,11 +229,11 @@ class FrameFilter:
         self._rate = RateLimiter(request.max_fps)
 
     def wants(self, seq: int, captured_ns: int) -> bool:
-        """Return whether a frame is wanted. Call it once for each frame, in order.
+        """Return whether the request includes this frame. Call it once for each frame, in order.
 
         Args:
             seq: The frame's number.
-            captured_ns: When it was captured, on any one clock [ns].
+            captured_ns: Its capture time, on any one clock [ns].
         """
         if self._part is not None and seq % self._part[1] != self._part[0]:
             return False
@@ -242,31 +241,31 @@ class FrameFilter:
 
 
 class RateLimiter:
-    """Selects samples of one series so that on average no more than so many a second are left.
+    """Thins out one series of samples to an average rate.
 
     It keeps state, so each series and each consumer needs its own.
     """
 
     def __init__(self, max_hz: float | None) -> None:
-        """Start with the first sample in time.
+        """Keep the first sample that arrives.
 
         Args:
-            max_hz: Most samples a second, above 0; None: all.
+            max_hz: Maximum rate, above 0; None: keep all.
         """
         self.max_hz = math.inf if max_hz is None else max_hz
         self._due_ns: int | None = None
 
     @property
     def max_hz(self) -> float:
-        """Most samples a second that are in time; infinity: all."""
+        """Maximum rate; infinity: keep all samples."""
         return NS_PER_S / self._period_ns if self._period_ns else math.inf
 
     @max_hz.setter
     def max_hz(self, max_hz: float) -> None:
-        self._period_ns = round(NS_PER_S / max_hz)  # 0: every sample is in time
+        self._period_ns = round(NS_PER_S / max_hz)  # 0: keep every sample
 
     def in_time(self, at_ns: int) -> bool:
-        """Return whether a sample is to be kept. Call it once for each sample, in order.
+        """Return whether to keep a sample. Call it once for each sample, in order.
 
         Args:
             at_ns: Its time, on any one clock.
@@ -274,7 +273,7 @@ class RateLimiter:
         period_ns, due_ns = self._period_ns, self._due_ns
         if not period_ns:
             return True
-        # A time long before the last one is of another run of the source, and restarts the count.
+        # A time long before the last one belongs to another run of the source: restart.
         if due_ns is None or at_ns < due_ns - 2 * period_ns or at_ns >= due_ns + period_ns:
             self._due_ns = at_ns + period_ns
             return True
@@ -285,7 +284,7 @@ class RateLimiter:
 
 
 def _with(request: VideoRequest, field: str, text: str) -> VideoRequest:
-    """The request with one more field, given as text. Raises ``ValueError``."""
+    """Return the request with one more field, given as text. Raises ``ValueError``."""
     if field == "encoding" and text in _ENCODINGS and request.encoding != "h264":
         return replace(request, encoding=text)  # type: ignore[arg-type]
     if field in ("quality", "kbit_s"):
@@ -297,7 +296,7 @@ def _with(request: VideoRequest, field: str, text: str) -> VideoRequest:
     if field == "part":
         k, _, n = text.partition("/")
         return replace(request, part=(int(k), int(n)))
-    raise ValueError(f"{field}={text[:40]} is unknown; known are {', '.join(_FIELDS)}")
+    raise ValueError(f"{field}={text[:40]} is unknown; known fields are {', '.join(_FIELDS)}")
 
 
 def _is_number(value: object) -> bool:

@@ -1,16 +1,16 @@
-"""The contract that every transport keeps.
+"""The contract of every transport.
 
 A transport carries whole packets between one proxy (the *transport server*) and any number of applications (*transport
-clients*). It knows packets and topics, but not what they mean. An implementation passes the tests of
+clients*). It knows packets and topics, but not their meaning. An implementation passes the tests of
 :mod:`skyloop.transport.conformance`.
 
-- No call ever blocks on the other end. A packet that does not fit now is not sent, and the caller gets False.
-- A packet arrives whole or not at all. Order is kept within one connection. A packet has 1 to :data:`MAX_PACKET`
-  bytes; sending any other raises :class:`skyloop.errors.UsageError`.
-- Handlers are called on the transport's receiving threads, one call at a time per end, so they must return quickly. A
-  handler that raises ends its own connection, not the transport.
-- When one end goes away, for whatever reason, the other one's handler is called once, with ``peer_left`` or
-  ``closed``.
+- No call ever blocks on the other end. A packet that does not fit at that moment is not sent, and the caller gets
+  False.
+- A packet arrives whole or not at all. Packets of one connection keep their order. A packet has 1 to
+  :data:`MAX_PACKET` bytes; sending any other raises :class:`skyloop.errors.UsageError`.
+- Handlers run on the transport's receiving threads, one call at a time per end, so they must return quickly. A handler
+  that raises ends its own connection, not the transport.
+- When one end goes away, for whatever reason, the other one's handler is called once: ``peer_left`` or ``closed``.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from skyloop.errors import UsageError
 from skyloop.messages import FrameHeader
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
 
-#: What a client can ask to be sent. ``feedback`` and ``events`` may be left out by an application that needs none.
+#: The topics of a client. An application that needs neither ``feedback`` nor ``events`` need not subscribe to them.
 FEEDBACK = "feedback"
 EVENTS = "events"
-COMMANDS = "commands"  #: echoes (Applied) of all commands that the proxy received
+COMMANDS = "commands"  #: echoes (Applied) of all commands received by the proxy
 ANNOTATIONS = "annotations"
-LOGS = "logs"  #: what applications log (LogEntry)
-OVERVIEW = "overview"  #: a row of each vehicle of the proxy's process, once a second (Overview)
+LOGS = "logs"  #: log entries of applications (LogEntry)
+OVERVIEW = "overview"  #: one row for each vehicle of the proxy's process, once a second (Overview)
 MAX_TOPIC = 200  #: characters
-MAX_SUBSCRIPTIONS = 64  #: topics of one connection at a time
-RESULTS = "results"  #: what all processors find (ProcessorResult)
+MAX_SUBSCRIPTIONS = 64  #: topics of one connection at the same time
+RESULTS = "results"  #: results of all processors (ProcessorResult)
 MAX_PACKET = HEADER_SIZE + MAX_BODY  #: bytes
 
 
@@ -52,19 +52,19 @@ def stream(camera: str) -> str:
 
 
 def results(processor: str) -> str:
-    """Return the topic of what one processor finds (ProcessorResult)."""
+    """Return the topic of one processor's results (ProcessorResult)."""
     return f"{RESULTS}/{processor}"
 
 
 _UINT8 = np.dtype(np.uint8)
 
-#: Bytes of a frame: shape (size,), uint8, not writeable. They stay as they are for as long as any view of them lives.
+#: Bytes of a frame: shape (size,), uint8, not writeable. They stay unchanged while any view of them exists.
 Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """An application's connection as the transport server sees it."""
+    """The transport server's view of an application's connection."""
 
     id: int  #: unique in this run of the transport server, from 1
     address: str  #: for people: process id and user, or host and port
@@ -80,48 +80,48 @@ class ServerHandler(Protocol):
     """
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection; nothing was received from it yet.
+        """Handle a new connection, before its first packet.
 
         Args:
-            peer: The connection; the same object or an equal one identifies it in all later calls.
+            peer: The connection; this object or an equal one identifies it in all later calls.
         """
 
     def packet(self, peer: Peer, packet: bytes) -> None:
         """Handle a packet from an application.
 
         Args:
-            peer: Who sent it.
-            packet: 1 to :data:`MAX_PACKET` bytes. They may be anything: the transport does not look inside.
+            peer: The sender.
+            packet: 1 to :data:`MAX_PACKET` bytes. The transport does not check their content.
         """
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Handle the refusal of a packet that the application's keys give it no right to send; it is not delivered.
+        """Handle the refusal of a packet that the application's keys do not allow; it is not delivered.
 
         Args:
-            peer: Who sent it; :data:`NOBODY` where no connection is known.
-            reason: Why it was refused, for people.
+            peer: The sender; :data:`NOBODY` where the connection is unknown.
+            reason: The reason, for people.
         """
 
     def topic_problem(self, topic: str) -> str:
-        """Say why nobody can subscribe to a topic.
+        """Return why a topic can't be subscribed to.
 
-        It may be called on any thread, also while another callback runs, and must answer at once.
+        May be called on any thread, also while another callback runs, and must answer at once.
 
         Args:
-            topic: The name that an application asks for.
+            topic: The requested name.
 
         Returns:
-            Why there is no such topic, naming those that there are; empty if it exists.
+            Why there is no such topic, with the names of those that exist; empty if it exists.
         """
 
     def malformed(self, peer: Peer, reason: str) -> None:
-        """Handle a request to the transport itself that can't be met.
+        """Handle an invalid request to the transport itself.
 
-        The application asked for a topic that does not exist, or for more topics than it may have.
+        The application requested an unknown topic, or more topics than allowed.
 
         Args:
-            peer: Who asked.
-            reason: What was wrong, for people.
+            peer: The requesting application.
+            reason: The problem, for people.
         """
 
     def peer_left(self, peer: Peer, reason: str) -> None:
@@ -129,7 +129,7 @@ class ServerHandler(Protocol):
 
         Args:
             peer: The connection.
-            reason: Why it ended, for people.
+            reason: The reason, for people.
         """
 
 
@@ -147,7 +147,7 @@ class TransportServer(ABC):
             handler: Called on the transport's receiving threads, one call at a time.
 
         Raises:
-            NameTakenError: A running proxy uses the name.
+            NameTakenError: A running proxy already uses the name.
         """
 
     @abstractmethod
@@ -163,7 +163,7 @@ class TransportServer(ABC):
             packet: 1 to :data:`MAX_PACKET` bytes.
 
         Returns:
-            Whether it was handed over; False if the application's buffer is full or the application is gone.
+            True if the packet was handed over; False if the application's buffer is full or it is gone.
 
         Raises:
             UsageError: The packet is empty or too large.
@@ -178,7 +178,7 @@ class TransportServer(ABC):
             packet: 1 to :data:`MAX_PACKET` bytes.
 
         Returns:
-            The number of subscribers to which it could *not* be handed over.
+            The number of subscribers that did *not* get it.
 
         Raises:
             UsageError: The packet is empty or too large.
@@ -190,56 +190,56 @@ class TransportServer(ABC):
 
         Args:
             header: The frame's header.
-            pixels: ``header.size`` bytes, dtype uint8, in any shape, C-contiguous; may be reused when the call returns.
+            pixels: ``header.size`` bytes, dtype uint8, any shape, C-contiguous; may be reused after the call.
 
         Returns:
-            The number of subscribers to which it could *not* be handed over.
+            The number of subscribers that did *not* get it.
 
         Raises:
-            UsageError: The pixels are not as in the header.
+            UsageError: The pixels do not match the header.
         """
 
     @abstractmethod
     def subscribers(self, topic: str) -> int:
-        """Return how many applications subscribed to a topic; what nobody subscribed to need not be made."""
+        """Return the number of a topic's subscribers; topics without any need not be produced."""
 
-    def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (all are let stay)
-        """Decide whether an application that has sent who it is may stay: some places are kept for pilots.
+    def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (the default admits all)
+        """Decide whether an application may stay after it has identified itself: some places are reserved for pilots.
 
-        The default lets every application stay.
+        The default admits every application.
 
         Args:
             peer: The application's connection.
-            pilot: Whether it stated that it is a pilot.
+            pilot: Whether it connects as a pilot.
 
         Returns:
-            Why it can't stay; empty if it can.
+            Why it may not stay; empty if it may.
         """
         return ""
 
     @abstractmethod
     def disconnect(self, peer: Peer, reason: str) -> None:
-        """End one connection; its ``peer_left`` follows with this reason. Does nothing if the connection is gone.
+        """End one connection; ``peer_left`` follows with this reason. Does nothing if it is already gone.
 
         Args:
             peer: The application's connection.
-            reason: Why, for people; both ends' handlers get it.
+            reason: The reason, for people; both ends' handlers get it.
         """
 
     @property
     def counters(self) -> dict[str, float]:
-        """What this end has counted since it started, by dotted name, for the proxy's statistics. Any thread."""
+        """Return this end's counters since its start, by dotted name, for the proxy's statistics. Any thread."""
         return {}
 
     @property
     def restricted(self) -> bool:
-        """Whether an application that may connect here may be kept from other proxies, as by keys that name drones."""
+        """Whether access here may not imply access to other proxies, as with keys that name drones."""
         return False
 
     @property
     @abstractmethod
     def address(self) -> str:
-        """Where this end can be reached, for people."""
+        """The address of this end, for people."""
 
 
 class ClientHandler(Protocol):
@@ -256,21 +256,21 @@ class ClientHandler(Protocol):
 
         Args:
             header: The frame's header.
-            pixels: ``header.size`` bytes, shape (size,), dtype uint8, not writeable. They, or any view of them, may be
-                kept for as long as needed: that costs only this application.
-            topic: The topic by which the frame was asked for, where :attr:`TransportClient.variants` is true.
+            pixels: ``header.size`` bytes, shape (size,), dtype uint8, not writeable. The handler may keep them, or any
+                view of them, for as long as it likes: that costs only this application.
+            topic: The subscribed topic that the frame belongs to, where :attr:`TransportClient.variants` is true.
         """
 
     def closed(self, reason: str) -> None:
-        """Handle the end of the connection, by whichever end; called once, as the last callback.
+        """Handle the end of the connection, whichever end closed it. Called once, as the last callback.
 
         Args:
-            reason: Why it ended, for people.
+            reason: The reason, for people.
         """
 
 
 class TransportClient(ABC):
-    """An application's side: one connection, made by a :data:`Dialer` and never reused after it closed."""
+    """An application's side: one connection, made by a :data:`Dialer` and never reused after closing."""
 
     @abstractmethod
     def send(self, packet: bytes) -> bool:
@@ -280,7 +280,7 @@ class TransportClient(ABC):
             packet: 1 to :data:`MAX_PACKET` bytes.
 
         Returns:
-            Whether it was handed over.
+            True if the packet was handed over.
 
         Raises:
             UsageError: The packet is empty or too large.
@@ -302,61 +302,61 @@ class TransportClient(ABC):
     def close(self) -> None:
         """End the connection. Idempotent.
 
-        The handler's ``closed`` is called before this returns, unless this runs on the receiving thread.
+        The handler's ``closed`` runs before this returns, except on the receiving thread.
         """
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:  # noqa: ARG002
-        """Receive on the calling thread while it waits, so that what it waits for wakes one thread and not two.
+        """Receive on the calling thread while it waits, so that a sample wakes one thread and not two.
 
-        The handler is called on this thread meanwhile, still one call at a time. The default can't.
+        Meanwhile the handler runs on this thread, still one call at a time. The default does not support it.
 
         Args:
-            ready: Whether the wait is over; called on this thread after each packet, and some times a second.
-            wake: Called once, on another thread, when trying again may succeed; not if this returns True.
+            ready: Returns whether the wait is over; called on this thread after each packet and several times a second.
+            wake: Called once, on another thread, when a retry may succeed; not if this returns True.
             timeout_s: How long to receive [s]; may take 50 ms longer.
 
         Returns:
-            Whether this thread did the receiving; False if another one does, and the caller waits as ever.
+            True if this thread received; False if another one does, and the caller must wait as usual.
         """
         return False
 
     @property
     def receiving(self) -> bool:
-        """Whether the calling thread has been lent to :meth:`lead`, and must not wait for what it would receive."""
+        """Whether the calling thread is inside :meth:`lead` and must not wait for its own packets."""
         return False
 
     @property
     @abstractmethod
     def same_clock(self) -> bool:
-        """Whether both ends read the same monotonic clock (one host), so that no offset has to be estimated.
+        """Whether both ends read the same monotonic clock (one host), so that the offset is zero.
 
-        An application also checks what the proxy's Welcome says, for a host can have several time namespaces.
+        An application also checks the clock named in the proxy's ``Welcome``: a host can have several time namespaces.
         """
 
     @property
     def variants(self) -> bool:
-        """Whether frames come in the form that each topic asks for (:class:`skyloop.messages.VideoRequest`).
+        """Whether frames arrive in the form that each topic requests (:class:`skyloop.messages.VideoRequest`).
 
-        Where it is false, all frames come as they are, and only the plain topic of a camera may be subscribed to.
+        Otherwise all frames arrive unchanged, and only the plain topic of a camera is available.
         """
         return False
 
     @property
     def excused_s(self) -> float:
-        """For how much longer than usual the other end may be silent before the link counts as lost [s]."""
+        """How much longer than usual the other end may be silent before the link counts as lost [s]."""
         return 0.0
 
     @property
     @abstractmethod
     def address(self) -> str:
-        """What this end is connected to, for people."""
+        """The address that this end is connected to, for people."""
 
 
-#: Makes a connection and begins to deliver to the handler. Raises :class:`skyloop.errors.LinkError` when it cannot.
+#: Connects and starts to deliver to the handler. Raises :class:`skyloop.errors.LinkError` if it cannot.
 Dialer = Callable[[ClientHandler], TransportClient]
 
 
-#: What can be the name of a proxy: one of a socket's file and of one chunk of a network key.
+#: Valid names of a proxy: usable as a socket's file name and as one chunk of a network key.
 NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 
 
@@ -367,7 +367,7 @@ def check_name(name: str) -> None:
         name: 1 to 48 lower-case letters, digits, ``_``, ``-`` and ``.``, the first one a letter or digit.
 
     Raises:
-        UsageError: It is anything else.
+        UsageError: The name is invalid.
     """
     if not NAME.fullmatch(name):
         raise UsageError(
@@ -383,7 +383,7 @@ def check_packet(packet: bytes) -> None:
         packet: 1 to :data:`MAX_PACKET` bytes.
 
     Raises:
-        UsageError: It is empty or too large.
+        UsageError: The packet is empty or too large.
     """
     if not 0 < len(packet) <= MAX_PACKET:
         raise UsageError(f"a packet of {len(packet)} bytes cannot be sent; it must have 1 to {MAX_PACKET}")
@@ -396,19 +396,19 @@ def check_topic(topic: str) -> None:
         topic: 1 to :data:`MAX_TOPIC` characters.
 
     Raises:
-        UsageError: It is empty or too long.
+        UsageError: The name is empty or too long.
     """
     if not 0 < len(topic) <= MAX_TOPIC:
         raise UsageError(f"the topic {topic[:100]!r} has {len(topic)} characters; it must have 1 to {MAX_TOPIC}")
 
 
 def too_many_topics(topic: str) -> str:
-    """Return why an application that has :data:`MAX_SUBSCRIPTIONS` topics gets no further one."""
-    return f"{topic[:64]!r} would be one more than the {MAX_SUBSCRIPTIONS} topics that a connection may subscribe to"
+    """Return why an application with :data:`MAX_SUBSCRIPTIONS` topics gets no more."""
+    return f"{topic[:64]!r} exceeds the {MAX_SUBSCRIPTIONS} topics that a connection may subscribe to"
 
 
 def check_frame(header: FrameHeader, pixels: Pixels) -> None:
-    """Check that pixels are as in their header.
+    """Check that pixels match their header.
 
     Args:
         header: The frame's header.

@@ -1,4 +1,4 @@
-"""Several transport servers as one, for a proxy that is reached on its host and over the network at the same time."""
+"""One transport server made of several, for a proxy that serves its host and the network at the same time."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ from skyloop.transport.priority import PriorityLock, is_command
 
 
 class _Member(NamedTuple):
-    """The end by which an application came, and its peer at that end."""
+    """The end that an application connected to, and its peer there."""
 
     end: TransportServer
     peer: Peer
 
 
 class CompositeServer(TransportServer):
-    """One transport server made of several, which numbers its peers over all of them.
+    """One transport server made of several, with its own numbers for their peers.
 
-    The ends take turns at the handler, so that it gets one call at a time as the contract says: an end that brings a
-    command first, the others in the order of their arrival.
+    The handler gets one call at a time, as the contract demands: an end that brings a command goes first, the others in
+    order of arrival.
 
     Args:
-        ends: The transport servers, the nearest first; at least one.
+        ends: The transport servers, nearest first; at least one.
 
     Raises:
-        UsageError: There are no ends.
+        UsageError: ``ends`` is empty.
     """
 
     def __init__(self, ends: Sequence[TransportServer]) -> None:
         if not ends:
-            raise UsageError("a transport server of several needs at least one")
+            raise UsageError("a composite transport server needs at least one end")
         self._ends = tuple(ends)
         self.lock = PriorityLock()  #: the thread that holds it may call the handler
         self._members: dict[int, _Member] = {}  # by our number
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
-        """Begin to accept connections at all ends, or at none.
+        """Start to accept connections at all ends, or at none.
 
-        What an end's own ``start`` raises is passed on after the ends before it were stopped.
+        If an end's ``start`` raises, the ends before it are stopped and the error is re-raised.
 
         Args:
             handler: Called by one end at a time, on that end's receiving threads.
@@ -61,12 +61,12 @@ class CompositeServer(TransportServer):
     def stop(self) -> None:
         """Stop all ends at the same time, and wait for them unless called from a handler.
 
-        A handler's caller holds the lock that an end which stops waits for.
+        Waiting inside a handler would deadlock: its caller holds the lock that the stopping end waits for.
         """
         threads = [threading.Thread(target=end.stop, name="skyloop-stop", daemon=True) for end in self._ends]
         for thread in threads:
             thread.start()
-        if not self.lock.held:  # else an end would wait for a lock that its stopper holds
+        if not self.lock.held:  # otherwise an end would wait for the lock that this thread holds
             for thread in threads:
                 thread.join()
 
@@ -112,14 +112,14 @@ class CompositeServer(TransportServer):
         return ", ".join(end.address for end in self._ends)
 
     def enter(self, end: TransportServer, peer: Peer) -> Peer:
-        """Give an end's peer a number of this server. The caller holds the lock.
+        """Register an end's peer under a number of this server. The caller holds the lock.
 
         Args:
-            end: Where the application connected.
-            peer: The application, as that end knows it.
+            end: The end that the application connected to.
+            peer: The application's peer at that end.
 
         Returns:
-            The peer for the handler.
+            The peer to pass to the handler.
         """
         self._last_id += 1
         ours = Peer(self._last_id, peer.address)
@@ -132,14 +132,14 @@ class CompositeServer(TransportServer):
 
 
 class _EndHandler:
-    """The handler of one end: passes calls on under the composite's lock, with the composite's peers."""
+    """Handler of one end: forwards calls under the composite's lock, with the composite's peers."""
 
     def __init__(self, whole: CompositeServer, end: TransportServer, handler: ServerHandler) -> None:
         self._whole = whole
         self._lock = whole.lock
         self._end = end
         self._handler = handler
-        self._peers: dict[int, Peer] = {}  # ours, by the end's number
+        self._peers: dict[int, Peer] = {}  # our peers, by the end's number
 
     def peer_joined(self, peer: Peer) -> None:
         with self._lock:

@@ -1,4 +1,4 @@
-"""The conformance tests of transports: subclass :class:`TransportSuite` in your tests and give it your two ends.
+"""Conformance tests for transports: subclass :class:`TransportSuite` in your tests and give it your two ends.
 
 ::
 
@@ -50,22 +50,22 @@ from skyloop.transport.testing import (
 class TransportSuite(ABC):
     """The contract of :mod:`skyloop.transport.base` as tests.
 
-    A subclass implements :meth:`make_server` and :meth:`dialer`; pytest collects the tests that it inherits.
+    A subclass implements :meth:`make_server` and :meth:`dialer`; pytest collects the inherited tests.
     """
 
     @abstractmethod
     def make_server(self) -> TransportServer:
-        """Return a new transport server that is not started."""
+        """Return a new transport server, not yet started."""
 
     @abstractmethod
     def dialer(self, server: TransportServer) -> Dialer:
         """Return a dialer that connects to a transport server.
 
         Args:
-            server: An end that :meth:`make_server` returned; it may be not started, or stopped.
+            server: An end from :meth:`make_server`, whether started or not.
 
         Returns:
-            A dialer that raises :class:`skyloop.errors.LinkError` or :class:`skyloop.errors.UnknownNameError` where the
+            A dialer that raises :class:`skyloop.errors.LinkError` or :class:`skyloop.errors.UnknownNameError` while the
             server does not run.
         """
 
@@ -86,7 +86,7 @@ class TransportSuite(ABC):
         Args:
             server: A started server.
             log: The log of its handler.
-            *topics: What the client subscribes to.
+            *topics: The client's topics.
             keep: Whether the client's log keeps frames (see :class:`skyloop.transport.testing.ClientLog`).
         """
         client_log = ClientLog(keep=keep)
@@ -103,7 +103,7 @@ class TransportSuite(ABC):
             client_log.gate.set()
             client.close()
             if len(log.joined) > known:
-                wait_until(lambda: log.joined[known] in [peer for peer, _ in log.left], "the server knows that it left")
+                wait_until(lambda: log.joined[known] in [peer for peer, _ in log.left], "the server saw it leave")
 
     # --- packets ---
 
@@ -112,11 +112,11 @@ class TransportSuite(ABC):
         with self.serving() as (server, log), self.connected(server, log) as app:
             for packet in sent:
                 wait_until(partial(app.client.send, packet), "the packet fits")
-            wait_until(lambda: len(log.packets) == len(sent), "all packets came up")
+            wait_until(lambda: len(log.packets) == len(sent), "the server got all packets")
             assert log.from_peer(app.peer) == sent
             for packet in sent:
                 wait_until(partial(server.send, app.peer, packet), "the packet fits")
-            wait_until(lambda: len(app.log.packets) == len(sent), "all packets came down")
+            wait_until(lambda: len(app.log.packets) == len(sent), "the client got all packets")
             assert app.log.packets == sent
 
     def test_garbage_passes_through_untouched(self) -> None:
@@ -125,7 +125,7 @@ class TransportSuite(ABC):
         with self.serving() as (server, log), self.connected(server, log) as app:
             for packet in sent:
                 wait_until(partial(app.client.send, packet), "the packet fits")
-            wait_until(lambda: len(log.packets) == len(sent), "all packets came")
+            wait_until(lambda: len(log.packets) == len(sent), "all packets arrived")
             assert log.from_peer(app.peer) == sent
 
     def test_packets_that_cannot_be_sent_are_refused(self) -> None:
@@ -135,7 +135,7 @@ class TransportSuite(ABC):
                 raises(UsageError, partial(server.send, app.peer, wrong))
                 raises(UsageError, partial(server.publish, FEEDBACK, wrong))
             assert app.client.send(b"still here")
-            wait_until(lambda: log.packets, "a good packet came")
+            wait_until(lambda: log.packets, "a good packet arrived")
             assert log.from_peer(app.peer) == [b"still here"]
 
     def test_each_application_has_its_own_connection(self) -> None:
@@ -144,7 +144,7 @@ class TransportSuite(ABC):
             assert one.client.send(b"from one")
             assert two.client.send(b"from two")
             assert server.send(two.peer, b"to two")
-            wait_until(lambda: len(log.packets) == 2 and two.log.packets, "all packets came")
+            wait_until(lambda: len(log.packets) == 2 and two.log.packets, "all packets arrived")
             assert log.from_peer(one.peer) == [b"from one"]
             assert two.log.packets == [b"to two"]
             assert one.log.packets == []
@@ -162,7 +162,7 @@ class TransportSuite(ABC):
                 thread.start()
             for thread in threads:
                 thread.join()
-            wait_until(lambda: len(log.packets) == 200, "all packets came")
+            wait_until(lambda: len(log.packets) == 200, "all packets arrived")
             for number in range(4):
                 assert [p[1] for p in log.from_peer(app.peer) if p[0] == number] == list(range(50))
 
@@ -176,15 +176,15 @@ class TransportSuite(ABC):
         ):
             assert server.publish(FEEDBACK, b"1") == 0
             assert server.publish("nobody", b"x") == 0
-            wait_until(lambda: one.log.packets, "it arrived before the subscription, and is not sent again")
+            wait_until(lambda: one.log.packets, "a packet published before the subscription is not sent later")
             two.client.subscribe(FEEDBACK)
             wait_until(lambda: server.subscribers(FEEDBACK) == 2, "both are subscribed")
             assert server.publish(FEEDBACK, b"2") == 0
-            wait_until(lambda: len(one.log.packets) == 2, "it came before it is wanted no longer")
+            wait_until(lambda: len(one.log.packets) == 2, "it arrived before the client unsubscribed")
             one.client.subscribe(FEEDBACK, False)
-            wait_until(lambda: server.subscribers(FEEDBACK) == 1, "one is not")
+            wait_until(lambda: server.subscribers(FEEDBACK) == 1, "one has unsubscribed")
             assert server.publish(FEEDBACK, b"3") == 0
-            wait_until(lambda: len(one.log.packets) == 2 and len(two.log.packets) == 2, "all packets came")
+            wait_until(lambda: len(one.log.packets) == 2 and len(two.log.packets) == 2, "all packets arrived")
             assert one.log.packets == [b"1", b"2"]
             assert two.log.packets == [b"2", b"3"]
 
@@ -199,7 +199,7 @@ class TransportSuite(ABC):
         with self.serving() as (server, log), self.connected(server, log, video(FRONT), keep=False) as app:
             for seq in range(60):
                 server.publish_frame(header(seq), picture(header(seq)))
-                wait_until(partial(app.log.saw, seq), "the frame came")
+                wait_until(partial(app.log.saw, seq), "the frame arrived")
             assert app.log.torn == []
 
     def test_frames_are_flat_read_only_and_of_any_size(self) -> None:
@@ -208,8 +208,8 @@ class TransportSuite(ABC):
             for head in heads:
                 pixels = picture(head).reshape(head.height, head.width, 3)
                 server.publish_frame(head, pixels)
-                pixels[:] = 0  # it is the caller's again
-                wait_until(partial(app.log.saw, head.seq), "the frame came")
+                pixels[:] = 0  # the caller may reuse it
+                wait_until(partial(app.log.saw, head.seq), "the frame arrived")
             for head, (got, pixels) in zip(heads, app.log.frames, strict=True):
                 assert got == head
                 assert pixels.ndim == 1
@@ -229,9 +229,9 @@ class TransportSuite(ABC):
             views: dict[int, Pixels] = {}
             for seq in range(40):
                 server.publish_frame(header(seq), picture(header(seq)))
-                wait_until(partial(app.log.saw, seq), "the frame came, whatever is held")
+                wait_until(partial(app.log.saw, seq), "the frame arrived, whatever views are kept")
                 head, pixels = app.log.frames.pop()
-                if seq % 4 == 0:  # a view of a view, and nothing else, keeps it
+                if seq % 4 == 0:  # only a view of a view keeps it alive
                     views[head.seq] = pixels.reshape(head.height, head.width, 3)[::2, 1::2]
                 del pixels
             app.client.close()
@@ -251,17 +251,17 @@ class TransportSuite(ABC):
                 packet = seq.to_bytes(4, "little") * 75
                 missed += server.publish(FEEDBACK, packet)
                 missed += server.publish_frame(header(seq), picture(header(seq)))
-                wait_until(partial(fast.log.saw, seq), "the fast reader has the frame")
+                wait_until(partial(fast.log.saw, seq), "the fast reader got the frame")
             assert fast.log.torn == []
-            wait_until(lambda: len(fast.log.packets) == 800, "the packets came, which may travel by another way")
+            wait_until(lambda: len(fast.log.packets) == 800, "the packets arrived, possibly over another channel")
             assert [int.from_bytes(p[:4], "little") for p in fast.log.packets] == list(range(800))
-            assert missed > 0, "what waits for a stalled reader must be bounded"
+            assert missed > 0, "the backlog of a stalled reader must be bounded"
             slow.log.gate.set()
-            wait_until(lambda: server.publish(FEEDBACK, b"new") == 0, "it is served again")
-            wait_until(lambda: slow.log.packets[-1:] == [b"new"], "the packet came")
+            wait_until(lambda: server.publish(FEEDBACK, b"new") == 0, "the slow reader is served again")
+            wait_until(lambda: slow.log.packets[-1:] == [b"new"], "the packet arrived")
             last = header(800)
-            wait_until(lambda: server.publish_frame(last, picture(last)) == 0, "it is sent frames again")
-            wait_until(lambda: slow.log.seen[-1:] == [800], "the newest frame came")
+            wait_until(lambda: server.publish_frame(last, picture(last)) == 0, "the slow reader gets frames again")
+            wait_until(lambda: slow.log.seen[-1:] == [800], "the newest frame arrived")
             for head, pixels in slow.log.frames:
                 assert np.array_equal(pixels, picture(head)), head.seq
 
@@ -272,7 +272,7 @@ class TransportSuite(ABC):
             assert missed[0] == 0
             assert missed[-1] == 1
             slow.log.gate.set()
-            wait_until(lambda: slow.log.seen[-1:] == [29], "the newest came without a further one being published")
+            wait_until(lambda: slow.log.seen[-1:] == [29], "the newest frame arrived without a later one")
             assert slow.log.seen == sorted(slow.log.seen)
 
     # --- ends ---
@@ -285,7 +285,7 @@ class TransportSuite(ABC):
     def dial_or_link_error(self, server: TransportServer) -> None:
         """Dial, and turn a ``UsageError`` into a ``LinkError``.
 
-        An unknown name is as good an answer as a refused connection.
+        An unknown name is as valid an answer as a refused connection.
         """
         try:
             self.dialer(server)(ClientLog())
@@ -322,7 +322,7 @@ class TransportSuite(ABC):
             assert log.left == [(app.peer, "because of this")]
             assert app.log.closings == ["because of this"]
             assert other.client.send(b"still here")
-            wait_until(lambda: log.from_peer(other.peer), "the other one is undisturbed")
+            wait_until(lambda: log.from_peer(other.peer), "the other one is unaffected")
 
     def test_stop_is_told_to_everybody(self) -> None:
         with self.serving() as (server, log):
@@ -331,7 +331,7 @@ class TransportSuite(ABC):
                 server.stop()
                 server.stop()
                 wait_until(lambda: one.log.closings and two.log.closings, "both were notified")
-                assert one.log.packets == [b"goodbye"], "what was sent before still comes"
+                assert one.log.packets == [b"goodbye"], "packets sent before the stop still arrive"
                 assert one.log.closings[0]
                 assert not one.client.send(b"x")
             assert sorted(peer.id for peer, _ in log.left) == [one.peer.id, two.peer.id]
@@ -348,7 +348,7 @@ class TransportSuite(ABC):
             wait_until(lambda: bad.log.closings and log.left, "both ends were notified")
             assert "on purpose" in log.left[0][1]
             assert good.client.send(b"good")
-            wait_until(lambda: log.from_peer(good.peer) == [b"good"], "the other one is undisturbed")
+            wait_until(lambda: log.from_peer(good.peer) == [b"good"], "the other one is unaffected")
             assert good.log.closings == []
 
     def test_a_raising_client_handler_ends_its_own_connection_only(self) -> None:
@@ -364,9 +364,9 @@ class TransportSuite(ABC):
             assert server.publish(FEEDBACK, b"x") == 0
             wait_until(lambda: bad.log.closings and log.left, "both ends were notified")
             assert "on purpose" in bad.log.closings[0]
-            wait_until(lambda: server.subscribers(FEEDBACK) == 1, "it is gone")
+            wait_until(lambda: server.subscribers(FEEDBACK) == 1, "the failed client is gone")
             assert server.publish(FEEDBACK, b"y") == 0
-            wait_until(lambda: good.log.packets == [b"x", b"y"], "the other one is undisturbed")
+            wait_until(lambda: good.log.packets == [b"x", b"y"], "the other one is unaffected")
 
     def test_ends_may_be_closed_from_inside_their_handlers(self) -> None:
         with self.serving() as (server, log), self.connected(server, log) as app, self.connected(server, log) as other:
@@ -375,7 +375,7 @@ class TransportSuite(ABC):
             wait_until(lambda: app.log.closings and log.left, "both ends were notified")
             log.on_packet = lambda _, __: server.stop()
             assert other.client.send(b"x")
-            wait_until(lambda: other.log.closings and len(log.left) == 2, "all were notified")
+            wait_until(lambda: other.log.closings and len(log.left) == 2, "all ends were notified")
 
     def test_coming_and_going_leaves_nothing_behind(self) -> None:
         with self.serving() as (server, log):
@@ -392,4 +392,4 @@ class TransportSuite(ABC):
             wait_until(lambda: len(log.left) == 51, "all left")
             assert sum(server.subscribers(topic) for topic in (video(FRONT), FEEDBACK)) == 0
             del app
-            wait_until(lambda: resources() <= before, f"resources are as before: {before}, and not {resources()}")
+            wait_until(lambda: resources() <= before, f"resources return to {before} from {resources()}")

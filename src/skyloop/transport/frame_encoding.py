@@ -1,4 +1,4 @@
-"""Frames in the form that a request for video asks for; pure functions."""
+"""Pure functions that encode frames as a request for video demands."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ _CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 
 
 def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> tuple[FrameHeader, bytes]:
-    """Encode a frame as it was asked for.
+    """Encode a frame as requested.
 
-    A frame that is JPEG already is returned as it is, whatever was asked for.
+    A frame that is already a JPEG is returned unchanged, whatever the request.
 
     Args:
         header: The frame's header.
         pixels: ``header.size`` bytes, dtype uint8.
-        request: Scale, encoding and quality to send it in.
+        request: Scale, encoding and quality of the result.
 
     Returns:
         The header that describes the result, and its bytes.
 
     Raises:
-        MissingExtraError: OpenCV is needed and not installed.
-        LinkError: OpenCV could not make a JPEG of it.
+        MissingExtraError: OpenCV is needed but not installed.
+        LinkError: OpenCV could not encode the frame as JPEG.
     """
     channels = _CHANNELS.get(header.encoding)
     if channels is None or (request.encoding == "raw" and request.scale == 1.0):
@@ -45,12 +45,12 @@ def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> 
         picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     done, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, request.quality])
     if not done:
-        raise LinkError(f"frame {header.seq} of {header.camera} could not be made a JPEG")
+        raise LinkError(f"frame {header.seq} of {header.camera} could not be encoded as JPEG")
     return msgspec.structs.replace(header, encoding=Encoding.JPEG, size=int(jpeg.size)), jpeg.tobytes()
 
 
 def scaled_header(header: FrameHeader, scale: float) -> FrameHeader:
-    """Return the header of a frame that is made smaller, with intrinsics that fit.
+    """Return the header of a scaled-down frame, with matching intrinsics.
 
     Args:
         header: The frame's header.
@@ -63,12 +63,12 @@ def scaled_header(header: FrameHeader, scale: float) -> FrameHeader:
 
 
 def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
-    """Return the header of a frame that is made smaller, with intrinsics that fit.
+    """Return the header of a scaled-down frame, with matching intrinsics.
 
     Args:
         header: The frame's header.
-        width: The new one [px].
-        height: The new one [px].
+        width: New width [px].
+        height: New height [px].
 
     Returns:
         The header; ``size`` is that of plain pixels.
@@ -76,7 +76,7 @@ def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
     x, y = width / header.width, height / header.height
     lens = header.intrinsics
     if lens is not None:
-        # The centre of the first pixel is at (0, 0), so its corner at (-0.5, -0.5) is what stays in place.
+        # The first pixel's centre is (0, 0), so the fixed point of the scaling is its corner at (-0.5, -0.5).
         lens = Intrinsics(
             lens.fx * x, lens.fy * y, (lens.cx + 0.5) * x - 0.5, (lens.cy + 0.5) * y - 0.5, lens.distortion, lens.model
         )
@@ -92,7 +92,7 @@ def resized(picture: Any, header: FrameHeader) -> Any:
         header: Gives the new width and height [pixels].
 
     Returns:
-        The picture in the new size, shape (height, width, channels).
+        The resized picture, shape (height, width, channels).
 
     Raises:
         MissingExtraError: OpenCV is not installed.

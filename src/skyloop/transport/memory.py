@@ -1,8 +1,8 @@
 """The transport inside one process: for tests, and for a proxy and an application that share a process.
 
-It keeps the whole contract of :mod:`skyloop.transport.base`, receiving threads and bounded queues included, so code
+It fulfils the whole contract of :mod:`skyloop.transport.base`, receiving threads and bounded queues included, so code
 that works over it works over the other transports. :class:`Faults` makes it lose, repeat, reorder and damage packets
-and frames, in exactly the same way for the same seed.
+and frames, identically for the same seed.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from skyloop.transport.base import (
 
 __all__ = ["DEPTH", "FRAME_DEPTH", "Faults", "MemoryClient", "MemoryServer"]
 
-DEPTH = 256  #: packets that wait at an end before further ones are dropped
-FRAME_DEPTH = 4  #: frames of one camera that wait at a client; then the newest takes the place of the one before it
+DEPTH = 256  #: packets that wait at an end; further ones are dropped
+FRAME_DEPTH = 4  #: frames of one camera that wait at a client; then the newest replaces the one before it
 
 _log = logging.getLogger(__name__)
 _Frame = tuple[FrameHeader, Pixels]
@@ -52,21 +52,21 @@ class _What(Enum):
     LEFT = auto()
 
 
-_Item = tuple["MemoryClient", _What, str]  # the text of what is malformed
+_Item = tuple["MemoryClient", _What, str]  # the text of a malformed request
 
 
 class MemoryServer(TransportServer):
-    """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It may be started again after a stop.
+    """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop.
 
     Args:
-        name: For its address and the names of its threads.
-        faults: What goes wrong on the way; by default nothing.
+        name: Name for its address and threads.
+        faults: Faults to inject; none by default.
     """
 
     def __init__(self, name: str = "memory", *, faults: Faults | None = None) -> None:
         self._name = name
         self._faults = faults or Faults()
-        self._lock = threading.Lock()  # guards joining and leaving; never held while a handler runs
+        self._lock = threading.Lock()  # guards joining and leaving; never held during a handler call
         self._clients: dict[int, MemoryClient] = {}
         self._ids = itertools.count(1)
         self._inbox: SimpleQueue[_Item | None] = SimpleQueue()
@@ -83,11 +83,11 @@ class MemoryServer(TransportServer):
             The connected transport client.
 
         Raises:
-            LinkError: The server is not started.
+            LinkError: The server has not been started.
         """
         with self._lock:
             if self._thread is None:
-                raise LinkError(f"nothing serves {self.address}: start the transport server first")
+                raise LinkError(f"{self.address} has no server: start the transport server first")
             client = MemoryClient(self, Peer(next(self._ids), "this process"), handler, self._faults)
             self._clients[client.peer.id] = client
             self._inbox.put((client, _What.JOINED, ""))
@@ -97,7 +97,7 @@ class MemoryServer(TransportServer):
     def start(self, handler: ServerHandler) -> None:
         with self._lock:
             if self._thread is not None:
-                raise UsageError(f"{self.address} is already started")
+                raise UsageError(f"{self.address} has already been started")
             self._inbox = SimpleQueue()
             self._handler = handler
             name = f"skyloop-{self._name}-server"
@@ -145,11 +145,11 @@ class MemoryServer(TransportServer):
         return f"memory:{self._name}"
 
     def arrived(self, client: MemoryClient) -> None:
-        """Wake the receiving thread for a packet that was put into the client's ``outgoing``."""
+        """Wake the receiving thread for a packet in the client's ``outgoing``."""
         self._inbox.put((client, _What.PACKET, ""))
 
     def may_subscribe(self, client: MemoryClient, topic: str) -> bool:
-        """Return whether a client may subscribe to a topic; if not, the handler's ``malformed`` is called."""
+        """Return whether a client may subscribe to a topic; if not, call the handler's ``malformed``."""
         problem = self._handler.topic_problem(topic) if self._handler is not None else ""
         if len(client.topics) >= MAX_SUBSCRIPTIONS:
             problem = problem or too_many_topics(topic)
@@ -158,12 +158,12 @@ class MemoryServer(TransportServer):
         return not problem
 
     def end(self, client: MemoryClient, reason: str, *, muted: bool) -> None:
-        """End a connection, once.
+        """End a connection. Idempotent.
 
         Args:
-            client: The connection's other end.
-            reason: Why, for the handlers of both ends.
-            muted: Whether to drop the packets from the client that were not delivered yet.
+            client: The connection's client.
+            reason: The reason, for both ends' handlers.
+            muted: Whether to drop the client's undelivered packets.
         """
         with self._lock:
             if self._clients.pop(client.peer.id, None) is None:
@@ -210,10 +210,10 @@ class MemoryClient(TransportClient):
         self._down = FaultInjector(faults, f"{peer.id}/down")
         self._up_lock = threading.Lock()
         self._down_lock = threading.Lock()
-        # A packet, the name of a camera whose next frame is due, or None: the connection has ended.
+        # Items: a packet, the name of a camera with a frame to deliver, or None: the connection has ended.
         self._inbox: SimpleQueue[bytes | str | None] = SimpleQueue()
         self._frames: dict[str, deque[_Frame]] = {}
-        self._ended = False  # by whichever end: nothing can be sent any more
+        self._ended = False  # by either end: nothing can be sent
         self._closing = False  # by this end: nothing more is delivered
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-memory-client-{peer.id}", daemon=True)
 
@@ -254,7 +254,7 @@ class MemoryClient(TransportClient):
         return self._server.address
 
     def deliver(self, packet: bytes) -> bool:
-        """Queue a packet from the server; return False if the connection has ended or too many packets wait."""
+        """Queue a packet from the server; return False if the connection has ended or the queue is full."""
         with self._down_lock:
             if self._ended or self._inbox.qsize() >= DEPTH:
                 return False
@@ -266,7 +266,7 @@ class MemoryClient(TransportClient):
         """Queue a frame from the server.
 
         Returns:
-            False if it took the place of one that waited, or if the connection has ended.
+            False if it replaced a waiting frame, or if the connection has ended.
         """
         room = True
         with self._down_lock:

@@ -1,13 +1,13 @@
-"""Commands first: the order in which the packets of connections, and the threads that bring them, get to the proxy.
+"""Commands first: the order in which connections' packets, and the threads that bring them, reach the proxy.
 
-A command is the full desired state, and the library sends it again 32 times a second. Where a proxy is late, each
-set-point that waits behind a newer one costs time and is refused for its age in the end, which makes the proxy later
-still. So in a :class:`PacketBacklog` a newer one takes its place. What asks for something once (take-off, landing,
-hover, emergency stop) is kept, and only repeats of it are joined.
+A command is the full desired state, and the library repeats it 32 times a second. When a proxy is late, each set-point
+that waits behind a newer one costs time and is refused in the end as stale, which makes the proxy even later. So in a
+:class:`PacketBacklog` a newer set-point replaces an older one. One-off requests (take-off, landing, hover, emergency
+stop) are kept, and only repeats of the same one are merged.
 
-Several threads take turns by a :class:`PriorityLock`, in the order of their arrival, commands first.
-``threading.RLock`` goes to whichever thread is awake: one that acquires it again and again keeps it from all others for
-as long as it likes, and a command would wait behind two hundred requests of another application.
+Several threads share a :class:`PriorityLock` in order of arrival, commands first. ``threading.RLock`` goes to whichever
+thread is awake: a thread that re-acquires it in a loop can starve all others, and a command would wait behind two
+hundred requests of another application.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from skyloop.messages import Command, Idle, decode
 from skyloop.messages.codec import KINDS
 from skyloop.messages.command import SET_POINTS
 
-SUPERSEDED: Final = "commands.superseded"  #: the counter of the commands that newer ones took the place of
-MOST_PACKETS: Final = 256  #: that are taken out of a socket before the first of them is handled
-MOST_BYTES: Final = 131_072  #: of them
+SUPERSEDED: Final = "commands.superseded"  #: counter of commands replaced by newer ones
+MOST_PACKETS: Final = 256  #: taken out of a socket before the first of them is handled
+MOST_BYTES: Final = 131_072  #: of these packets
 _NOTHING: Final[tuple[bytes, Command | None]] = (b"", None)
 _COMMAND: Final = bytes([KINDS[Command]])
 
@@ -36,18 +36,18 @@ def is_command(packet: bytes) -> bool:
 
 
 class Lane(IntEnum):
-    """What waits first in a backlog, the most urgent first."""
+    """Class of a backlog's first packet, most urgent first."""
 
-    URGENT = 0  #: commands, and one of them is no set-point: a landing, an emergency stop
-    STEERING = 1  #: set-points, and the keep-alive in place of one
+    URGENT = 0  #: commands, at least one of them not a set-point: a landing, an emergency stop
+    STEERING = 1  #: set-points, and keep-alives in their place
     OTHERS = 2  #: anything else
 
 
 class PacketBacklog:
-    """The packets of one connection that wait. Not thread-safe.
+    """The waiting packets of one connection. Not thread-safe.
 
     Args:
-        most: How many may wait.
+        most: Maximum number of waiting packets.
     """
 
     __slots__ = ("_bytes", "_idle", "_last", "_most", "_number", "_set_point", "_waiting")
@@ -57,19 +57,19 @@ class PacketBacklog:
         self._bytes = 0
         self._number = 0
         self._waiting: dict[int, tuple[bytes, Command | None]] = {}  # in order
-        self._set_point = self._idle = self._last = 0  # the newest of the commands; they may not wait any more
+        self._set_point = self._idle = self._last = 0  # numbers of the newest commands, which may have left the backlog
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     @property
     def full(self) -> bool:
-        """Whether no more should be put in for now."""
+        """Whether the backlog can take no more packets for now."""
         return len(self._waiting) >= self._most or self._bytes >= MOST_BYTES
 
     @property
     def lane(self) -> Lane | None:
-        """What waits first, up to the first packet that is no command; None: nothing does."""
+        """The lane of the packets up to the first non-command; None if nothing waits."""
         found = None
         for _, command in self._waiting.values():
             if command is None:
@@ -80,7 +80,7 @@ class PacketBacklog:
         return found
 
     def put(self, packet: bytes) -> int:
-        """Add a packet; return how many commands it took the place of."""
+        """Add a packet; return how many commands it replaced."""
         command = _command(packet)
         superseded = 0 if command is None else self._supersede(command)
         self._number += 1
@@ -95,7 +95,7 @@ class PacketBacklog:
         return superseded
 
     def get(self) -> bytes:
-        """Take the packet that waits first. There must be one."""
+        """Remove and return the first packet. There must be one."""
         return self._take(next(iter(self._waiting)))
 
     def _take(self, number: int) -> bytes:
@@ -114,9 +114,9 @@ class PacketBacklog:
         return self._drop(self._last, command)
 
     def _drop(self, number: int, newer: Command) -> int:
-        """Drop an older command if it still waits; return how many were dropped."""
+        """Drop an older command that still waits; return how many were dropped."""
         _, older = self._waiting.get(number, _NOTHING)
-        if older is None or older.seq >= newer.seq:  # packets of a network may come in another order
+        if older is None or older.seq >= newer.seq:  # a network may reorder packets
             return 0
         self._take(number)
         return 1
@@ -134,28 +134,28 @@ def _command(packet: bytes) -> Command | None:
 
 
 class PriorityLock:
-    """A re-entrant lock that each holder hands over to the next waiter.
+    """A re-entrant lock that each holder hands to the next waiter.
 
-    ``with lock:`` waits behind all others, ``with lock.urgent:`` only behind those that are urgent, too.
+    ``with lock:`` waits behind all others, ``with lock.urgent:`` only behind other urgent waiters.
     """
 
     def __init__(self) -> None:
-        self._taken = threading.Lock()  # taken while a thread has it; handed over as it is
-        self._owner = 0  # identity of the thread that has it
-        self._depth = 0  # how often the owner acquired it besides
+        self._taken = threading.Lock()  # locked while a thread owns this lock; stays locked in a hand-over
+        self._owner = 0  # identity of the owning thread
+        self._depth = 0  # additional acquisitions by the owner
         self._queues = threading.Lock()  # guards the queues
-        self._urgent: deque[tuple[threading.Lock, int]] = deque()  # who waits, woken by a lock of its own
+        self._urgent: deque[tuple[threading.Lock, int]] = deque()  # waiters, each with a lock to wake it
         self._others: deque[tuple[threading.Lock, int]] = deque()
         self.urgent = _Urgent(self)
 
     def acquire(self, urgent: bool = False) -> None:
-        """Wait for the lock and acquire it; the thread that holds it may acquire it again.
+        """Wait for the lock and acquire it; the owner may acquire it again.
 
         Args:
-            urgent: Whether to go before all waiters that are not urgent.
+            urgent: Whether to go before all non-urgent waiters.
         """
         me = threading.get_ident()
-        if self._taken.acquire(False):  # the usual case, with as few lines as possible
+        if self._taken.acquire(False):  # the usual case, in as few steps as possible
             self._owner = me
             return
         if self._owner == me:
@@ -165,13 +165,13 @@ class PriorityLock:
         woken.acquire()
         with self._queues:
             (self._urgent if urgent else self._others).append((woken, me))
-        self._hand_over()  # should it have been released just now
-        woken.acquire()  # it is ours then
+        self._hand_over()  # it may have been released since the first attempt
+        woken.acquire()  # the releaser has made this thread the owner
 
     def release(self) -> None:
-        """Release the lock once, and hand it over when the holder's last hold is released.
+        """Release the lock once; the last release hands it over.
 
-        Only the thread that holds the lock may call this; that is not checked.
+        Only the owning thread may call this; that is not checked.
         """
         if self._depth:
             self._depth -= 1
@@ -182,7 +182,7 @@ class PriorityLock:
             self._hand_over()
 
     def _hand_over(self) -> None:
-        """Give the lock to who waits first, if it is free."""
+        """Give the lock to the first waiter, if it is free."""
         with self._queues:
             waiting = self._urgent or self._others
             if waiting and self._taken.acquire(False):
@@ -196,7 +196,7 @@ class PriorityLock:
 
     @property
     def waiting(self) -> int:
-        """How many threads wait."""
+        """Number of waiting threads."""
         return len(self._urgent) + len(self._others)
 
     def __enter__(self) -> None:

@@ -1,4 +1,4 @@
-"""Helpers for tests of transports and of what builds on them: handlers that record their calls.
+"""Helpers for tests of transports and their users: handlers that record their calls.
 
 Nothing here sleeps for a fixed time: :func:`wait_until` waits for a condition, for at most :data:`PATIENCE_S`.
 """
@@ -26,14 +26,14 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
 
     Args:
         condition: Called about every millisecond until it returns something true.
-        what: What is waited for, for the failure's message.
+        what: The condition in words, for the failure's message.
 
     Raises:
-        AssertionError: It did not hold within :data:`PATIENCE_S`.
+        AssertionError: The condition did not hold within :data:`PATIENCE_S`.
     """
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
-        assert time.monotonic() < deadline, f"waited {PATIENCE_S} s in vain until {what}"
+        assert time.monotonic() < deadline, f"after {PATIENCE_S} s still not true: {what}"
         time.sleep(0.001)
 
 
@@ -57,7 +57,7 @@ def raises(error: type[Exception], call: Callable[[], object]) -> None:
 class ServerLog:
     """A server's handler that records its calls.
 
-    Its lists grow on the transport's receiving thread. ``on_packet``, if set, is called there with each packet after it
+    Its lists grow on the transport's receiving thread, where ``on_packet``, if set, is called with each packet after it
     was recorded.
     """
 
@@ -111,7 +111,7 @@ class ClientLog:
         self.torn: list[int] = []
         self.closings: list[str] = []
         self.on_packet: Callable[[bytes], None] | None = None
-        self.gate = threading.Event()  #: the handler stops here while it is not set
+        self.gate = threading.Event()  #: the handler blocks here while this is not set
         self.gate.set()
 
     def packet(self, packet: bytes) -> None:
@@ -129,7 +129,7 @@ class ClientLog:
         self.seen.append(header.seq)
 
     def saw(self, seq: int) -> bool:
-        """Return whether the newest frame that came has this number."""
+        """Return whether the newest received frame has this number."""
         return self.seen[-1:] == [seq]
 
     def closed(self, reason: str) -> None:
@@ -142,7 +142,7 @@ def header(seq: int, width: int = 32, height: int = 24, camera: str = FRONT) -> 
 
 
 def picture(head: FrameHeader) -> Pixels:
-    """Return the pixels of a frame for tests, in which each byte depends on the frame's number.
+    """Return the pixels of a frame for tests; each byte depends on the frame's number.
 
     Args:
         head: The frame's header.
@@ -163,9 +163,9 @@ class Joined:
 
 
 def resources() -> tuple[int, int]:
-    """Return how many threads and, where ``/proc`` shows it, open descriptors this process has.
+    """Return the number of threads and, where ``/proc`` shows it, open descriptors of this process.
 
-    The collector runs before they are counted.
+    The garbage collector runs first.
     """
     gc.collect()
     descriptors = Path("/proc/self/fd")

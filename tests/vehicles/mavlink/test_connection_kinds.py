@@ -135,7 +135,7 @@ def test_tcp_brings_bytes_and_says_when_it_ends() -> None:
         assert came(ours) == b"heartbeat"
         vehicle.close()
         assert select.select([ours], [], [], 5.0)[0]
-        with pytest.raises(ConnectionError, match="the vehicle ended the connection"):
+        with pytest.raises(ConnectionError, match="the vehicle closed the connection"):
             ours.receive()
 
 

@@ -732,10 +732,10 @@ def test_a_serial_number_that_one_version_of_the_protocol_lacks_is_no_other_vehi
 def test_a_vehicle_that_no_longer_reads_is_not_up_before_it_has_answered() -> None:
     """What was sent found no room: its heartbeats alone don't show that commands get through again."""
     bench = Bench(Vehicle(PX4)).found()
-    bench.session.broken(ConnectionError("the vehicle no longer reads what is sent"), bench.clock())
+    bench.session.broken(ConnectionError("the vehicle no longer reads what we send"), bench.clock())
     bench.go_on(1.0)
     assert bench.link() is LinkState.DEGRADED
-    assert (LinkState.LOST, "the connection failed: the vehicle no longer reads what is sent") in bench.sink.links
+    assert (LinkState.LOST, "the connection failed: the vehicle no longer reads what we send") in bench.sink.links
     bench.answer(m.MAV_CMD_SET_MESSAGE_INTERVAL)
     bench.go_on(0.1)
     assert bench.link() is LinkState.UP
@@ -745,7 +745,7 @@ def test_a_vehicle_that_no_longer_reads_gets_no_set_points_before_it_has_answere
     """Nothing shows that the port, opened again, carries anything: what waits there would be followed late."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
-    bench.session.broken(ConnectionError("the vehicle no longer reads what is sent"), bench.clock())
+    bench.session.broken(ConnectionError("the vehicle no longer reads what we send"), bench.clock())
     bench.go_on(0.5)
     bench.said.clear()
     for _ in range(10):
@@ -815,7 +815,7 @@ def test_a_vehicle_whose_only_answer_was_lost_is_asked_again() -> None:
     """It told its version, so nothing more was asked, and no set-point was ever sent again."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
-    bench.session.broken(ConnectionError("the vehicle no longer reads what is sent"), bench.clock())
+    bench.session.broken(ConnectionError("the vehicle no longer reads what we send"), bench.clock())
     bench.go_on(0.1)
     bench.hear(version_of(1))
     bench.said.clear()

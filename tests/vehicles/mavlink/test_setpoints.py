@@ -1064,7 +1064,7 @@ def test_a_stopped_vehicle_that_others_arm_again_is_told_as_it_flies(autopilot: 
     bench.go_on(0.5)
     assert CUT not in bench.commands()
     assert bench.state() is FlightState.FLYING
-    assert any("started again, not from here" in text for text in bench.texts)
+    assert any("started its motors again" in text for text in bench.texts)
 
 
 def arming(autopilot: int) -> Bench:

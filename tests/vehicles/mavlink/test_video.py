@@ -269,7 +269,7 @@ def test_a_stream_that_becomes_noise_is_told_and_seen_again_when_it_is_none() ->
     ):
         shows(sink, 3)
         projector.spoilt.set()
-        is_told(sink, "nothing that came could be decoded")
+        is_told(sink, "nothing received could be decoded")
         projector.spoilt.clear()
         shows(sink, 3)
         numbers = [number_of(frame.pixels) for frame in sink.frames]

@@ -1,8 +1,8 @@
 """The transport of one host: a Unix ``SOCK_SEQPACKET`` connection per application, frames in sealed shared memory.
 
 The kernel keeps packets whole, reports at once when the other end dies, checks who may connect, and leaves nothing
-behind after a crash. It needs Linux 5.1 or later; elsewhere no proxy is
-listed, and the other names here raise :class:`UnsupportedError` when used.
+behind after a crash. It needs Linux 5.1 or later; elsewhere no proxy is listed, and using the other names here raises
+:class:`UnsupportedError`.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ __all__ = ["LocalServer", "dial", "list_names", "names_of_others"]
 
 
 def dial(name: str, *, group: str | None = None) -> Dialer:
-    """Return the dialer of a proxy on this host.
+    """Return a dialer for a proxy on this host.
 
-    The dialer raises :class:`UnknownNameError` where there is no such proxy, and :class:`LinkError` where it does not
-    accept (it was killed, is stopped, or belongs to another user); it returns or raises within about a second.
+    The dialer raises :class:`UnknownNameError` if there is no such proxy, and :class:`LinkError` if it does not accept
+    the connection (it was killed, is stopped, or belongs to another user). It returns or raises within about a second.
 
     Args:
         name: The proxy's name.
         group: The group of users that shares the directory of sockets (default: the variable ``SKYLOOP_GROUP``).
 
     Raises:
-        UsageError: The name or the group is not valid.
+        UsageError: The name or the group is invalid.
         UnsupportedError: This is not Linux.
     """
     _check_platform()
@@ -61,19 +61,19 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
 
 
 def list_names(*, group: str | None = None) -> list[Proxy]:
-    """List the running proxies of this host that this user may reach.
+    """List the running proxies on this host that this user may reach.
 
-    Sockets that killed proxies left are removed.
+    Removes sockets left by killed proxies.
 
     Args:
         group: The group of users that shares the directory of sockets (default: the variable ``SKYLOOP_GROUP``).
 
     Returns:
-        The proxies, sorted by name; none where this is not Linux, as none can run there.
+        The proxies, sorted by name; none on systems other than Linux.
 
     Raises:
         LinkError: The directory of sockets is not safe.
-        UsageError: The group is not valid.
+        UsageError: The group is invalid.
     """
     if sys.platform != "linux":
         return []
@@ -83,7 +83,7 @@ def list_names(*, group: str | None = None) -> list[Proxy]:
 
 
 def names_of_others() -> dict[str, list[str]]:
-    """Return the names of the proxies on this host that other users run, by user. This user may not reach them."""
+    """Return the names of other users' proxies on this host, by user. This user may not reach them."""
     if sys.platform != "linux":
         return {}
     from skyloop.transport.local.directory import directory_owner, of_others
@@ -96,7 +96,7 @@ def names_of_others() -> dict[str, list[str]]:
 
 
 def __getattr__(name: str) -> Any:
-    # Its modules cannot even be imported where there is no fcntl, so they are not until they are asked for.
+    # The modules need fcntl and can't even be imported elsewhere, so they are imported on demand.
     if name == "LocalServer":
         _check_platform()
         from skyloop.transport.local.server import LocalServer

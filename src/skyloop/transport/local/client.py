@@ -1,4 +1,4 @@
-"""An application's end of the local transport, and its read-only view of the server's frame slots."""
+"""An application's end of the local transport, and its read-only views of the server's frame slots."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from skyloop.transport.local import packets
 from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set_timeout
 
-_MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet has a few bytes more than its header's
+_MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is a few bytes larger than its header's
 _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
-_RETRY_S: Final = 0.25  # for what did not fit into a full socket
-_LOOK_S: Final = 0.05  # how often a thread that leads looks whether its wait is over, while nothing comes
-_STAND_BY_S: Final = 0.002  # how long nobody receives after the thread that led went away with what it waited for
-_MAX_CAPACITY: Final = 1 << 31  # what a client lets a server make it map
+_RETRY_S: Final = 0.25  # for packets that did not fit into a full socket
+_LOOK_S: Final = 0.05  # how often a leading thread checks whether its wait is over, while nothing arrives
+_STAND_BY_S: Final = 0.002  # how long no thread receives after the leading thread returned with its sample
+_MAX_CAPACITY: Final = 1 << 31  # most memory that a client lets a server make it map
 _log = logging.getLogger(__name__)
 
 
@@ -37,15 +37,15 @@ class LocalClient(TransportClient):
     """An application's end, made by the dialer that :func:`skyloop.transport.local.dial` returns.
 
     Args:
-        sock: Connected to the proxy.
+        sock: A socket connected to the proxy.
         name: The proxy's name.
         handler: Called on the receiving thread, which starts at once.
     """
 
-    # Whoever holds ``_turn`` receives and delivers. That is the receiving thread, or a thread of the application that
-    # waits for a sample and *leads* meanwhile: a sample wakes that thread alone, where handing it over from one to the
-    # other takes a second wake-up, which costs as much as the whole way from the proxy. While somebody leads, the
-    # receiving thread stands by, and receives again when nobody has for two milliseconds.
+    # The thread that holds ``_turn`` receives and delivers: the receiving thread, or an application's thread that waits
+    # for a sample and *leads* meanwhile. Then a sample wakes that thread alone. Handing it from one thread to the other
+    # takes a second wake-up, which costs as much as the whole path from the proxy. During a lead the receiving thread
+    # stands by; it takes over when no thread has received for two milliseconds.
 
     def __init__(self, sock: Socket, name: str, handler: ClientHandler) -> None:
         self._address = f"local:{name} (pid {credentials(sock).pid})"
@@ -59,16 +59,16 @@ class LocalClient(TransportClient):
         self._reason = ""
         self._turn = threading.Lock()
         self._receiver = 0  # identity of the thread that has the turn
-        self._ended = ""  # why receiving is over
-        self._candidate: Callable[[], None] | None = None  # wakes a thread that would lead
-        self._releases: deque[bytes] = deque()  # of frames that were dropped while a packet was delivered
+        self._ended = ""  # why receiving has ended
+        self._candidate: Callable[[], None] | None = None  # wakes a thread that is ready to lead
+        self._releases: deque[bytes] = deque()  # of frames dropped during a delivery
         self._send_own(packets.hello())
         self._thread = threading.Thread(target=self._run, args=(sock,), name=f"skyloop-{name}-client", daemon=True)
         self._thread.start()
         leave_to_parent(self)
 
     def forked(self) -> None:
-        """Drop a forked child's copy of the connection; shutting it down would end the parent's."""
+        """Drop a forked child's copy of the connection; a shutdown would end the parent's connection, too."""
         sock, self._socket = self._socket, None
         self._ended = "the connection belongs to the parent process"
         if sock is not None:
@@ -100,7 +100,7 @@ class LocalClient(TransportClient):
         if sock is None or self._ended:
             return False
         if not self._turn.acquire(False):
-            self._candidate = wake  # the receiving thread makes room after the next packet
+            self._candidate = wake  # the receiving thread yields after the next packet
             return False
         deadline_s = time.monotonic() + timeout_s
         try:
@@ -122,7 +122,7 @@ class LocalClient(TransportClient):
         return self._address
 
     def _end(self, reason: str) -> None:
-        """End the connection once; the receiving thread does the rest."""
+        """End the connection. Idempotent; the receiving thread does the rest."""
         sock = self._socket
         if sock is not None and not self._closing:
             self._reason = reason
@@ -132,7 +132,7 @@ class LocalClient(TransportClient):
     def _release(self, slot: int) -> None:
         packet = packets.release(slot)
         if self._receiver == threading.get_ident():
-            self._releases.append(packet)  # after the delivery, for which somebody waits
+            self._releases.append(packet)  # after the delivery, which another thread waits for
         else:
             self._send_own(packet)
 
@@ -150,7 +150,7 @@ class LocalClient(TransportClient):
             except BlockingIOError:
                 pass
             except OSError:
-                return  # it has ended
+                return  # the connection has ended
             else:
                 return
         self._unsent.append(packet)
@@ -180,18 +180,18 @@ class LocalClient(TransportClient):
             _log.exception("the handler of %s failed in closed()", self._address)
 
     def _stand_by(self) -> None:
-        """Wait until nobody leads."""
+        """Wait until no thread leads."""
         while not self._ended:
             time.sleep(_STAND_BY_S)
             if not self._turn.locked():
                 return
 
-    # --- whoever has the turn ---
+    # --- the thread that has the turn ---
 
     def _take_turn(self, sock: Socket, over: Callable[[], bool]) -> None:
-        """Deliver until it is over, or the connection has ended.
+        """Deliver until ``over`` returns True or the connection ends.
 
-        On the application's main thread, what a handler of a signal raises while nothing comes is raised from here.
+        On the application's main thread, an exception from a signal handler during the wait is raised from here.
         """
         self._receiver = threading.get_ident()
         try:
@@ -200,7 +200,7 @@ class LocalClient(TransportClient):
             self._receiver = 0
 
     def _receive(self, sock: Socket, over: Callable[[], bool]) -> str:
-        """Deliver until it is over, or until the connection ends: then return why."""
+        """Deliver until ``over`` returns True, or the connection ends; then return the reason."""
         receive = sock.recvmsg
         deliver, deliver_frame = self._handler.packet, self._handler.frame
         while not self._closing:
@@ -213,10 +213,10 @@ class LocalClient(TransportClient):
                     return ""
                 continue
             except ConnectionResetError:
-                continue  # what was sent before it still comes, and then the end
+                continue  # packets sent before it still arrive, and then the end
             except OSError as error:
                 if error.errno is None:
-                    raise  # not the kernel's: a handler of a signal raised it, such as a TimeoutError
+                    raise  # not from the kernel: a signal handler raised it, for example a TimeoutError
                 return f"receiving failed: {error}"
             kind = packet[5:6]
             try:
@@ -232,9 +232,9 @@ class LocalClient(TransportClient):
                         number, header = packets.parse_frame(packet)
                         pixels = self._leases.pixels(number, header.size)
                     except (DecodeError, LinkError, OSError) as error:
-                        return f"the proxy does not keep to the protocol: {error}"
+                        return f"the proxy violates the protocol: {error}"
                     deliver_frame(header, pixels)
-                    del pixels  # else their slot stayed leased until the next packet
+                    del pixels  # otherwise their slot would stay leased until the next packet
                 else:
                     deliver(packet)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)
@@ -245,20 +245,20 @@ class LocalClient(TransportClient):
         return self._reason or "closed by the application"
 
     def _control(self, packet: bytes, descriptors: list[int]) -> None:
-        """Handle one of the transport's own packets that is no frame, and close the descriptors that came with it.
+        """Handle one of the transport's own packets other than a frame, and close its descriptors.
 
         Raises:
-            DecodeError: It can't be parsed.
-            LinkError: The proxy announced something that is not valid.
+            DecodeError: The packet can't be parsed.
+            LinkError: The proxy announced something invalid.
             OSError: A slot can't be mapped.
         """
         try:
             message = packets.parse(packet)
             if isinstance(message, packets.Frame):
-                raise LinkError(f"a frame came with {len(descriptors)} descriptors and has none")
+                raise LinkError(f"a frame arrived with {len(descriptors)} descriptors and must have none")
             if isinstance(message, packets.Slot):
                 if len(descriptors) != 1:
-                    raise LinkError(f"a slot was announced with {len(descriptors)} descriptors and needs one")
+                    raise LinkError(f"a slot was announced with {len(descriptors)} descriptors and must have one")
                 self._leases.add(message.slot, message.camera, message.capacity, descriptors[0])
             elif isinstance(message, packets.Retire):
                 self._leases.retire(message.camera, message.before)
@@ -269,12 +269,12 @@ class LocalClient(TransportClient):
                 os.close(descriptor)
 
     def _send_waiting(self, sock: Socket) -> None:
-        """Send the releases of this turn, and what did not fit into the socket before."""
+        """Send the releases of this turn, and packets that did not fit into the socket before."""
         while self._releases:
             self._unsent.append(self._releases.popleft())
         try:
             while self._unsent:
-                # It stays in the queue until it is sent, so that nothing that comes later overtakes it.
+                # It stays in the queue until sent, so that later packets can't overtake it.
                 sock.send(self._unsent[0], SEND_FLAGS)
                 self._unsent.popleft()
         except OSError:
@@ -282,7 +282,7 @@ class LocalClient(TransportClient):
 
 
 def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
-    """The descriptors that came with a packet."""
+    """Return a packet's descriptors."""
     descriptors = array.array("i")
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
@@ -291,7 +291,7 @@ def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
 
 
 class SlotView:
-    """One slot at a client, mapped once, for reading only."""
+    """One slot at a client, mapped once, read-only."""
 
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 
@@ -300,20 +300,20 @@ class SlotView:
 
         Args:
             number: The slot's number on the wire.
-            camera: The camera's.
+            camera: The camera's number.
             capacity: The slot's size [bytes].
-            fd: Its descriptor, which stays the caller's.
-            held: The numbers of all slots of this camera that the application has; shared with the camera's other
+            fd: The slot's descriptor, which the caller keeps.
+            held: The numbers of all slots of this camera that the application holds; shared with the camera's other
                 slots.
 
         Raises:
-            LinkError: The memory could be cut off while it is read, or is smaller than announced.
-            OSError: It can't be mapped.
+            LinkError: The memory could shrink during reading, or is smaller than announced.
+            OSError: The memory can't be mapped.
         """
         self.number = number
         self.camera = camera
         self.capacity = capacity
-        self.held = held  #: numbers of all slots of this camera that the application has
+        self.held = held  #: numbers of all slots of this camera that the application holds
         try:
             seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)
         except OSError:
@@ -322,13 +322,13 @@ class SlotView:
             raise LinkError("the proxy offered shared memory that is not sealed against shrinking")
         size = os.fstat(fd).st_size
         if not 0 < capacity <= min(size, _MAX_CAPACITY):
-            raise LinkError(f"the proxy offered a slot of {capacity} bytes in {size} bytes of shared memory")
+            raise LinkError(f"the proxy offered a slot of {capacity} bytes, but only {size} bytes of shared memory")
         view = mmap.mmap(fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE, mmap.PROT_READ)
         self.pixels: Pixels = np.frombuffer(view, np.uint8)
         self._interface = self._describe(capacity)
 
     def interface(self, size: int) -> dict[str, Any]:
-        """Return NumPy's description of the first ``size`` bytes; it is made again only when their number changes."""
+        """Return NumPy's description of the first ``size`` bytes; it is cached until the size changes."""
         if self._interface["shape"][0] != size:
             self._interface = self._describe(size)
         return self._interface
@@ -338,7 +338,7 @@ class SlotView:
 
 
 class Lease:
-    """The owner of a frame's pixels: while any array over it lives, the server does not reuse the slot."""
+    """The owner of a frame's pixels: while any array over them exists, the server does not reuse the slot."""
 
     __slots__ = ("__array_interface__", "_leases", "_slot")
 
@@ -354,14 +354,14 @@ class Lease:
 class Leases:
     """A client's slots.
 
-    :meth:`released` is called by the garbage collector, on any thread and at any point of it.
+    The garbage collector calls :meth:`released` on any thread and at any point.
 
     Args:
-        send_release: Gives a slot back to the server by its number; must not acquire a lock.
+        send_release: Returns a slot to the server by its number; must not acquire a lock.
     """
 
-    #: Frames of one camera that an application may have in place. It gets copies of further ones, so that one that
-    #: collects frames does not use up the server's limit and starve.
+    #: Frames of one camera that an application may hold in place. Further ones are copied, so that an application that
+    #: collects frames does not exhaust the server's limit and starve itself.
     IN_PLACE: Final = 3
 
     def __init__(self, send_release: Callable[[int], None]) -> None:
@@ -370,40 +370,40 @@ class Leases:
         self._held: dict[int, set[int]] = {}
 
     def add(self, number: int, camera: int, capacity: int, fd: int) -> None:
-        """Map a slot that the server announced.
+        """Map a slot announced by the server.
 
         Args:
-            number: The slot's.
+            number: The slot's number.
             camera: The camera's number.
             capacity: The slot's size [bytes].
-            fd: Its descriptor, which stays the caller's.
+            fd: The slot's descriptor, which the caller keeps.
 
         Raises:
-            LinkError: The memory is not usable.
+            LinkError: The memory is unusable.
             OSError: It can't be mapped.
         """
         self._slots[number] = SlotView(number, camera, capacity, fd, self._held.setdefault(camera, set()))
 
     def retire(self, camera: int, before: int) -> None:
-        """Forget the slots of a camera below the number ``before``."""
+        """Forget a camera's slots with numbers below ``before``."""
         for slot in list(self._slots.values()):
             if slot.camera == camera and slot.number < before:
                 del self._slots[slot.number]
 
     def end(self) -> None:
-        """Forget all slots, as the connection has ended; frames that the application still has stay valid.
+        """Forget all slots at the end of the connection; frames that the application still holds stay valid.
 
         Those frames refer to this object, and the collector does not search arrays for cycles. A reference from here to
-        the client, its handler and the frames that the handler keeps would keep all of them for ever.
+        the client, its handler and the frames that the handler keeps would therefore keep all of them for ever.
         """
         self._slots.clear()
         self._send_release = _to_nobody
 
     def pixels(self, number: int, size: int) -> Pixels:
-        """Return the frame in a slot: in place, or as a copy if the application has :attr:`IN_PLACE` frames already.
+        """Return a slot's frame: in place, or as a copy if the application already has :attr:`IN_PLACE` frames.
 
         Args:
-            number: The slot's.
+            number: The slot's number.
             size: The frame's size [bytes].
 
         Returns:
@@ -424,10 +424,10 @@ class Leases:
         return np.asarray(Lease(slot, size, self))
 
     def released(self, slot: SlotView) -> None:
-        """Give a slot back to the server; the application has no array over it any more."""
+        """Return a slot to the server, when the application's last array over it is gone."""
         slot.held.discard(slot.number)
         self._send_release(slot.number)
 
 
 def _to_nobody(_: int) -> None:
-    """Drop a release, as the connection has ended."""
+    """Drop a release, because the connection has ended."""

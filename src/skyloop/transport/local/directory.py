@@ -1,14 +1,14 @@
-"""The directory of sockets, in which proxies are found by name, and who may use it.
+"""The directory of sockets, where proxies are found by name, and its access rules.
 
-Each proxy has one socket, ``NAME.sock``, in a directory that only its owner (or a named group) can enter: the one of
+Each proxy has one socket, ``NAME.sock``, in a directory that only its owner (or a named group) can enter: the value of
 the variable ``SKYLOOP_RUNTIME_DIR``, or else ``skyloop`` in the user's runtime directory. A process that changes the
-directory holds an advisory lock, which the kernel releases with the process. The lock is on the directory itself, or,
-where a group may look into it, on the file ``.lock`` there, which only the owner can open, so that no member of the
-group can hold up a proxy. Reading takes no lock.
+directory holds an advisory lock, which the kernel releases with the process. The lock is on the directory itself. If a
+group may read the directory, the lock is on the file ``.lock`` in it, which only the owner can open, so that no member
+of the group can block a proxy. Reading needs no lock.
 
-The socket of a killed proxy stays as a file. Whether a process listens at it is found out by connecting with the
-*wrong* type of socket: the kernel answers at once, without the owner noticing, with ``EPROTOTYPE`` for one that is
-alive and ``ECONNREFUSED`` for one that is not.
+The socket of a killed proxy remains as a file. A connection attempt with the *wrong* type of socket shows whether a
+process still listens: the kernel answers at once, unnoticed by the owner, with ``EPROTOTYPE`` for a live socket and
+``ECONNREFUSED`` for a dead one.
 """
 
 from __future__ import annotations
@@ -32,31 +32,31 @@ from skyloop.transport.local.sockets import Socket, credentials, set_timeout, us
 
 DIRECTORY_VARIABLE: Final = "SKYLOOP_RUNTIME_DIR"
 GROUP_VARIABLE: Final = "SKYLOOP_GROUP"
-MAX_PATH: Final = 107  #: bytes that Linux allows in the path of a socket
+MAX_PATH: Final = 107  #: Linux's limit for a socket's path [bytes]
 LOCK_TIMEOUT_S: Final = 2.0
 CONNECT_TIMEOUT_S: Final = 1.0
 PROXY: Final = "proxy"
-HOST: Final = "host"  #: of many proxies: its socket takes requests to add and remove vehicles
+HOST: Final = "host"  #: a host of many proxies: its socket accepts requests to add and remove vehicles
 _SUFFIXES: Final = {PROXY: ".sock", HOST: ".host"}
 _LOCK: Final = ".lock"
 _OPEN_TO_OTHERS: Final = 0o027  # writable by the group, or anything for others
 
 
 class Proxy(NamedTuple):
-    """A proxy that runs on this host."""
+    """A running proxy on this host."""
 
     name: str
-    pid: int | None  #: of the process; None if it is too busy to say
+    pid: int | None  #: process id; None if the process is too busy to tell
     path: Path  #: its socket
 
 
 class Directory:
-    """The directory of sockets, seen by a user; :func:`find_directory` makes one.
+    """A user's view of the directory of sockets; see :func:`find_directory`.
 
     Args:
-        path: The directory, absolute.
-        gid: The group that shares it, None for this user alone.
-        kind: Whose sockets: :data:`PROXY` or :data:`HOST`. They have names of their own.
+        path: The absolute path.
+        gid: The group that shares it; None for this user alone.
+        kind: Whose sockets: :data:`PROXY` or :data:`HOST`. Each kind has its own names.
     """
 
     def __init__(self, path: Path, gid: int | None, kind: str = PROXY) -> None:
@@ -69,23 +69,23 @@ class Directory:
         """Return the path of a proxy's socket.
 
         Raises:
-            UsageError: The name can't be a proxy's, or the path is longer than :data:`MAX_PATH`.
+            UsageError: The name is invalid, or the path is longer than :data:`MAX_PATH`.
         """
         check_name(name)
         path = self.path / (name + self._suffix)
         if len(os.fsencode(path)) > MAX_PATH:
             raise UsageError(
-                f"the socket's path {path} has {len(os.fsencode(path))} bytes and may have {MAX_PATH}: "
+                f"the socket's path {path} has {len(os.fsencode(path))} bytes, over the limit of {MAX_PATH}: "
                 f"set {DIRECTORY_VARIABLE} to a shorter directory"
             )
         return path
 
     def create(self) -> None:
-        """Make the directory if it is missing, give it to the group if there is one, and check it.
+        """Create the directory if missing, give it to the group if there is one, and check it.
 
         Raises:
-            LinkError: It is not safe; see :meth:`check`.
-            OSError: It can't be made.
+            LinkError: The directory is not safe; see :meth:`check`.
+            OSError: The directory can't be created.
         """
         self.path.parent.mkdir(mode=0o700 if self.gid is None else 0o755, parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
@@ -96,10 +96,10 @@ class Directory:
         self.check()
 
     def check(self) -> None:
-        """Check that nobody else can put a socket here.
+        """Check that no other user can put a socket here.
 
         Raises:
-            LinkError: Another user owns the directory, or can change it or the one that holds it.
+            LinkError: Another user owns the directory, or can change it or its parent.
             FileNotFoundError: There is no such directory.
         """
         here, above = self._lstat(self.path), self._lstat(self.path.parent)
@@ -119,12 +119,12 @@ class Directory:
         shared = above.st_mode & 0o022 and not above.st_mode & stat.S_ISVTX
         if shared or above.st_uid not in (0, here.st_uid, os.geteuid()):
             raise LinkError(
-                f"{self.path.parent}, which holds {self.path.name}, can be changed by others: "
-                f"set {DIRECTORY_VARIABLE} to a directory in a place of your own"
+                f"{self.path.parent}, the parent of {self.path.name}, can be changed by others: "
+                f"set {DIRECTORY_VARIABLE} to a directory in a place that only you can change"
             )
 
     def proxies(self) -> list[Proxy]:
-        """List the running proxies by name, and remove the sockets that killed ones left.
+        """List the running proxies by name, and remove sockets left by killed ones.
 
         Raises:
             LinkError: The directory is not safe.
@@ -145,11 +145,11 @@ class Directory:
         return found
 
     def _remove_stale(self, path: Path) -> None:
-        """Remove the socket of a killed proxy, if the lock is free: a reader never waits for anybody."""
+        """Remove the socket of a killed proxy, if the lock is free: a reader never waits."""
         if self._lstat(self.path).st_uid != os.geteuid():
-            return  # a group's member may look, but not remove
+            return  # members of a group may look, but not remove
         with contextlib.suppress(OSError, LinkError), self.lock(timeout_s=0.0):
-            if not is_live(path):  # a proxy may have taken the name meanwhile
+            if not is_live(path):  # a proxy may have taken the name since
                 path.unlink()
 
     def listen(self, name: str) -> tuple[Socket, int]:
@@ -162,9 +162,9 @@ class Directory:
             The listening socket, and the inode of its file for :meth:`remove`.
 
         Raises:
-            NameTakenError: A running proxy has the name.
-            LinkError: The directory is not safe, or stays locked for :data:`LOCK_TIMEOUT_S`.
-            UsageError: The name or its path is not valid.
+            NameTakenError: A running proxy uses the name.
+            LinkError: The directory is not safe, or stayed locked for :data:`LOCK_TIMEOUT_S`.
+            UsageError: The name or its path is invalid.
         """
         path = self.socket_path(name)
         self.create()
@@ -173,7 +173,7 @@ class Directory:
                 pid = owner_pid(path)
                 raise NameTakenError(
                     f"the name {name!r} is in use by a running {self._kind}"
-                    f"{f' (pid {pid})' if pid is not None else ''}: choose another, or stop that one"
+                    f"{f' (pid {pid})' if pid is not None else ''}: choose another name, or stop that process"
                 )
             path.unlink(missing_ok=True)
             listener = Socket()
@@ -185,7 +185,7 @@ class Directory:
             return listener, path.lstat().st_ino
 
     def remove(self, name: str, inode: int) -> None:
-        """Remove the socket of a name if it is still the file with this inode; errors are ignored."""
+        """Remove the socket of a name if its file still has this inode; errors are ignored."""
         path = self.socket_path(name)
         with contextlib.suppress(OSError, LinkError), self.lock():
             if path.lstat().st_ino == inode:
@@ -193,13 +193,13 @@ class Directory:
 
     @contextlib.contextmanager
     def lock(self, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[None]:
-        """Hold the directory against changes by others.
+        """Lock the directory against changes by other processes.
 
         Args:
-            timeout_s: How long to wait for it [s].
+            timeout_s: How long to wait for the lock [s].
 
         Raises:
-            LinkError: Another process holds it for longer than that.
+            LinkError: Another process holds the lock for longer than that.
         """
         here, path = self._lstat(self.path), self.path
         flags = os.O_RDONLY | os.O_DIRECTORY
@@ -207,7 +207,7 @@ class Directory:
             path, flags = path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
         descriptor = os.open(path, flags | os.O_CLOEXEC, 0o600)
         try:
-            if path is not self.path and os.geteuid() == 0:  # which may have made it, in somebody else's directory
+            if path is not self.path and os.geteuid() == 0:  # root may have created it, in another user's directory
                 os.fchown(descriptor, here.st_uid, -1)
             _lock(descriptor, path, timeout_s)
             yield
@@ -219,15 +219,15 @@ class Directory:
         try:
             return path.lstat()
         except PermissionError as error:
-            raise LinkError(f"cannot look into {path.parent}: {error.strerror}; its owner or group only may") from None
+            raise LinkError(f"cannot look into {path.parent}: {error.strerror}; only its owner or group may") from None
 
 
 def find_directory(group: str | None = None, kind: str = PROXY) -> Directory:
-    """Return the directory of this user, or the one that a group shares. Touches no file.
+    """Return this user's directory, or the one that a group shares. Touches no file.
 
     Args:
         group: The name of the group (default: the variable ``SKYLOOP_GROUP``).
-        kind: Whose sockets in it.
+        kind: Kind of its sockets.
 
     Raises:
         UsageError: The group does not exist, or no directory is configured that its members can reach.
@@ -254,7 +254,7 @@ def _default_path() -> Path:
     import platformdirs
 
     with warnings.catch_warnings():
-        # It warns where there is no XDG_RUNTIME_DIR; that the fallback is safe is checked here.
+        # It warns if there is no XDG_RUNTIME_DIR; the safety of the fallback is checked here.
         warnings.simplefilter("ignore")
         return Path(platformdirs.user_runtime_dir("skyloop", appauthor=False))
 
@@ -267,18 +267,18 @@ def is_live(path: Path) -> bool:
 
 
 def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list[str]]:
-    """Return the names of the proxies that other users run on this host, by user: their sockets are closed to us.
+    """Return the names of other users' proxies on this host, by user: their sockets are closed to us.
 
     Args:
-        table: What ``/proc/net/unix`` holds: the kernel names all sockets to everybody.
-        owner: Returns whose a directory is, as a number; None if that can't be known.
+        table: Content of ``/proc/net/unix``, where the kernel shows the names of all sockets to every user.
+        owner: Returns the user id of a directory's owner; None if unknown.
     """
     found: dict[str, list[str]] = {}
     for line in table.splitlines():
         path = Path(line[line.find("/") :]) if "/" in line else Path()
         name = path.name.removesuffix(_SUFFIXES[PROXY])
         if path.parent.name != "skyloop" or name == path.name or not NAME.fullmatch(name):
-            continue  # a directory of another name may be anybody's, of any program
+            continue  # a directory of another name may belong to any program
         user = owner(path.parent)
         if user is not None and user != os.geteuid() and name not in found.setdefault(user_name(user), []):
             found[user_name(user)].append(name)
@@ -286,7 +286,7 @@ def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list
 
 
 def directory_owner(path: Path) -> int | None:
-    """Return whose a directory is: that of the nearest folder above it where it can't be seen itself."""
+    """Return a directory's owner, or that of its nearest visible parent if it can't be seen itself."""
     for folder in (path, *path.parents):
         with contextlib.suppress(OSError):
             return folder.lstat().st_uid
@@ -294,7 +294,7 @@ def directory_owner(path: Path) -> int | None:
 
 
 def owner_pid(path: Path) -> int | None:
-    """Return the process that listens at this path; None if that is not known at once."""
+    """Return the id of the process that listens at this path; None if that is not known at once."""
     probe = Socket()
     probe.setblocking(False)
     try:
@@ -308,10 +308,10 @@ def connect(path: Path) -> Socket:
     """Connect to the socket at this path.
 
     Raises:
-        OSError: There is none, or nobody accepts within :data:`CONNECT_TIMEOUT_S`.
+        OSError: There is no socket, or no process accepts within :data:`CONNECT_TIMEOUT_S`.
     """
     sock = Socket()
-    # Without it a connect waits for ever where the owner is stopped and its queue of callers is full.
+    # Without a time-out, connecting to a stopped process with a full queue would block for ever.
     set_timeout(sock, socket.SO_SNDTIMEO, CONNECT_TIMEOUT_S)
     sock.connect(os.fspath(path))
     return sock
@@ -324,7 +324,7 @@ def _lock(descriptor: int, path: Path, timeout_s: float) -> None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() > deadline:
-                raise LinkError(f"{path} is locked by another process, which seems to be stopped") from None
+                raise LinkError(f"{path} is locked by another process, which appears to be stopped") from None
             time.sleep(0.005)
         else:
             return

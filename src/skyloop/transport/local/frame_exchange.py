@@ -1,8 +1,8 @@
-"""The server's frame slots: which one is free, who has which, and who waits for the newest frame.
+"""The server's frame slots: which are free, which clients hold them, and which viewers wait for the newest frame.
 
-A frame is copied once, into a slot that nobody has, and each viewer is sent a small packet that names the slot. A
-viewer that has :data:`MAX_LEASES` frames, or whose socket is full, is passed over; as soon as it releases one it is
-sent the newest frame. There are always slots enough, as each viewer can hold only so many.
+A frame is copied once, into a free slot, and each viewer gets a small packet that names the slot. A viewer that holds
+:data:`MAX_LEASES` frames, or whose socket is full, is skipped; once it releases a frame, it gets the newest one. There
+are always enough slots, because each viewer can hold only a limited number.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from skyloop.messages import FrameHeader, encode
 from skyloop.transport.base import Pixels
 from skyloop.transport.local import packets
 
-MAX_LEASES: Final = 4  #: frames of one camera that one client may have: on the way, or in use
+MAX_LEASES: Final = 4  #: frames of one camera that one client may hold: in transit, or in use
 F_SEAL_FUTURE_WRITE: Final = 0x10  # Linux 5.1; missing from Python's fcntl module
-# After mapping it the server keeps its own writeable view; nobody can make another, nor change the size. Were a slot to
-# shrink while a reader has it mapped, reading it would kill the reader (SIGBUS).
+# After mapping it, the server keeps its own writeable view; no one can create another or change the size. If a slot
+# could shrink while a reader has it mapped, reading it would kill the reader (SIGBUS).
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | F_SEAL_FUTURE_WRITE | fcntl.F_SEAL_SEAL
 
 
 class SlotMemory:
-    """One slot at the server: memory for a frame, and how many hold it."""
+    """One slot at the server: memory for a frame, and the number of its holders."""
 
     __slots__ = ("array", "capacity", "fd", "generation", "holders", "number")
 
@@ -41,21 +41,19 @@ class SlotMemory:
 
         Args:
             number: The slot's number on the wire.
-            generation: Which set of its camera's slots it belongs to.
-            capacity: Its size [bytes].
+            generation: The generation of its camera's slots.
+            capacity: Size [bytes].
 
         Raises:
-            OSError: No memory or descriptor is left.
+            OSError: Out of memory or descriptors.
         """
         self.fd = -1
         self.number = number
         self.generation = generation
         self.capacity = capacity
-        self.holders = (
-            0  #: clients that have it, and the server while it writes to it or keeps it for a viewer that waits
-        )
+        self.holders = 0  #: clients that hold it, and the server while it writes to it or keeps it for waiting viewers
         self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.posix_fallocate(self.fd, 0, capacity)  # fails here where memory is short, and not while copying
+        os.posix_fallocate(self.fd, 0, capacity)  # fails here when memory is short, rather than during a copy
         view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
         self.array: Pixels = np.frombuffer(view, np.uint8)
         fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, _SEALS)
@@ -66,11 +64,11 @@ class SlotMemory:
 
 
 def check_support() -> None:
-    """Check that the kernel has what the transport needs.
+    """Check that the kernel supports the transport.
 
     Raises:
-        UnsupportedError: It has no sealed shared memory.
-        LinkError: No memory or descriptor is left.
+        UnsupportedError: The kernel has no sealed shared memory.
+        LinkError: Out of memory or descriptors.
     """
     try:
         SlotMemory(0, 0, mmap.PAGESIZE)
@@ -86,7 +84,7 @@ _Newest = tuple[SlotMemory, bytes]
 
 
 class Connection(Protocol):
-    """What a viewer needs of its connection; both methods raise ``OSError`` when the packet can't be sent now."""
+    """A viewer's connection; both methods raise ``OSError`` if the packet can't be sent now."""
 
     def transmit(self, packet: bytes) -> None: ...
 
@@ -102,20 +100,20 @@ class Viewer:
         self.connection = connection
         self.leases: dict[int, SlotMemory] = {}
         self.announced: set[int] = set()
-        self.retire_before = 0  #: slots below this number were retired, and the client is to be notified; 0: no
-        self.active = True  #: frames are sent to it; if not, it may still hold some
-        self.waits = False  #: it was passed over
+        self.retire_before = 0  #: slots below this number were retired, and the client must be notified; 0: none
+        self.active = True  #: whether it gets frames; if not, it may still hold some
+        self.waits = False  #: whether it was skipped
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
-        """Send a frame, unless the viewer has enough frames or its socket is full.
+        """Send a frame, unless the viewer holds enough frames or its socket is full.
 
         Args:
-            slot: Where the frame is.
-            packet: Announces it.
+            slot: The frame's slot.
+            packet: The packet that announces it.
             camera: The camera's number.
 
         Returns:
-            Whether it was sent; if not, the viewer is marked as waiting.
+            Whether the frame was sent; if not, the viewer is marked as waiting.
         """
         self.waits = True
         if len(self.leases) >= MAX_LEASES:
@@ -142,37 +140,37 @@ class Camera:
 
     Args:
         number: The camera's number on the wire.
-        slot_numbers: Gives numbers to new slots, unique over all cameras.
+        slot_numbers: Yields numbers for new slots, unique over all cameras.
     """
 
     def __init__(self, number: int, slot_numbers: Iterator[int]) -> None:
         self.number = number
-        self.viewers: dict[Connection, Viewer] = {}  # inactive ones only hold some frames still
-        self.active: tuple[Viewer, ...] = ()  # those that frames are sent to
+        self.viewers: dict[Connection, Viewer] = {}  # inactive ones only hold frames
+        self.active: tuple[Viewer, ...] = ()  # those that get frames
         self._generation = 0
         self._geometry: object = None
         self._capacity = 0
         self._free: list[SlotMemory] = []
         self._count = 0  # slots of this generation
         self._slot_numbers = slot_numbers
-        self._next_number = 0  # no slot so far has this number or a higher one
+        self._next_number = 0  # higher than the numbers of all slots so far
         self._newest: _Newest | None = None
 
     def take(self, header: FrameHeader) -> SlotMemory:
         """Return a slot to write a frame to; the writer holds it until :meth:`offer`.
 
         Raises:
-            OSError: No memory or descriptor is left.
+            OSError: Out of memory or descriptors.
         """
         geometry = (header.width, header.height, header.encoding)
         if geometry != self._geometry or header.size > self._capacity:
-            # Compressed frames vary in size: when one outgrows its slots, the next ones get room to spare.
+            # The size of compressed frames varies: when one outgrows its slots, new slots get some spare room.
             grows = geometry == self._geometry
             self.retire()
             self._geometry = geometry
             self._capacity = 1 << (header.size - 1).bit_length() if grows else max(header.size, 1)
         if self._free:
-            slot = self._free.pop()  # the one freed last: it is in the processor's cache
+            slot = self._free.pop()  # the one freed last is still in the processor's cache
         else:
             slot = SlotMemory(next(self._slot_numbers), self._generation, self._capacity)
             self._next_number = slot.number + 1
@@ -184,11 +182,11 @@ class Camera:
         """Send a written slot to all viewers.
 
         Args:
-            slot: From :meth:`take`.
-            packet: Announces the frame.
+            slot: A slot from :meth:`take`.
+            packet: The packet that announces the frame.
 
         Returns:
-            How many viewers were passed over.
+            The number of skipped viewers.
         """
         missed = 0
         for viewer in self.active:
@@ -201,7 +199,7 @@ class Camera:
         return missed
 
     def drop(self, slot: SlotMemory) -> None:
-        """Remove one hold on a slot; without any it is free again."""
+        """Remove one hold on a slot; without holds it is free again."""
         slot.holders -= 1
         if slot.holders == 0 and slot.generation == self._generation:
             self._free.append(slot)
@@ -210,7 +208,7 @@ class Camera:
         """Take a slot back from a viewer, and send it the newest frame if it waits for one.
 
         Returns:
-            False if the viewer did not have the slot.
+            False if the viewer did not hold the slot.
         """
         slot = viewer.leases.pop(number, None)
         if slot is None:
@@ -223,12 +221,12 @@ class Camera:
         return True
 
     def subscribe(self, connection: Connection) -> None:
-        """Send frames to a connection from the next one on."""
+        """Send frames to a connection, starting with the next one."""
         self.viewers.setdefault(connection, Viewer(connection)).active = True
         self._count_active()
 
     def unsubscribe(self, viewer: Viewer) -> None:
-        """Send a viewer no more frames; those it has stay as they are until it releases them."""
+        """Stop sending frames to a viewer; those it holds stay intact until it releases them."""
         viewer.active = viewer.waits = False
         viewer.announced.clear()
         with contextlib.suppress(OSError):  # then it keeps the slots mapped until it ends
@@ -236,7 +234,7 @@ class Camera:
         self._trim()
 
     def leave(self, connection: Connection) -> None:
-        """Remove a client that is gone, and free all slots that it had."""
+        """Remove a client that is gone, and free all its slots."""
         viewer = self.viewers.pop(connection, None)
         if viewer is not None:
             for slot in viewer.leases.values():
@@ -244,7 +242,7 @@ class Camera:
             self._trim()
 
     def _trim(self) -> None:
-        """Give memory back that the remaining viewers cannot need."""
+        """Release memory that the remaining viewers cannot need."""
         self._count_active()
         if not self.active or self._count > (MAX_LEASES * len(self.viewers)) + 2:
             self.retire()
@@ -253,7 +251,7 @@ class Camera:
         self.active = tuple(viewer for viewer in self.viewers.values() if viewer.active)
 
     def retire(self) -> None:
-        """Give the memory of all slots back; that of slots in use when they are released."""
+        """Release the memory of all slots; slots in use follow when they are released."""
         self._keep(None)
         self._generation += 1
         self._geometry = None
@@ -265,14 +263,14 @@ class Camera:
             viewer.retire_before = self._next_number
 
     def _keep(self, newest: _Newest | None) -> None:
-        """Keep a slot for viewers that wait, or none; the hold on ``newest`` passes on from its writer."""
+        """Keep a slot for waiting viewers, or none; the writer's hold on ``newest`` is passed on."""
         before, self._newest = self._newest, newest
         if before is not None:
             self.drop(before[0])
 
 
 class FrameExchange:
-    """All cameras of a server. Thread-safe; nothing is copied under its lock."""
+    """All cameras of a server. Thread-safe; frames are copied outside its lock."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -285,10 +283,10 @@ class FrameExchange:
 
         Args:
             header: The frame's header.
-            pixels: ``header.size`` bytes, dtype uint8, in any shape.
+            pixels: ``header.size`` bytes, dtype uint8, any shape.
 
         Returns:
-            To how many viewers it could not be sent; all of them if no memory is left.
+            The number of viewers that did not get it; all of them if memory ran out.
         """
         camera = self._cameras.get(header.camera)
         if camera is None or not camera.active:
@@ -305,7 +303,7 @@ class FrameExchange:
             return camera.offer(slot, packet)
 
     def subscribe(self, connection: Connection, name: str) -> None:
-        """Send a camera's frames to a connection, from the next one on."""
+        """Send a camera's frames to a connection, starting with the next one."""
         with self._lock:
             camera = self._cameras.get(name)
             if camera is None:
@@ -313,7 +311,7 @@ class FrameExchange:
             camera.subscribe(connection)
 
     def unsubscribe(self, connection: Connection, name: str) -> None:
-        """Send a camera's frames to a connection no longer."""
+        """Stop sending a camera's frames to a connection."""
         with self._lock:
             camera = self._cameras.get(name)
             viewer = camera.viewers.get(connection) if camera is not None else None
@@ -321,7 +319,7 @@ class FrameExchange:
                 camera.unsubscribe(viewer)
 
     def release(self, connection: Connection, slot: int) -> bool:
-        """Take a slot back from a client; return False if it did not have it."""
+        """Take a slot back from a client; return False if the client did not hold it."""
         with self._lock:
             for camera in self._cameras.values():
                 viewer = camera.viewers.get(connection)
@@ -334,5 +332,5 @@ class FrameExchange:
         with self._lock:
             for name, camera in list(self._cameras.items()):
                 camera.leave(connection)
-                if not camera.viewers:  # it is made again for the next one: no name is kept for nobody
+                if not camera.viewers:  # recreated for the next viewer: unused names must not accumulate
                     del self._cameras[name]

@@ -1,6 +1,6 @@
-"""The local transport's own packets: bytes to typed tuples and back, as pure functions.
+"""The local transport's own packets: pure functions between bytes and typed tuples.
 
-They share the header of all packets and have kinds from 0x40, which no sample has. ``docs/wire-format.md`` has the
+They share the header of all packets and use kinds from 0x40, which no sample has. ``docs/wire-format.md`` has the
 tables.
 """
 
@@ -15,25 +15,25 @@ from skyloop.messages import FrameHeader, decode
 from skyloop.messages.codec import HEADER, HEADER_SIZE, SIGNATURE, VERSION
 from skyloop.transport.base import MAX_TOPIC
 
-REVISION: Final = 1  #: of the local transport's own packets
+REVISION: Final = 1  #: revision of the local transport's own packets
 MAX_REASON: Final = 400  #: bytes of UTF-8
 
 
 class LocalKind(IntEnum):
-    """The kinds of packets that the two ends exchange between themselves."""
+    """Kinds of packets that the two ends exchange between themselves."""
 
     HELLO = 0x40  #: first packet of a client
     SUBSCRIBE = 0x41  #: client to server
-    RELEASE = 0x42  #: client to server: the frame in this slot is not used any more
+    RELEASE = 0x42  #: client to server: the frame in this slot is no longer used
     SLOT = 0x43  #: server to client, with the slot's descriptor
-    FRAME = 0x44  #: server to client: a slot is filled
-    RETIRE = 0x45  #: server to client: older slots of a camera will not be used any more
-    BYE = 0x46  #: either way: why the connection ends
+    FRAME = 0x44  #: server to client: a slot holds a frame
+    RETIRE = 0x45  #: server to client: older slots of a camera will not be used again
+    BYE = 0x46  #: either direction: why the connection ends
     WAKE = 0x47  #: client to server: sent before each command by older applications, and ignored
 
 
-# The sixth byte of a packet is its kind: these are compared with it as it stands there.
-OWN: Final = bytes([LocalKind.HELLO])  #: from here on, a packet is the transport's own
+# A packet's sixth byte is its kind; it is compared with these without conversion.
+OWN: Final = bytes([LocalKind.HELLO])  #: from this kind on, packets are the transport's own
 FRAME: Final = bytes([LocalKind.FRAME])
 
 
@@ -51,13 +51,13 @@ class Subscribe(NamedTuple):
 
 
 class Release(NamedTuple):
-    """A client gives a slot back."""
+    """A client returns a slot."""
 
     slot: int
 
 
 class Slot(NamedTuple):
-    """A slot that frames of a camera will come in; ``capacity`` is in bytes."""
+    """A slot for frames of a camera; ``capacity`` is in bytes."""
 
     slot: int
     camera: int
@@ -65,14 +65,14 @@ class Slot(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A frame that was written to a slot."""
+    """A frame in a slot."""
 
     slot: int
     header: FrameHeader
 
 
 class Retire(NamedTuple):
-    """Slots of a camera below the number ``before`` are not used any more."""
+    """A camera's slots with numbers below ``before`` are no longer used."""
 
     camera: int
     before: int
@@ -94,7 +94,7 @@ _FRAME_PREFIX = struct.Struct(HEADER.format + "I")
 
 
 def is_own(packet: bytes) -> bool:
-    """Return whether a packet is for the transport itself and not for the handler."""
+    """Return whether a packet is for the transport itself rather than the handler."""
     return packet[5:6] >= OWN and packet.startswith(SIGNATURE)
 
 
@@ -122,7 +122,7 @@ def frame(number: int, header: bytes) -> bytes:
     """Encode a :class:`Frame`.
 
     Args:
-        number: The slot's.
+        number: The slot's number.
         header: The whole packet of the :class:`FrameHeader`.
     """
     return _FRAME_PREFIX.pack(SIGNATURE, VERSION, LocalKind.FRAME, 0, _NUMBER.size + len(header), number) + header
@@ -146,10 +146,10 @@ def parse(packet: bytes) -> Message:
     """Decode one of the transport's own packets.
 
     Raises:
-        DecodeError: It is not one, or it is damaged.
+        DecodeError: The packet is of another kind, or damaged.
     """
     if len(packet) < HEADER_SIZE:
-        raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
+        raise DecodeError(f"{len(packet)} bytes are too few for the header of {HEADER_SIZE}")
     if packet[5:6] == FRAME:
         return parse_frame(packet)
     signature, version, kind, reserved, length = HEADER.unpack_from(packet)
@@ -176,26 +176,26 @@ _FIXED: Final[dict[int, tuple[struct.Struct, type[Hello | Release | Slot | Retir
 
 
 def parse_frame(packet: bytes) -> Frame:
-    """Decode a frame's packet, header and slot in one go, as it comes often.
+    """Decode a frame's packet, header and slot in one step, as these are frequent.
 
     Raises:
-        DecodeError: It is not one, or it is damaged.
+        DecodeError: The packet is of another kind, or damaged.
     """
     if len(packet) < _FRAME_PREFIX.size:
-        raise DecodeError(f"{len(packet)} bytes are less than the {_FRAME_PREFIX.size} before the header of a frame")
+        raise DecodeError(f"{len(packet)} bytes are too few for the {_FRAME_PREFIX.size} before the header of a frame")
     signature, version, _, reserved, length, slot = _FRAME_PREFIX.unpack_from(packet)
     if signature != SIGNATURE or version != VERSION or reserved or length != len(packet) - HEADER_SIZE:
         raise DecodeError(f"not a frame packet of the local transport: header {packet[:HEADER_SIZE].hex(' ')}")
     header = decode(packet[_FRAME_PREFIX.size :])
     if type(header) is not FrameHeader:
-        raise DecodeError(f"a frame was announced by a {type(header).__name__} and must be by a FrameHeader")
+        raise DecodeError(f"a frame was announced by a {type(header).__name__} and must be announced by a FrameHeader")
     return Frame(slot, header)
 
 
 def _parse_subscribe(body: bytes) -> Subscribe:
     on, topic = body[0], body[1:].decode()
     if on > 1 or not 0 < len(topic) <= MAX_TOPIC:
-        raise DecodeError(f"a subscription of {len(topic)} characters with flag {on}")
+        raise DecodeError(f"invalid subscription: {len(topic)} characters, flag {on}")
     return Subscribe(topic, bool(on))
 
 

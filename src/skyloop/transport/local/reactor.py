@@ -1,13 +1,13 @@
-"""One thread that receives for any number of local transport servers, and can be split when one of them blocks it.
+"""One thread that receives for many local transport servers; the others can leave it when one of them blocks it.
 
-A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call less, and is the
-better choice for one vehicle. For a hundred it is two hundred threads that wake one another: here one thread waits for
-all connections (epoll), takes in all that is there, and handles one packet of each connection in turn: landings and
-stops first, then set-points, then the rest, with some turns for each of them, however much of the others there is.
+A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call less, which is
+better for one vehicle. For a hundred vehicles that makes two hundred threads that wake one another. Here, one thread
+waits for all connections (epoll), reads all available packets, and handles one packet of each connection in turn.
+Landings and stops come first, then set-points, then the rest; each class gets some turns, however busy the others are.
 
-What a handler does is done on this thread. While it calls one, :attr:`Reactor.inside` has its server and
-:attr:`Reactor.entries` counts the calls, so that somebody else notices a call that does not come back:
-:meth:`Reactor.split` then leaves this thread to that server alone and moves all others to a new reactor.
+Handlers run on this thread. During a call, :attr:`Reactor.inside` holds its server and :attr:`Reactor.entries` counts
+the calls, so that a watchdog notices a call that does not return: :meth:`Reactor.split` then leaves this thread to that
+server alone and moves all others to a new reactor.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from skyloop.transport.local.server import HELLO_S, LocalServer
 from skyloop.transport.local.sockets import RECEIVE_FLAGS, ServerConnection, Socket
 from skyloop.transport.priority import MOST_PACKETS, Lane, is_command
 
-CHECK_S: Final = 0.5  #: how often silent connections, and listeners that could not accept, are looked at
+CHECK_S: Final = 0.5  #: how often to check silent connections, and listeners that could not accept
 _AFTER_FAILURE_S: Final = 0.01
-_PAUSE_S: Final = 100e-6  # waiting for so long shows that nothing was waiting
-_IN_A_ROW: Final = 8  # packets that are handled before it is looked for new ones
+_PAUSE_S: Final = 100e-6  # a wait this long shows that nothing was pending
+_IN_A_ROW: Final = 8  # packets handled before the next check for new ones
 _FIRST_COME: Final = tuple(Lane)
-#: Which lane has the next turn: where there is always something urgent, the others have one in four each.
+#: The lane of each turn: even if there is always something urgent, the others each get one turn in four.
 _ORDERS: Final = (
     _FIRST_COME,
     (Lane.STEERING, Lane.URGENT, Lane.OTHERS),
     _FIRST_COME,
     (Lane.OTHERS, Lane.URGENT, Lane.STEERING),
 )
-_LOOK_S: Final = 0.1  # how often a wait for connections looks whether their thread has ended
+_LOOK_S: Final = 0.1  # how often a wait for connections checks whether their thread has ended
 _log = logging.getLogger(__name__)
 
 
@@ -48,7 +48,7 @@ class Source:
     """A socket that a reactor waits for: a server's listener, or one of its connections.
 
     Args:
-        server: Whose it is.
+        server: The socket's server.
         sock: The listener; None for a connection.
         connection: The connection; None for a listener.
     """
@@ -63,9 +63,9 @@ class Source:
         self.connection = connection
         self.fileno = sock.fileno() if sock is not None else connection.fileno() if connection is not None else -1
         self.since_s = time.monotonic()
-        self.lane: Lane | None = None  #: in which it waits for its turn
+        self.lane: Lane | None = None  #: the lane it waits in
         self.ended = False
-        self.muted = False  #: not waited for until the next check
+        self.muted = False  #: ignored until the next check
 
 
 class _Thread(threading.Thread):
@@ -73,10 +73,10 @@ class _Thread(threading.Thread):
 
 
 class Reactor:
-    """Receives for transport servers on one thread, from its construction to :meth:`close`."""
+    """Receives for transport servers on one thread, from construction to :meth:`close`."""
 
     def __init__(self) -> None:
-        self.inside: SharedLocalServer | None = None  #: whose handler is being called, or may be
+        self.inside: SharedLocalServer | None = None  #: server whose handler is, or may be, running
         self.entries = 0  #: how often :attr:`inside` was set
         self._lock = threading.Lock()  # guards the table
         self._sources: dict[int, Source] = {}  # by file descriptor
@@ -84,20 +84,20 @@ class Reactor:
         self._waker = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._epoll.register(self._waker, select.EPOLLIN)
         self._closing = False
-        self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # have packets that are not handled yet
+        self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # sources with unhandled packets
         self._resumed: deque[Source] = deque()
         self._turns = 0
         self._thread = _Thread(target=self._run, name="skyloop-reactor", daemon=True)
         self._thread.start()
 
     def add(self, source: Source) -> None:
-        """Wait for a socket. Any thread."""
+        """Start waiting for a socket. Thread-safe."""
         with self._lock:
             self._sources[source.fileno] = source
             self._epoll.register(source.fileno, select.EPOLLIN)
 
     def remove(self, source: Source) -> bool:
-        """Wait for a socket no longer; return whether it was waited for here. Any thread."""
+        """Stop waiting for a socket; return whether this reactor waited for it. Thread-safe."""
         with self._lock:
             if self._sources.get(source.fileno) is not source:
                 return False
@@ -108,49 +108,49 @@ class Reactor:
 
     @property
     def over(self) -> bool:
-        """Whether its thread has ended, so that nobody receives for its servers any more."""
+        """Whether its thread has ended, so that nothing receives for its servers."""
         return not self._thread.is_alive()
 
     def left_of(self, server: SharedLocalServer) -> list[Source]:
-        """Return the sockets of a server that were left when the thread ended; none while it runs. Any thread."""
+        """Return a server's sockets that remained when the thread ended; none while it runs. Thread-safe."""
         with self._lock:
             return [source for source in self._sources.values() if source.server is server] if self.over else []
 
     @property
     def empty(self) -> bool:
-        """Whether it waits for no socket."""
+        """Whether it has no sockets."""
         return not self._sources
 
     def split(self, stuck: SharedLocalServer) -> Reactor:
-        """Leave this reactor to one server, and return a new one that receives for all others. Any thread.
+        """Leave this reactor to one server, and return a new one that receives for all others. Thread-safe.
 
         No packet is lost, none is delivered twice, and the packets of each connection keep their order.
 
         Args:
-            stuck: The server whose handler the thread is in.
+            stuck: The server whose handler blocks the thread.
         """
         with self._lock:
             moved = [source for source in self._sources.values() if source.server is not stuck]
         new = Reactor()
         for server in {source.server for source in moved}:
-            server.reactor = new  # from here on this thread handles nothing of theirs any more
+            server.reactor = new  # from here on, this thread handles none of their packets
         for source in moved:
             self.hand_over(source, new)
         new.resume(source for source in moved if source.lane is not None)
         return new
 
     def hand_over(self, source: Source, other: Reactor) -> None:
-        """Let another reactor wait for a socket. Any thread."""
+        """Move a socket to another reactor. Thread-safe."""
         if self.remove(source):
             other.add(source)
 
     def resume(self, sources: Iterable[Source]) -> None:
-        """Handle packets that another reactor has received. Any thread."""
+        """Handle packets that another reactor has received. Thread-safe."""
         self._resumed.extend(sources)
         self._wake()
 
     def close(self) -> None:
-        """End the thread, after what it is doing. Its servers are stopped before. Idempotent."""
+        """End the thread after its current work. Stop its servers first. Idempotent."""
         if not self._closing:
             self._closing = True
             self._wake()
@@ -171,8 +171,8 @@ class Reactor:
                 self.inside = None
             begun_s = time.monotonic()
             ready = self._epoll.poll(0 if busy else CHECK_S)
-            # After a pause, a single packet is not one of many. Looking for more behind each of many would cost a
-            # system call each: all sockets are asked together, again and again until there is nothing new.
+            # After a pause, a single packet is just one. Among many, checking each socket for another packet would cost
+            # one system call each: all sockets are polled together instead, until nothing new arrives.
             waited = time.monotonic() - begun_s > _PAUSE_S
             try:
                 if self._receive(ready, at_once=waited and len(ready) == 1):
@@ -186,15 +186,15 @@ class Reactor:
                 if time.monotonic() - checked_s >= CHECK_S:
                     checked_s = time.monotonic()
                     self._check()
-            except Exception:  # noqa: BLE001  nothing else receives for these servers: this thread must go on
-                _log.exception("a turn of the receiving thread failed; it goes on")
-                time.sleep(_AFTER_FAILURE_S)  # what failed is still there, and must not take the whole processor
+            except Exception:  # noqa: BLE001  nothing else receives for these servers: this thread must continue
+                _log.exception("a turn of the receiving thread failed; it continues")
+                time.sleep(_AFTER_FAILURE_S)  # the cause persists and must not use up the whole processor
         self.inside = None
         os.close(self._waker)
         self._epoll.close()
 
     def _receive(self, ready: list[tuple[int, int]], *, at_once: bool) -> bool:
-        """Take a packet of each socket, so that what is urgent is found, and what is superseded.
+        """Read a packet from each socket, so that urgent and superseded ones are known.
 
         Returns:
             Whether more may wait behind one of them.
@@ -213,7 +213,7 @@ class Reactor:
         return more
 
     def line_up(self, source: Source, lane: Lane | None) -> None:
-        """Give a source a turn in a lane; None: in none. On the reactor's thread."""
+        """Queue a source for a turn in a lane; None: in no lane. On the reactor's thread."""
         if lane is not None:
             self._lanes[lane].append(source)
 
@@ -233,13 +233,13 @@ class Reactor:
         self.entries += 1
 
     def mute(self, source: Source) -> None:
-        """Do not wait for a listener until the next check: it can't accept, and would be ready all the time."""
+        """Ignore a listener until the next check: it can't accept, but would always be ready."""
         source.muted = True
         with self._lock, contextlib.suppress(OSError):
             self._epoll.modify(source.fileno, 0)
 
     def _check(self) -> None:
-        """End connections that sent nothing, and try listeners again."""
+        """End connections that sent nothing, and retry listeners."""
         now_s = time.monotonic()
         with self._lock:
             sources = list(self._sources.values())
@@ -256,26 +256,25 @@ class Reactor:
 class SharedLocalServer(LocalServer):
     """A :class:`LocalServer` that shares its receiving thread with others.
 
-    Its handler has to return quickly as ever: what it delays is delayed for all of them, until somebody calls
-    :meth:`Reactor.split`.
+    Its handler must return quickly: a delay affects all of these servers, until :meth:`Reactor.split` is called.
 
     Args:
         name: The proxy's name.
-        reactor: Receives for it, until it is split.
-        group: A group of users whose members may connect as well (default: the variable ``SKYLOOP_GROUP``).
+        reactor: The reactor that receives for it, until a split.
+        group: A group of users whose members may also connect (default: the variable ``SKYLOOP_GROUP``).
 
     Raises:
-        UsageError: The name or the group is not valid, or the socket's path would be too long.
+        UsageError: The name or the group is invalid, or the socket's path would be too long.
     """
 
     def __init__(self, name: str, reactor: Reactor, *, group: str | None = None) -> None:
         super().__init__(name, group=group)
-        self.reactor = reactor  #: which receives for it now
+        self.reactor = reactor  #: the reactor that receives for it at present
         self._handler: ServerHandler | None = None
         self._listening: Source | None = None
         self._inode = 0
         self._served: set[ServerConnection] = set()
-        self._left = threading.Condition()  # guards the set, and is notified when a connection has gone
+        self._left = threading.Condition()  # guards the set; notified when a connection has gone
 
     def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
         listener.setblocking(False)
@@ -284,42 +283,42 @@ class SharedLocalServer(LocalServer):
         self._listening = Source(self, sock=listener)
         self.reactor.add(self._listening)
 
-    def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the source has it)
+    def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the source owns it)
         source, self._listening = self._listening, None
         if source is not None:
             self._drop(source)
         self._directory.remove(self._name, self._inode)
         for connection in list(self._connections):
             connection.hang_up("the proxy stopped")
-        # A handler that stops its own server does not wait for itself.
+        # A handler that stops its own server must not wait for itself.
         if not isinstance(threading.current_thread(), _Thread):
             with self._left:
                 while self._served and not self.reactor.over:
                     self._left.wait(_LOOK_S)
             with self._lock:
-                for left in self.reactor.left_of(self):  # its thread ended first: nobody else gives them back
+                for left in self.reactor.left_of(self):  # the thread ended first: nothing else returns these
                     assert left.connection is not None
                     self._finish_connection(left, left.connection, "the proxy stopped")
 
     def _drop(self, source: Source) -> None:
-        """Let no reactor wait for a socket any more."""
+        """Remove a socket from all reactors."""
         source.ended = True
-        self.reactor.remove(source)  # one that is on its way to another reactor is dropped there, at first sight
+        self.reactor.remove(source)  # a socket on its way to another reactor is dropped there, on first sight
 
     # --- the reactor's thread ---
 
     def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
-        """Take in a caller, or a packet of a connection.
+        """Accept a connection, or read a packet of one.
 
         Args:
-            reactor: Whose thread it is.
-            source: Is readable.
-            at_once: Whether nothing else waits for the thread, so that a command is handled here.
+            reactor: The reactor of this thread.
+            source: The readable source.
+            at_once: Whether nothing else waits for this thread, so that a command is handled here.
 
         Returns:
-            Whether the packet waits for :meth:`deliver`, and more may wait behind it.
+            Whether the packet waits for :meth:`deliver`, possibly with more behind it.
         """
-        with self._lock:  # from receiving to handling, so that after a split nothing overtakes what this thread has
+        with self._lock:  # from receiving to handling, so that after a split nothing overtakes this thread's packet
             if not self._is_mine(reactor, source):
                 return False
             connection = source.connection
@@ -332,7 +331,7 @@ class SharedLocalServer(LocalServer):
             try:
                 packet = connection.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
             except (BlockingIOError, ConnectionResetError):
-                return False  # after a reset, what was sent before it still comes, and then the end
+                return False  # after a reset, packets sent before it still arrive, and then the end
             except OSError as error:
                 self._finish_connection(source, connection, f"receiving failed: {error}")
                 return False
@@ -346,19 +345,19 @@ class SharedLocalServer(LocalServer):
             return connection.pilot and bool(packet)
 
     def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
-        """Handle the first packet that waits in a source.
+        """Handle the first waiting packet of a source.
 
         Args:
-            reactor: Whose thread it is.
-            source: Was in this lane.
+            reactor: The reactor of this thread.
+            source: The source, from this lane.
             lane: The lane.
 
         Returns:
-            The lane that the source is to be put in again; None: in none.
+            The lane to queue the source in again; None: no lane.
         """
         with self._lock:
             if not self._is_mine(reactor, source) or source.lane is not lane:
-                return None  # else it has become more urgent, and was in that lane
+                return None  # it has become more urgent and moved to that lane
             source.lane = None
             connection = source.connection
             if connection is None or not connection.backlog:
@@ -367,7 +366,7 @@ class SharedLocalServer(LocalServer):
             return None if source.ended else self._lane(source, connection)
 
     def _lane(self, source: Source, connection: ServerConnection) -> Lane | None:
-        """Return the lane that a source is to be put in; None: nothing waits, or it is in that lane already."""
+        """Return the lane to queue a source in; None: nothing waits, or it is already in that lane."""
         lane = connection.backlog.lane
         if lane is Lane.URGENT and not connection.pilot:
             lane = Lane.STEERING  # it will be refused
@@ -377,7 +376,7 @@ class SharedLocalServer(LocalServer):
         return lane
 
     def end_silent(self, reactor: Reactor, source: Source, now_s: float) -> None:
-        """End a connection that takes too long to send its first packet."""
+        """End a connection whose first packet takes too long."""
         with self._lock:
             connection = source.connection
             if connection is None or now_s - source.since_s <= HELLO_S or not self._is_mine(reactor, source):
@@ -385,7 +384,7 @@ class SharedLocalServer(LocalServer):
             self._finish_connection(source, connection, f"it sent no Hello within {HELLO_S:g} s")
 
     def _is_mine(self, reactor: Reactor, source: Source) -> bool:
-        """Return whether this reactor still receives from it; pass it on or drop it if not."""
+        """Return whether this reactor still receives from a source; otherwise pass it on or drop it."""
         if source.ended:
             reactor.remove(source)
             return False
@@ -412,11 +411,11 @@ class SharedLocalServer(LocalServer):
             with self._left:
                 self._served.add(connection)
             reactor.add(Source(self, connection=connection))
-            if self._stopping.is_set():  # it came while the others were sent away
+            if self._stopping.is_set():  # it arrived while the others were being disconnected
                 connection.hang_up("the proxy stopped")
 
     def _handle(self, source: Source, connection: ServerConnection, packet: bytes) -> None:
-        """Handle one packet, whatever the handler raises."""
+        """Handle one packet; survive whatever the handler raises."""
         handler = self._handler
         assert handler is not None
         try:

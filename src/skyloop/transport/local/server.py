@@ -1,9 +1,9 @@
 """The proxy's end of the local transport: one connection and one receiving thread per application.
 
-A thread of its own that waits in ``recv`` delivers a packet with one system call; waiting for all connections at once
-(epoll) needs two, which made the delay of a command a third longer on an idle machine. The threads take turns at the
-handler, so that it gets one call at a time as the contract says: those that bring a command first, the others in the
-order of their arrival. A thread that comes late takes all that waits for it, and of the set-points hands on the newest.
+A dedicated thread in ``recv`` delivers a packet with one system call. Waiting for all connections at once (epoll) needs
+two, which made the delay of a command a third longer on an idle machine. The threads take turns at the handler, so that
+it gets one call at a time as the contract demands: those with a command first, the others in order of arrival. A thread
+whose turn comes late reads all its waiting packets and passes on only the newest of the set-points.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from skyloop.transport.local.sockets import Credentials, ServerConnection, Socke
 from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128
-#: Of them, so that no program alone can take all: a page of the cockpit that flies has a connection of its own.
+#: Per process, so that no program can take all; a cockpit's page that flies has its own connection.
 MAX_PER_PROCESS: Final = 64
-MAX_PER_USER: Final = 64  #: of a user who is let in by a group; the proxy's own has all that others leave
-PILOT_PLACES: Final = 32  #: that observers do not get
-HELLO_S: Final = 2.0  #: how long a connection may take for the first packet, which is sent with the connection
+MAX_PER_USER: Final = 64  #: per user with access through a group; the proxy's own user may use all remaining places
+PILOT_PLACES: Final = 32  #: places reserved for pilots
+HELLO_S: Final = 2.0  #: time limit for the first packet, which clients send as they connect
 _RETRY_ACCEPT_S: Final = 0.2
 _VIDEO: Final = video("")
 _log = logging.getLogger(__name__)
@@ -49,30 +49,30 @@ _log = logging.getLogger(__name__)
 class LocalServer(TransportServer):
     """A proxy's end, found on this host by its name. It can be started once.
 
-    :meth:`start` raises :class:`NameTakenError` where a running proxy has the name, :class:`LinkError` where the
-    directory of sockets is not safe, and :class:`UnsupportedError` where the kernel lacks what is needed.
+    :meth:`start` raises :class:`NameTakenError` if a running proxy uses the name, :class:`LinkError` if the directory
+    of sockets is not safe, and :class:`UnsupportedError` if the kernel lacks a required feature.
 
     Args:
         name: The proxy's name.
-        group: A group of users whose members may connect as well (default: the variable ``SKYLOOP_GROUP``).
+        group: A group of users whose members may also connect (default: the variable ``SKYLOOP_GROUP``).
 
     Raises:
-        UsageError: The name or the group is not valid, or the socket's path would be too long.
+        UsageError: The name or the group is invalid, or the socket's path would be too long.
     """
 
     def __init__(self, name: str, *, group: str | None = None) -> None:
         check_name(name)
         self._name = name
         self._directory = find_directory(group)
-        self._directory.socket_path(name)  # here, and not only when it starts, it says that the path is too long
+        self._directory.socket_path(name)  # raises here, rather than on start, if the path is too long
         self._exchange = FrameExchange()
-        # Changed under the lock only, and read by all: the tuples are replaced and never changed.
+        # Replaced under the lock only, never changed in place, so that any thread may read them.
         self._connections: set[ServerConnection] = set()
-        self._peers: dict[int, ServerConnection] = {}  # by the peer's number
+        self._peers: dict[int, ServerConnection] = {}  # by number of the peer
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
         self._lock = PriorityLock()  # its holder may call the handler
         self._receivers: set[int] = set()  # identities of the receiving threads
-        self._superseded = 0  # commands, by newer ones that waited behind them
+        self._superseded = 0  # commands replaced by newer ones behind them
         self._last_id = 0
         self._started = False
         self._state_lock = threading.Lock()  # guards starting and stopping
@@ -83,7 +83,7 @@ class LocalServer(TransportServer):
     def start(self, handler: ServerHandler) -> None:
         with self._state_lock:
             if self._started:
-                raise UsageError(f"{self.address} was started before: make a new {type(self).__name__}")
+                raise UsageError(f"{self.address} was started before: create a new {type(self).__name__}")
             check_support()
             listener, inode = self._directory.listen(self._name)
             self._started = True
@@ -91,7 +91,7 @@ class LocalServer(TransportServer):
             self._begin(handler, listener, inode)
 
     def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
-        """Accept and receive from now on."""
+        """Start to accept and receive."""
         self._thread = threading.Thread(
             target=self._run, args=(handler, listener, inode), name=f"skyloop-{self._name}-server", daemon=True
         )
@@ -103,14 +103,14 @@ class LocalServer(TransportServer):
             if listener is None:
                 return
             self._stopping.set()
-            listener.hang_up()  # wakes who accepts
+            listener.hang_up()  # wakes the accepting thread
         self._finish(listener)
 
-    def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (who accepts has it)
-        """Wait until all has ended."""
+    def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the accepting thread owns it)
+        """Wait until everything has ended."""
         thread = self._thread
         if thread is not None and threading.get_ident() not in self._receivers:
-            thread.join()  # a handler that stops its own server does not wait for itself
+            thread.join()  # a handler that stops its own server must not wait for itself
 
     def send(self, peer: Peer, packet: bytes) -> bool:
         check_packet(packet)
@@ -148,7 +148,9 @@ class LocalServer(TransportServer):
                 return ""
             observers = sum(other.admitted and not other.pilot for other in self._peers.values())
             if not pilot and observers >= MAX_CLIENTS - PILOT_PLACES:
-                return f"{self.address} has {observers} observers; the other {PILOT_PLACES} places are kept for pilots"
+                return (
+                    f"{self.address} has {observers} observers; the other {PILOT_PLACES} are reserved for pilots"
+                )
             connection.admitted, connection.pilot = True, pilot
             return ""
 
@@ -182,12 +184,12 @@ class LocalServer(TransportServer):
                 thread.join()
 
     def _accept(self, handler: ServerHandler, listener: Socket) -> threading.Thread | None:
-        """Accept one caller and begin to receive from it; return its receiving thread, None if there is none."""
+        """Accept one connection and start to receive from it; return its receiving thread, or None."""
         try:
             accepted, _ = listener.accept()
         except OSError as error:
             if not self._stopping.is_set() and not isinstance(error, ConnectionError):
-                # Out of descriptors or memory: without a pause this thread would do nothing else but try.
+                # Out of descriptors or memory: without a pause, this thread would only spin.
                 _log.warning("%s cannot accept: %s", self.address, error)
                 self._stopping.wait(_RETRY_ACCEPT_S)
             return None
@@ -201,14 +203,14 @@ class LocalServer(TransportServer):
         try:
             thread.start()
         except RuntimeError as error:  # no more threads
-            connection.hang_up(f"{self.address} cannot serve it: {error}")
+            connection.hang_up(f"{self.address} cannot serve this connection: {error}")
             with self._lock:
                 self._connections.discard(connection)
             return None
         return thread
 
     def _let_in(self, sock: Socket) -> ServerConnection | None:
-        """Return the connection of who called; None for one that may not connect, or has no place."""
+        """Return the caller's connection; None if it may not connect, or there is no place."""
         who = credentials(sock)
         if not may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
@@ -224,27 +226,25 @@ class LocalServer(TransportServer):
         return connection
 
     def _make_room(self, who: Credentials) -> str:
-        """Find a place for a caller; return why there is none, empty if there is.
+        """Find a place for a new connection; return why there is none, or an empty text.
 
-        Where all places are taken, the oldest connection that has not sent who it is gives way, so that such
-        connections keep nobody out, however many they are.
+        If all places are taken, the oldest connection that has not identified itself gives way. So any number of such
+        connections can't keep others out.
         """
         with self._lock:
             present = [connection for connection in self._connections if not connection.ending]
-            # In a namespace of processes that is not ours a process has no number: 0.
+            # A process outside our process namespace has the number 0.
             if who.pid and sum(other.who.pid == who.pid for other in present) >= MAX_PER_PROCESS:
-                return f"pid {who.pid} has {MAX_PER_PROCESS} connections to {self.address} already: end some of them"
+                return f"pid {who.pid} has {MAX_PER_PROCESS} connections to {self.address}: end some of them"
             if who.uid not in (0, os.geteuid()) and sum(other.who.uid == who.uid for other in present) >= MAX_PER_USER:
-                return (
-                    f"{user_name(who.uid)} has {MAX_PER_USER} connections to {self.address} already: end some of them"
-                )
+                return f"{user_name(who.uid)} has {MAX_PER_USER} connections to {self.address}: end some of them"
             if len(present) < MAX_CLIENTS:
                 return ""
             silent = [connection for connection in present if not connection.admitted]
             if not silent:
-                return f"{self.address} has {MAX_CLIENTS} connections already, and takes no more"
+                return f"{self.address} has {MAX_CLIENTS} connections and accepts no more"
             oldest = min(silent, key=lambda connection: connection.peer.id)
-            oldest.hang_up(f"its place at {self.address} was given to a newer connection: it had sent no Hello")
+            oldest.hang_up(f"it sent no Hello, so its place at {self.address} went to a newer connection")
             return ""
 
     # --- the receiving threads ---
@@ -261,22 +261,22 @@ class LocalServer(TransportServer):
         self._receivers.discard(threading.get_ident())
 
     def _receive(self, handler: ServerHandler, connection: ServerConnection) -> str:
-        """Hand packets on, and return why it ended. Raises what the handler raises."""
+        """Pass packets on; return why the connection ended. Re-raises the handler's errors."""
         receive, poll, lock, backlog = connection.receive, connection.poll, self._lock, connection.backlog
         while True:
             try:
                 packet = receive(MAX_PACKET + 1)
             except ConnectionResetError:
-                continue  # what was sent before it still comes, and then the end
+                continue  # packets sent before it still arrive, and then the end
             except BlockingIOError:
                 return f"it sent no Hello within {HELLO_S:g} s"
             except OSError as error:
                 return f"receiving failed: {error}"
             if packet == packets.WAKE and connection.joined:
-                continue  # at once: the command that follows it does not wait in line with it
+                continue  # at once: a command behind it must not wait in line with it
             lock.acquire(is_command(packet))
             try:
-                if connection.pilot and poll(0):  # it waited: what came meanwhile may supersede it
+                if connection.pilot and poll(0):  # it waited: packets that arrived since may supersede it
                     backlog.put(packet)
                     packet = self._next(connection)
                 reason = self._take(handler, connection, packet)
@@ -292,14 +292,14 @@ class LocalServer(TransportServer):
                 return reason
 
     def _next(self, connection: ServerConnection) -> bytes:
-        """Take in all that waits, and return what is to be handled first. The lock is held."""
+        """Read all waiting packets, and return the one to handle first. The lock is held."""
         self._superseded += connection.take_in()
         return connection.backlog.get()
 
     def _take(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> str:
-        """Handle one packet; return why the connection ends with it, empty if it goes on. The lock is held."""
+        """Handle one packet; return why it ends the connection, empty if it does not. The lock is held."""
         if not packet or connection.ending:
-            # An empty packet cannot be distinguished from the end, so it counts as one.
+            # An empty packet can't be distinguished from the end of the connection, so it counts as that.
             return f"the application is gone ({connection.peer.address})"
         if len(packet) > MAX_PACKET:
             return f"it sent a packet of more than {MAX_PACKET} bytes"
@@ -310,9 +310,9 @@ class LocalServer(TransportServer):
         return ""
 
     def _welcome(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
-        """Handle a connection's first packet. A process that only asks who listens here sends none."""
+        """Handle a connection's first packet. A process that only asks which process listens sends none."""
         if packet != packets.hello():
-            connection.hang_up(f"its Hello is not that of revision {packets.REVISION} of the local transport")
+            connection.hang_up(f"its Hello is not of revision {packets.REVISION} of the local transport")
             return
         connection.limit_silence(0.0)
         connection.joined = True
@@ -323,7 +323,7 @@ class LocalServer(TransportServer):
         """Handle one of the transport's own packets.
 
         Returns:
-            False for one that makes no sense: it is left to the handler, as any garbage is.
+            False for one that makes no sense: the handler gets it, like any garbage.
         """
         try:
             message = packets.parse(packet)
@@ -381,12 +381,12 @@ class LocalServer(TransportServer):
 
 
 def _problem(topic: str, subscribed: int) -> str:
-    """Return why an application can't subscribe to a topic that exists; empty if it can.
+    """Return why an application can't subscribe to an existing topic; empty if it can.
 
     Args:
         topic: The topic.
-        subscribed: How many topics the application has.
+        subscribed: Number of topics that the application has.
     """
     if topic.startswith(_VIDEO) and "?" in topic:
-        return f"{topic[:64]!r}: frames come as they are on one host; subscribe to {topic.partition('?')[0][:64]!r}"
+        return f"{topic[:64]!r}: frames are not converted on one host; subscribe to {topic.partition('?')[0][:64]!r}"
     return too_many_topics(topic) if subscribed >= MAX_SUBSCRIPTIONS else ""

@@ -15,21 +15,21 @@ from skyloop.transport.base import MAX_PACKET, Peer
 from skyloop.transport.local import packets
 from skyloop.transport.priority import MOST_PACKETS, PacketBacklog
 
-#: Enough for a packet of the largest size and a burst of small ones; little enough that what waits for a stalled
-#: reader stays small (about 200 packets of 300 bytes).
+#: Enough for a packet of the largest size and a burst of small ones, and small enough to bound the backlog of a stalled
+#: reader (about 200 packets of 300 bytes).
 SEND_BUFFER: Final = 131_072
 SEND_FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
-RECEIVE_FLAGS: Final = socket.MSG_DONTWAIT  #: for who waits by other means
+RECEIVE_FLAGS: Final = socket.MSG_DONTWAIT  #: for callers that wait by other means
 _SO_PEERGROUPS: Final = 59  # Linux 4.13; missing from Python's socket module
 _CREDENTIALS: Final = struct.Struct("3i")
-_MAX_OPTION: Final = 1024  # bytes that Python lets an option have: 256 groups
+_MAX_OPTION: Final = 1024  # Python's limit for an option [bytes]: 256 groups
 
 
 class Socket(socket.socket):
-    """A ``SOCK_SEQPACKET`` socket that closes when nobody uses it any more.
+    """A ``SOCK_SEQPACKET`` socket that closes when no longer referenced.
 
-    The ends *shut down* a connection and drop their references, and never close it. So the number of a descriptor that
-    a thread is just sending on can't be reused for something else.
+    Both ends *shut down* a connection and drop their references, but never close it. So a descriptor's number can't be
+    reused while a thread is sending on it.
 
     Args:
         fileno: An open descriptor to take over; None for a new socket.
@@ -43,11 +43,11 @@ class Socket(socket.socket):
         self.close()
 
     def limit_backlog(self) -> None:
-        """Bound what may wait unread at the other end, to :data:`SEND_BUFFER` bytes."""
+        """Limit the unread data at the other end to :data:`SEND_BUFFER` bytes."""
         self.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
 
     def hang_up(self, last_packet: bytes = b"") -> None:
-        """End the connection in both directions, after a last packet if that one fits."""
+        """End the connection in both directions, after a last packet if it fits."""
         try:
             if last_packet:
                 self.send(last_packet, SEND_FLAGS)
@@ -59,11 +59,11 @@ class Socket(socket.socket):
         try:
             self.shutdown(socket.SHUT_RDWR)
         except OSError:
-            return  # it had ended already
+            return  # it had already ended
 
 
 class Credentials(NamedTuple):
-    """The process at the other end, as the kernel saw it when the connection was made."""
+    """The process at the other end, as the kernel saw it when it connected."""
 
     pid: int
     uid: int
@@ -74,12 +74,12 @@ class Credentials(NamedTuple):
 
 
 def credentials(sock: socket.socket) -> Credentials:
-    """Return who connected or, at a client, who listens."""
+    """Return the connecting process or, at a client, the listening one."""
     return Credentials(*_CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)))
 
 
 def peer_groups(sock: socket.socket) -> set[int]:
-    """Return all groups of who connected; only the primary one for a user in more than 256."""
+    """Return all groups of the connecting user; only the primary one for a user in more than 256."""
     primary = credentials(sock).gid
     try:
         raw = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _MAX_OPTION)
@@ -89,14 +89,14 @@ def peer_groups(sock: socket.socket) -> set[int]:
 
 
 def may_connect(sock: socket.socket, gid: int | None) -> bool:
-    """Return whether the process that connected may.
+    """Return whether the connecting process has access.
 
     Args:
         sock: The accepted connection.
-        gid: The group that may connect, None for none.
+        gid: The group with access; None for none.
 
     Returns:
-        Whether it belongs to this process's user, to the superuser, or to a member of the group.
+        True for a process of this process's user, of the superuser, or of a member of the group.
     """
     uid = credentials(sock).uid
     return uid in (os.geteuid(), 0) or (gid is not None and gid in peer_groups(sock))
@@ -104,7 +104,7 @@ def may_connect(sock: socket.socket, gid: int | None) -> bool:
 
 @functools.lru_cache(maxsize=64)
 def user_name(uid: int) -> str:
-    """Return the name of a user, or ``uid 123`` if it has none."""
+    """Return a user's name, or ``uid 123`` without one."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
@@ -124,11 +124,11 @@ def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
 
 
 class ServerConnection:
-    """An application's connection: any thread may send without waiting, all else belongs to its receiving thread.
+    """An application's connection: any thread may send without waiting, the rest belongs to its receiving thread.
 
     Args:
-        sock: Accepted from the listener.
-        peer: As the handler knows it.
+        sock: The accepted socket.
+        peer: The peer, as the handler knows it.
         who: The process at the other end, as the kernel reports it.
     """
 
@@ -157,25 +157,25 @@ class ServerConnection:
         poll = select.poll()
         poll.register(sock, select.POLLIN)
         self.poll = poll.poll  #: whether a packet, or the end, waits in the socket; for the receiving thread
-        self.backlog = PacketBacklog()  #: taken out of the socket, and not handled yet
+        self.backlog = PacketBacklog()  #: taken from the socket, but not handled yet
         self.peer = peer
-        self.joined = False  #: it sent Hello, and the handler knows of it
-        self.admitted = False  #: it sent who it is, and the handler let it stay
-        self.pilot = False  #: it stated that it is one
-        self.ending = False  #: by the server: what it sent before is not wanted any more
-        self.reason = ""  #: why it ends, as soon as one end has given a reason
+        self.joined = False  #: it sent Hello, and the handler knows it
+        self.admitted = False  #: it identified itself, and the handler admitted it
+        self.pilot = False  #: it connected as a pilot
+        self.ending = False  #: by the server: earlier packets no longer count
+        self.reason = ""  #: why it ends, once one end has given a reason
         self.topics: set[str] = set()
 
     def fileno(self) -> int:
-        """Return the socket's descriptor, for who waits for several."""
+        """Return the socket's descriptor, for polling several."""
         return self._socket.fileno()
 
     def more(self) -> bool:
-        """Return whether a packet of a pilot, or the end, waits in the socket; others' commands are refused anyway."""
+        """Return whether a pilot's packet, or the end, waits in the socket; others' commands are refused anyway."""
         return self.pilot and bool(self.poll(0))
 
     def take_in(self) -> int:
-        """Take what waits in the socket into the backlog; return how many commands that superseded."""
+        """Move waiting packets from the socket to the backlog; return the number of superseded commands."""
         superseded = 0
         backlog = self.backlog
         for _ in range(MOST_PACKETS):
@@ -184,7 +184,7 @@ class ServerConnection:
             try:
                 packet = self.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
             except OSError:
-                break  # who waits for the next packet gets it, too
+                break  # the next reader gets it, too
             if packet == packets.WAKE:
                 continue
             superseded += backlog.put(packet)
@@ -220,7 +220,7 @@ class ServerConnection:
     def hang_up(self, reason: str) -> None:
         """End the connection and send the reason to the application. Any thread.
 
-        The receiving thread detects the end as it does any other.
+        The receiving thread notices this like any other end.
         """
         if not self.ending:
             self.reason = self.reason or reason
