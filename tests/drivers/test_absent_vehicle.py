@@ -1,4 +1,4 @@
-"""A vehicle that is not there: why, and what to do, is told soon, and again whenever that changes."""
+"""An absent vehicle: the reason and the remedy are reported soon, and again when they change."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Session(VehicleSession):
         self._set_link_state(LinkState.UP)
 
     def told(self, now_s: float) -> list[tuple[LinkState, str, str]]:
-        """What is new by then."""
+        """Return the new reports by that time."""
         sink, found = RecordingSink(watch=set()), []
         self._check_silence(nanoseconds(now_s))
         for publish in self.drain():
@@ -49,7 +49,7 @@ class Session(VehicleSession):
 USUAL = "check the vehicle's power, and host and port in the address"
 
 
-def test_a_vehicle_that_was_never_heard() -> None:
+def test_a_vehicle_that_never_answered() -> None:
     session = Session()
     assert session.told(0.0) == [(LinkState.CONNECTING, "waiting", USUAL)]
     session.failed(ABSENT)
@@ -58,7 +58,7 @@ def test_a_vehicle_that_was_never_heard() -> None:
     assert session.told(60.0) == []
 
 
-def test_another_reason_is_told_but_not_in_a_flood() -> None:
+def test_a_new_reason_is_reported_but_not_in_a_flood() -> None:
     session = Session()
     session.failed(ABSENT)
     session.told(2.0)
@@ -71,7 +71,7 @@ def test_another_reason_is_told_but_not_in_a_flood() -> None:
     assert session.told(10.1) == [(LinkState.LOST, "silence", USUAL)]
 
 
-def test_one_that_is_heard_needs_no_remedy_and_one_that_is_lost_does() -> None:
+def test_a_lost_vehicle_has_a_remedy_and_a_present_one_has_none() -> None:
     session = Session()
     session.told(0.0)
     session.hear(nanoseconds(0.1))

@@ -1,4 +1,4 @@
-"""Streams never wait: what finds no room is dropped, what was cut is discarded, a slow line is paced."""
+"""Streams never block: packets without room are dropped, cut frames are discarded, a slow line is paced."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 @pytest.fixture
 def line() -> Iterator[tuple[int, str]]:
-    """A serial line: its far end, and the device at this one."""
+    """Open a serial line: its far end, and the device at this end."""
     far, near = os.openpty()
     tty.setraw(near)
     os.set_blocking(far, False)
@@ -32,7 +32,7 @@ def line() -> Iterator[tuple[int, str]]:
 
 
 def read_all(far: int) -> int:
-    """Return how many bytes could be read."""
+    """Read everything and return the number of bytes."""
     count = 0
     with suppress(BlockingIOError):
         while True:
@@ -41,7 +41,7 @@ def read_all(far: int) -> int:
 
 
 def fill(stream: SerialStream) -> None:
-    """Leave no room at all, as when the other end hangs. The system may make some more a moment later."""
+    """Fill the buffer, as when the other end hangs. The system may free some room a moment later."""
     while select.select([], [stream], [], 0.05)[1]:
         with suppress(BlockingIOError):
             while True:
@@ -49,7 +49,7 @@ def fill(stream: SerialStream) -> None:
 
 
 def test_a_serial_port_whose_other_end_does_not_read_drops_and_never_waits(line: tuple[int, str]) -> None:
-    """The output buffer is full: writing returns, and what stays so for half a second is an error."""
+    """With a full output buffer, writing returns at once, and raises after half a second without room."""
     pytest.importorskip("serial")
     far, device = line
     clock = ManualClock()
@@ -63,16 +63,16 @@ def test_a_serial_port_whose_other_end_does_not_read_drops_and_never_waits(line:
         stream.write(b"set-point")
         fill(stream)
         stream.write(b"set-point")
-        assert stream.dropped == 3, "it had room in between"
+        assert stream.dropped == 3, "there was room in between"
         clock.advance(STUCK_NS / 1e9)
         with pytest.raises(OSError, match="no longer reads"):
             stream.write(b"set-point")
 
 
-def test_a_frame_that_is_cut_by_a_full_port_is_discarded_by_the_vehicle_and_the_next_one_is_not(
+def test_the_vehicle_discards_a_frame_cut_by_a_full_port_but_not_the_next(
     line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A port that is full for a moment cuts one frame in some hundred. That broke the connection, and it hovered."""
+    """A port that is full for a moment cuts one frame in a hundred. That broke the connection: the vehicle hovered."""
     pytest.importorskip("serial")
     far, device = line
     station, vehicle = Codec(255, 190), FlightControllerParser()
@@ -95,7 +95,7 @@ def test_a_frame_that_is_cut_by_a_full_port_is_discarded_by_the_vehicle_and_the_
         assert stream.dropped == 2 * cut
 
 
-def test_a_stop_that_is_cut_is_sent_again_whole(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cut_stop_is_resent_whole(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("serial")
     far, device = line
     write = os.write
@@ -127,10 +127,10 @@ def test_a_port_that_takes_only_parts_of_frames_for_half_a_second_is_not_read(
 
 
 class Uart:
-    """The same line with the output buffer of a UART: its size is available, and it can be emptied.
+    """The same line with a UART's output buffer, whose level can be read and which can be emptied.
 
     Args:
-        line: Its far end, and the device at this one.
+        line: Its far end, and the device at this end.
     """
 
     def __init__(self, line: tuple[int, str]) -> None:
@@ -138,7 +138,7 @@ class Uart:
         self._far, self.device = line
 
     def read(self, most: int = 65_536) -> bytes:
-        """Carry some of what waits."""
+        """Transmit some of the waiting bytes."""
         came, wanted = b"", min(most, self.waiting)
         while len(came) < wanted:
             assert select.select([self._far], [], [], 5.0)[0]
@@ -163,8 +163,8 @@ def uart(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> Uart:
     return uart
 
 
-def test_what_is_not_carried_counts_as_full(uart: Uart) -> None:
-    """The reader stalls, with room for thousands of bytes: a few set-points wait, and the newest is sent after that."""
+def test_a_stalled_line_counts_as_full(uart: Uart) -> None:
+    """The reader stalls with room for thousands of bytes: only a few set-points wait, and then the newest is sent."""
     clock = ManualClock()
     with closing(SerialStream(uart.device, 921_600, "x", "mavlink", clock)) as stream:
         for number in range(25):
@@ -174,7 +174,7 @@ def test_what_is_not_carried_counts_as_full(uart: Uart) -> None:
         for number in range(25, 32):
             stream.write(b"%08d" % number)
             clock.advance(0.04)
-        assert uart.waiting <= 4 * 8, "what waits is of one tenth of a second"
+        assert uart.waiting <= 4 * 8, "a tenth of a second waits"
         assert stream.dropped >= 3
         uart.read()
         stream.write(b"%08d" % 32)
@@ -187,8 +187,8 @@ def test_what_is_not_carried_counts_as_full(uart: Uart) -> None:
 
 
 @pytest.mark.parametrize(("baud", "most"), [(57_600, 576), (115_200, 1152)])
-def test_what_waits_is_asked_for_and_not_only_reckoned(uart: Uart, baud: int, most: int) -> None:
-    """The line is slower than its baud rate: what waits is limited to a tenth of a second at that rate."""
+def test_the_backlog_is_read_and_not_only_estimated(uart: Uart, baud: int, most: int) -> None:
+    """The line is slower than its baud rate: the backlog is limited to a tenth of a second at that rate."""
     clock = ManualClock()
     with closing(SerialStream(uart.device, baud, "x", "mavlink", clock)) as stream:
         for _ in range(100):
@@ -200,7 +200,7 @@ def test_what_waits_is_asked_for_and_not_only_reckoned(uart: Uart, baud: int, mo
 
 
 class FlightControllerParser:
-    """Finds frames as MAVLink's C library does: it does not look for one within a damaged one."""
+    """Finds frames like MAVLink's C library, which does not search inside a damaged frame."""
 
     def __init__(self) -> None:
         self._kept = bytearray()
@@ -218,8 +218,8 @@ class FlightControllerParser:
         return found
 
 
-def test_a_stop_goes_before_what_waits_and_is_not_taken_for_the_end_of_a_cut_frame(uart: Uart) -> None:
-    """The reader stalls in the middle of a frame, whose rest is discarded: the next frame it decodes is the stop."""
+def test_a_stop_precedes_the_backlog_and_is_not_parsed_as_the_end_of_a_cut_frame(uart: Uart) -> None:
+    """The reader stalls within a frame, whose rest is discarded: the next frame that it decodes is the stop."""
     clock, station, vehicle = ManualClock(), Codec(255, 190), FlightControllerParser()
     target = m.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1.0, 0.0, 0.0, 0.0], 0.1, 0.2, 0.3, 0.5)
     stop = m.MAVLink_command_long_message(1, 1, m.MAV_CMD_COMPONENT_ARM_DISARM, 0, 0.0, 21196.0, 0, 0, 0, 0, 0)
@@ -235,12 +235,12 @@ def test_a_stop_goes_before_what_waits_and_is_not_taken_for_the_end_of_a_cut_fra
         for _ in range(5):
             stream.write(station.encode(stop), Rank.STOP)
             clock.advance(0.1)
-        assert len(vehicle.feed(uart.read())) == 5, "a stop does not discard the one before"
+        assert len(vehicle.feed(uart.read())) == 5, "a stop does not discard the previous one"
 
 
 @pytest.mark.parametrize("bytes_per_s", [1000, 1500])
 def test_a_stop_arrives_on_a_line_that_is_slower_than_its_baud_rate(uart: Uart, bytes_per_s: int) -> None:
-    """Each repeat discarded the one before, of which only the zeros had been carried, and none ever arrived."""
+    """Each repeat discarded the previous one, of which only the padding had been sent, so none ever arrived."""
     clock, came = ManualClock(), b""
     with closing(SerialStream(uart.device, 921_600, "x", "msp", clock)) as stream:
         for tick in range(100):
@@ -254,7 +254,7 @@ def test_a_stop_arrives_on_a_line_that_is_slower_than_its_baud_rate(uart: Uart, 
 
 
 def test_a_stop_finds_room_in_a_full_port(line: tuple[int, str]) -> None:
-    """The end of the buffer is discarded for it, even where its size is not available."""
+    """The end of the buffer is discarded for it, even where its level can't be read."""
     pytest.importorskip("serial")
     far, device = line
     with closing(SerialStream(device, 10_000_000, "x", "mavlink")) as stream:
@@ -271,7 +271,7 @@ def test_a_stop_finds_room_in_a_full_port(line: tuple[int, str]) -> None:
 def test_a_stop_on_a_stalled_line_gets_a_moment_to_leave_when_the_port_is_closed(
     uart: Uart, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A program that stops the motors and ends: what was written a moment before was discarded at once."""
+    """A program that stopped the motors and exited discarded the bytes that it had just written."""
     clock, came = ManualClock(), bytearray()
     stream = SerialStream(uart.device, 57_600, "x", "mavlink", clock)
     for _ in range(12):
@@ -298,7 +298,7 @@ def test_a_port_is_empty_when_it_is_opened(uart: Uart) -> None:
     os.close(other)
 
 
-def test_a_port_that_does_not_tell_what_waits_is_written_to_as_before(
+def test_a_port_without_a_readable_backlog_is_still_written_to(
     line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     serial = pytest.importorskip("serial")
@@ -331,7 +331,7 @@ def peer() -> Iterator[socket.socket]:
 
 
 def received(connection: socket.socket) -> tuple[bytes, bool]:
-    """Return everything that comes, and whether the connection was ended properly."""
+    """Return everything received, and whether the connection was closed properly."""
     came = b""
     connection.settimeout(5.0)
     with connection:
@@ -343,8 +343,8 @@ def received(connection: socket.socket) -> tuple[bytes, bool]:
     return came, True
 
 
-def test_what_a_connection_holds_when_it_is_closed_is_not_delivered_later(peer: socket.socket) -> None:
-    """The vehicle's network comes back when nobody flies it any more: it must not be armed then."""
+def test_data_buffered_at_closing_are_not_delivered_later(peer: socket.socket) -> None:
+    """The vehicle's network comes back when no one flies it any more: it must not be armed then."""
     stream = TcpStream("127.0.0.1", peer.getsockname()[1], ManualClock())
     connection, _ = peer.accept()
     with suppress(ConnectionError):
@@ -356,8 +356,8 @@ def test_what_a_connection_holds_when_it_is_closed_is_not_delivered_later(peer: 
     assert not ended
 
 
-def test_a_peer_that_reads_no_more_is_left_with_few_set_points(peer: socket.socket) -> None:
-    """They filled the system's buffers, megabytes of them, and were followed one after the other when it went on."""
+def test_a_stalled_peer_gets_few_old_set_points(peer: socket.socket) -> None:
+    """They filled megabytes of the system's buffers, and the vehicle followed each of them when it resumed."""
     clock = ManualClock()
     with closing(TcpStream("127.0.0.1", peer.getsockname()[1], clock)) as stream:
         connection, _ = peer.accept()
@@ -370,10 +370,8 @@ def test_a_peer_that_reads_no_more_is_left_with_few_set_points(peer: socket.sock
     assert len(came) < 40_000
 
 
-def test_set_points_wait_for_a_network_that_is_out_for_no_longer_than_a_moment(
-    peer: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """TCP delivers all of them when it is back; a packet or two that are sent again do not end the connection."""
+def test_set_points_survive_a_short_network_outage(peer: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+    """TCP delivers all of them when the network is back; one or two resent packets do not end the connection."""
     clock, out = ManualClock(), False
     with closing(TcpStream("127.0.0.1", peer.getsockname()[1], clock)) as stream:
         peer.accept()[0].close()
@@ -392,11 +390,11 @@ def test_set_points_wait_for_a_network_that_is_out_for_no_longer_than_a_moment(
             stream.write(bytes(50))
             clock.advance(0.02)
             if tick == 99:
-                assert len(sent) <= 17, "of a third of a second"
+                assert len(sent) <= 17, "those of a third of a second"
         assert len(sent) == 150, "all, once it is back"
 
 
-def test_the_last_words_of_a_connection_are_delivered(peer: socket.socket) -> None:
+def test_the_last_packets_of_a_connection_are_delivered(peer: socket.socket) -> None:
     stream = TcpStream("127.0.0.1", peer.getsockname()[1])
     connection, _ = peer.accept()
     stream.write(b"disarm", Rank.COMMAND)
@@ -405,8 +403,8 @@ def test_the_last_words_of_a_connection_are_delivered(peer: socket.socket) -> No
 
 
 @pytest.mark.parametrize("last", [True, False])
-def test_the_last_words_may_be_lost_once(peer: socket.socket, monkeypatch: pytest.MonkeyPatch, last: bool) -> None:
-    """TCP sends again after 0.2 s what was not acknowledged; while a new connection waits to be opened nobody waits."""
+def test_the_last_packets_may_be_lost_once(peer: socket.socket, monkeypatch: pytest.MonkeyPatch, last: bool) -> None:
+    """TCP resends unacknowledged data after 0.2 s; closing does not wait if a new connection is to be opened."""
     stream = TcpStream("127.0.0.1", peer.getsockname()[1])
     connection, _ = peer.accept()
     stream.write(b"stop", Rank.STOP)
@@ -417,8 +415,8 @@ def test_the_last_words_may_be_lost_once(peer: socket.socket, monkeypatch: pytes
     assert received(connection)[1] is last
 
 
-def test_a_connection_that_is_gone_is_not_waited_for(peer: socket.socket) -> None:
-    """The system went on to count what it did not receive, and the next connection waited for that."""
+def test_closing_does_not_wait_for_a_lost_connection(peer: socket.socket) -> None:
+    """The system kept counting unacknowledged bytes, and the next connection waited for them."""
     stream = TcpStream("127.0.0.1", peer.getsockname()[1], ManualClock())
     connection, _ = peer.accept()
     stream.write(bytes(1 << 14), Rank.COMMAND)
@@ -433,7 +431,7 @@ def test_a_connection_that_is_gone_is_not_waited_for(peer: socket.socket) -> Non
 
 
 def test_a_slow_line_carries_set_points_before_poses_and_commands_before_all() -> None:
-    """57,600 baud, a set-point each 20 ms, a pose each 10 ms: far more than fits, and nothing waits for long."""
+    """At 57,600 baud, a set-point every 20 ms and a pose every 10 ms are far too much, yet nothing waits for long."""
     pace, sent, latest_s = LinePace(5760.0), dict.fromkeys(Rank, 0), 0.0
     free_s = 0.0
     for step in range(1000):

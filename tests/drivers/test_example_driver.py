@@ -1,4 +1,4 @@
-"""A driver outside the package, found by its entry point, keeps the contract; and the page shows its very code."""
+"""A driver outside the package, found by its entry point, keeps the contract, and the page shows its code."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EXAMPLE = ROOT / "tests" / "example_driver"
 
 
 def install(project: Path, site: Path) -> None:
-    """Put a project's metadata where an installer would, without one: entry points are found by it."""
+    """Write a project's metadata as an installer would, so that its entry points are found."""
     metadata = tomllib.loads((project / "pyproject.toml").read_text())["project"]
     folder = site / f"{metadata['name'].replace('-', '_')}-{metadata['version']}.dist-info"
     folder.mkdir(parents=True)
@@ -56,11 +56,11 @@ class TestToy(DriverSuite):
         return driver
 
 
-def test_it_is_found_beside_our_own() -> None:
+def test_the_example_is_found_beside_our_own() -> None:
     assert {"sim", "toy", "video"} <= set(known_schemes())
 
 
-def test_it_is_imported_when_used_and_not_before() -> None:
+def test_the_example_is_imported_on_first_use() -> None:
     sys.modules.pop("skyloop_toy", None)
     assert "toy" in known_schemes()
     assert "skyloop_toy" not in sys.modules

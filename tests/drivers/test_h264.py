@@ -1,4 +1,4 @@
-"""What the headers of H.264 show, of streams that x264 makes; what is damaged is refused."""
+"""Headers of H.264 streams made by x264; damaged ones are refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KEYS = "keyint=6:min-keyint=6:scenecut=0:repeat-headers=1"
 def encoded(
     width: int = 322, height: int = 242, *, more: str = "", pixels: str = "yuv420p", b_frames: int = 0, count: int = 14
 ) -> tuple[bytes, ...]:
-    """Access units of a square that moves, a key each six."""
+    """Return the access units of a moving square, with a key picture every six."""
     context = av.CodecContext.create("libx264", "w")
     context.width, context.height, context.pix_fmt = width, height, pixels
     context.framerate, context.time_base = Fraction(25), Fraction(1, 25)
@@ -66,7 +66,7 @@ def test_sizes_keys_and_numbers_of_every_profile(width: int, height: int, more: 
     assert tuple(unit.data for unit in found) == encoded(width, height, more=more, pixels=pixels)
 
 
-def test_pictures_that_build_on_later_ones_are_named() -> None:
+def test_pictures_that_refer_to_later_ones_are_reported() -> None:
     found = sound(encoded(b_frames=2))
     assert {unit.reason for unit in found} == {"", "pictures refer to later ones (B-frames)"}
     assert not any(unit.after_gap for unit in found)
@@ -78,7 +78,7 @@ def test_a_missing_picture_shows_in_the_next_one_only() -> None:
     assert [number for number, unit in enumerate(found) if unit.after_gap] == [3]
 
 
-def test_a_stream_that_is_torn_open_waits_for_its_parameters() -> None:
+def test_a_stream_joined_in_the_middle_waits_for_its_parameters() -> None:
     assert [unit is None for unit in inspected(encoded()[3:])] == [True] * 3 + [False] * 8
     assert sound(encoded()[6:])[0].is_key
 
@@ -87,7 +87,7 @@ def without_sets(data: bytes) -> bytes:
     return START + START.join(unit for unit in units(data) if unit_type(unit) not in (SPS, PPS))
 
 
-def test_sets_that_came_beside_the_stream_or_once_go_in_front_of_each_key() -> None:
+def test_parameter_sets_from_outside_or_sent_once_precede_each_key_picture() -> None:
     whole = list(encoded())
     sets = START + START.join(unit for unit in units(whole[0]) if unit_type(unit) in (SPS, PPS))
     bare = [without_sets(data) for data in whole]
@@ -98,7 +98,7 @@ def test_sets_that_came_beside_the_stream_or_once_go_in_front_of_each_key() -> N
         assert all([unit_type(part) for part in units(unit.data)][:2] == [SPS, PPS] for unit in keys)
 
 
-def test_a_key_without_its_sets_is_none() -> None:
+def test_a_key_picture_without_its_sets_does_not_count() -> None:
     assert inspected([without_sets(encoded()[0])]) == [None]
     picture_set = next(unit for unit in units(encoded()[0]) if unit_type(unit) == PPS)
     cut = encoded()[0].replace(START + picture_set, b"").replace(b"\0\0\1" + picture_set, b"")
@@ -129,7 +129,7 @@ def test_a_damaged_set_does_not_replace_the_good_one() -> None:
     assert {unit.width for unit in sound(stream)} == {322}
 
 
-def test_interlaced_pictures_are_named() -> None:
+def test_interlaced_pictures_are_reported() -> None:
     fields = Sequence(4, 1920, 1080, interlaced=True)
     inspector = Inspector()
     inspector._sequence = fields
@@ -150,7 +150,7 @@ def test_numbers_may_have_gaps_where_the_stream_says_so() -> None:
 
 
 @given(st.lists(st.binary(max_size=60) | st.binary(max_size=40).map(lambda tail: START + tail), max_size=20))
-def test_any_bytes_are_taken(stream: list[bytes]) -> None:
+def test_any_bytes_are_accepted(stream: list[bytes]) -> None:
     inspected([encoded()[0], *stream])
 
 

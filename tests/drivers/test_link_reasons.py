@@ -1,4 +1,4 @@
-"""Why a vehicle can't be reached, in words that tell what to do; and names that take long to look up."""
+"""Reasons for unreachable vehicles, with remedies, and slow name look-ups."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ DENIED = OSError(errno.EACCES, "Permission denied")
         (socket.gaierror(-2, "Name or service not known"), "its name is unknown", "correct the name"),
     ],
 )
-def test_what_failed_and_what_to_do(error: OSError, reason: str, remedy: str) -> None:
+def test_errors_have_a_reason_and_a_remedy(error: OSError, reason: str, remedy: str) -> None:
     trouble = trouble_of(error, "join it")
     assert reason in trouble.reason
     assert remedy in trouble.remedy
 
 
-def test_a_port_that_is_not_there_names_those_that_are(tmp_path: Path) -> None:
+def test_a_missing_port_lists_the_available_ones(tmp_path: Path) -> None:
     for name in ("ttyACM0", "ttyUSB1", "null"):
         (tmp_path / name).touch()
     trouble = serial_trouble(OSError(errno.ENOENT, "gone"), str(tmp_path / "none"), "", tmp_path)
@@ -45,7 +45,7 @@ def test_a_port_that_is_not_there_names_those_that_are(tmp_path: Path) -> None:
     assert "available ports" not in serial_trouble(OSError(), str(tmp_path / "none"), "", tmp_path / "no").remedy
 
 
-def test_what_is_no_port(tmp_path: Path) -> None:
+def test_a_file_is_not_a_port(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert "is not a serial port" in serial_trouble(OSError(), str(tmp_path / "file"), "").reason
 
@@ -98,7 +98,7 @@ def test_a_number_is_not_looked_up(monkeypatch: pytest.MonkeyPatch) -> None:
     assert NameLookup().address("192.168.10.1") == "192.168.10.1"
 
 
-def test_a_name_that_takes_long_keeps_nobody_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_name_look_up_blocks_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
     known = threading.Event()
 
     def look_up(*_: object) -> list[tuple[object, ...]]:
@@ -117,13 +117,13 @@ def test_a_name_that_takes_long_keeps_nobody_waiting(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("error", [socket.gaierror(-2, "Name or service not known"), UnicodeError("label too long")])
-def test_a_name_that_nobody_knows(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+def test_an_unknown_host_name(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     def look_up(*_: object) -> None:
         raise error
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     monkeypatch.setattr("skyloop.drivers.vehicle_link.NAME_WAIT_S", 10.0)
     lookup = NameLookup()
-    for _ in range(2):  # it is asked anew each time
+    for _ in range(2):  # each attempt looks it up again
         with pytest.raises(OSError, match=r"not known|not a valid host name"):
             lookup.address("drone")

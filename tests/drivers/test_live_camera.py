@@ -1,4 +1,4 @@
-"""Streams as they come, of a camera over RTSP, RTP and in containers: whole, in order, and with their frames' times."""
+"""Undecoded streams from RTSP, RTP and containers: complete, in order, and with their frames' times."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def told(sink: RecordingSink) -> list[str]:
 
 
 def decoded(pictures: list[SeenPicture]) -> list[int]:
-    """The numbers in pictures that were handed on, decoded strictly from the first one."""
+    """Return the numbers in forwarded pictures, decoded strictly from the first one."""
     context = new_decoder("h264", "a test")
     return [
         number_of(np.asarray(image.to_ndarray(format="bgr24"), np.uint8))
@@ -60,7 +60,7 @@ def came(sink: RecordingSink, count: int) -> None:
 
 
 @pytest.mark.parametrize("way", ["tcp", "udp"])
-def test_a_stream_is_handed_on_as_it_came_with_the_times_of_its_frames(way: str) -> None:
+def test_a_stream_is_forwarded_with_the_times_of_its_frames(way: str) -> None:
     film = Film()
     sent: list[bytes] = []
     sink = RecordingSink(record=True)
@@ -102,23 +102,23 @@ def test_nothing_is_decoded_for_a_stream_that_can_lose_nothing() -> None:
     assert not sink.frames
 
 
-def test_who_comes_late_begins_with_a_key() -> None:
+def test_a_late_subscriber_starts_with_a_key_picture() -> None:
     sink = RecordingSink(watch=set())
     with RtspServer(Film().next().payload) as server, camera(server.address, sink) as running, Projector(server.send):
         for _ in range(2):
             wanted = int(str(running.telemetry()["camera.received"])) + 5
-            wait_until(lambda: int(str(running.telemetry()["camera.received"])) >= wanted, "pictures come")  # noqa: B023
+            wait_until(lambda: int(str(running.telemetry()["camera.received"])) >= wanted, "pictures")  # noqa: B023
             assert not sink.pictures
             sink.record = True
             came(sink, 5)
             assert sink.pictures[0].key
             sink.record = False
             wanted = int(str(running.telemetry()["camera.received"])) + 2
-            wait_until(lambda: int(str(running.telemetry()["camera.received"])) >= wanted, "pictures come")  # noqa: B023
+            wait_until(lambda: int(str(running.telemetry()["camera.received"])) >= wanted, "pictures")  # noqa: B023
             sink.pictures.clear()
 
 
-def test_sets_that_only_the_servers_description_has_go_in_front_of_each_key() -> None:
+def test_parameter_sets_from_the_sdp_precede_each_key_picture() -> None:
     sink = RecordingSink(record=True)
     film = Film()
     with RtspServer(film.next().payload) as server, camera(server.address, sink):
@@ -139,7 +139,7 @@ def test_sets_that_only_the_servers_description_has_go_in_front_of_each_key() ->
 
 
 class RtpSender:
-    """Sends what a projector gives to a port, in RTP; ``lost`` says of each packet whether it gets lost."""
+    """Sends a projector's pictures to a port, in RTP; ``lost`` decides for each packet whether it gets lost."""
 
     def __init__(self, port: int, lost: Callable[[int], bool] = lambda _: False) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -158,7 +158,7 @@ class RtpSender:
         self._socket.close()
 
 
-def test_rtp_over_udp_is_shown_and_handed_on() -> None:
+def test_rtp_over_udp_is_shown_and_forwarded() -> None:
     port, sink = free_port(), RecordingSink(record=True)
     sender = RtpSender(port)
     with camera(f"rtp://{HOST}:{port}", sink), Projector(sender.send):
@@ -169,7 +169,7 @@ def test_rtp_over_udp_is_shown_and_handed_on() -> None:
     assert numbers == list(range(numbers[0], numbers[0] + len(sink.pictures)))
 
 
-def test_of_rtp_that_loses_packets_only_whole_pictures_are_shown_and_handed_on() -> None:
+def test_only_whole_pictures_of_lossy_rtp_are_shown_and_forwarded() -> None:
     chance = np.random.default_rng(3)
     port, sink = free_port(), RecordingSink(record=True)
     sender = RtpSender(port, lambda _: bool(chance.random() < 0.01))
@@ -190,11 +190,11 @@ def test_of_rtp_that_loses_packets_only_whole_pictures_are_shown_and_handed_on()
     assert numbers == sorted(set(numbers))
 
 
-# What can't be handed on ---------------------------------------------------------------------------------------------
+# Streams that can't be forwarded -------------------------------------------------------------------------------------
 
 
 class TcpFilm:
-    """A film in a container, sent to one after the other who connects, at once and again until it is closed."""
+    """A film in a container, sent in a loop to one client after another until it is closed."""
 
     def __init__(self, film: bytes) -> None:
         self._film = film
@@ -260,14 +260,14 @@ def test_h264_in_a_container_becomes_a_stream(tmp_path: Path) -> None:
         ("mpeg4", "matroska", 0, {}, "the video is mpeg4, not H.264"),
     ],
 )
-def test_what_can_not_be_handed_on_is_told_once_and_shown(
+def test_a_stream_that_can_not_be_forwarded_is_reported_once_and_shown(
     tmp_path: Path, codec: str, form: str, b_frames: int, options: dict[str, str], why: str
 ) -> None:
     film = TcpFilm(container(codec, form, tmp_path / "film", b_frames, **options))
     sink = RecordingSink(record=True)
     with camera(film.address, sink) as running:
         assert sink.wait(lambda: sink.frame_counts["front"] > 5, PATIENCE_S)
-        wait_until(lambda: int(str(running.telemetry()["camera.reconnects"])) > 0, "it is opened again")
+        wait_until(lambda: int(str(running.telemetry()["camera.reconnects"])) > 0, "the stream is reopened")
     film.close()
     (text,) = [text for text in told(sink) if "as it came" in text]
     assert why in text
@@ -277,7 +277,7 @@ def test_what_can_not_be_handed_on_is_told_once_and_shown(
 
 
 class Refreshed(Film):
-    """A film whose pictures are renewed stripe by stripe; it has one key, at the beginning."""
+    """A film refreshed stripe by stripe, with its only key picture at the start."""
 
     def __init__(self, *, without_key: bool) -> None:
         super().__init__()
@@ -298,7 +298,7 @@ class Refreshed(Film):
         return Encoded(data, self.number == 1)
 
 
-def test_a_stream_without_keys_is_left_to_ffmpeg_after_a_while_and_that_is_told(
+def test_a_stream_without_key_pictures_is_left_to_ffmpeg_and_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("skyloop.drivers.live_container.STRICT_S", 0.5)
@@ -307,14 +307,14 @@ def test_a_stream_without_keys_is_left_to_ffmpeg_after_a_while_and_that_is_told(
     with RtspServer(Refreshed(without_key=False).next().payload) as server, camera(server.address, sink):
         with Projector(server.send, Refreshed(without_key=True)):
             assert sink.wait(lambda: sink.frame_counts["front"] > 5, PATIENCE_S), told(sink)
-        with Projector(server.send):  # with keys: damage is looked for again
+        with Projector(server.send):  # with key pictures, damage is rejected again
             came(sink, GROUP)
     assert any("no flawless key picture arrived" in text for text in told(sink))
     assert any("without a key picture (IDR)" in text for text in told(sink))
     assert not [event for event in sink.events if event.kind is EventKind.DRIVER_ERROR]
 
 
-def test_another_size_is_shown_and_handed_on_from_its_key_on() -> None:
+def test_another_size_is_shown_and_forwarded_from_its_key_picture_on() -> None:
     small = Film()
     small._encoder = Encoder(Format("h264", WIDTH // 2, HEIGHT // 2, 0), FPS, 2000, group=GROUP)
     sink = RecordingSink(record=True)

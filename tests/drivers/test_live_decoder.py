@@ -1,4 +1,4 @@
-"""The decoder of cameras: what is lost, cut, flipped or of another size never shows, and never stops what follows."""
+"""The cameras' decoder: lost, cut, flipped or resized pictures never show, and never stop later ones."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def right() -> dict[int, Pixels]:
 
 
 class Watched:
-    """A decoder that is given pictures; None is one that never comes."""
+    """A decoder that is fed pictures; None is a lost one."""
 
     def __init__(self) -> None:
         self.whole: list[int] = []
@@ -49,7 +49,7 @@ class Watched:
         self._number = 0
 
     def decode(self, data: bytes, now: int, *, show: bool = True) -> Pixels | None:
-        """The picture, if one is shown. ``now``: in periods."""
+        """Return the picture, if one is shown. ``now`` is in periods."""
         packet: Any = av.Packet(data)
         piece = Piece(packet, self._context, self._number, self._inspector.inspect(data))
         self._number += 1
@@ -60,7 +60,7 @@ class Watched:
 
 
 def shown(stream: list[bytes | None]) -> dict[int, Pixels]:
-    """What is shown of pictures, by their places."""
+    """Return the shown pictures by their positions."""
     watched = Watched()
     found = {}
     for number, data in enumerate(stream):
@@ -86,7 +86,7 @@ def test_after_a_lost_picture_nothing_is_shown_up_to_the_next_key() -> None:
     expect(shown(stream), [0, 1, 2, *range(GROUP, COUNT)])
 
 
-def test_a_cut_picture_and_what_builds_on_it_are_not_shown() -> None:
+def test_a_cut_picture_and_its_successors_are_not_shown() -> None:
     for cut in (film()[3][:200], film()[3][: len(film()[3]) // 2] + film()[3][len(film()[3]) // 2 + 300 :]):
         stream: list[bytes | None] = list(film())
         stream[3] = cut
@@ -99,7 +99,7 @@ def test_a_lost_key_is_waited_out() -> None:
     expect(shown(stream), [*range(GROUP), *range(2 * GROUP, COUNT)])
 
 
-def test_lost_parameters_are_those_of_before() -> None:
+def test_lost_parameters_keep_the_previous_ones() -> None:
     def without(data: bytes) -> bytes:
         return START + START.join(unit for unit in units(data) if unit_type(unit) != SPS)
 
@@ -111,7 +111,7 @@ def test_lost_parameters_are_those_of_before() -> None:
     expect(shown(stream), list(range(GROUP, COUNT)))
 
 
-def test_cut_parameters_are_those_of_before() -> None:
+def test_cut_parameters_keep_the_previous_ones() -> None:
     first = units(film()[GROUP])[0]
     stream: list[bytes | None] = list(film())
     stream[GROUP] = film()[GROUP].replace(first, first[:6])
@@ -154,7 +154,7 @@ def test_flipped_bits_and_lost_pieces_end_with_the_next_whole_key(seed: int) -> 
     assert all(np.array_equal(found[number], right()[number]) for number in range(3 * GROUP, COUNT))
 
 
-def test_noise_is_told_and_forgotten_when_it_is_none() -> None:
+def test_noise_is_reported_and_forgotten_once_it_ends() -> None:
     watched, noise = Watched(), np.random.default_rng(1)
     assert watched.decode(film()[0], 0) is not None
     seconds = int(HOPELESS_S * FPS)
@@ -166,7 +166,7 @@ def test_noise_is_told_and_forgotten_when_it_is_none() -> None:
     assert watched.decoder.damaged > 50
 
 
-def test_a_stream_of_which_no_key_comes_is_left_to_ffmpeg_and_a_whole_key_ends_that() -> None:
+def test_a_stream_without_key_pictures_is_left_to_ffmpeg_until_a_whole_one() -> None:
     watched = Watched()
     assert watched.decode(film()[0], 0) is not None
     faulty = bytearray(film()[GROUP])
@@ -185,6 +185,6 @@ def test_a_stream_of_which_no_key_comes_is_left_to_ffmpeg_and_a_whole_key_ends_t
     assert watched.whole[-1] == numbers[-1] + 2
 
 
-def test_only_pieces_are_taken() -> None:
+def test_only_pieces_are_accepted() -> None:
     with pytest.raises(TypeError, match="a piece of a live stream"):
         LiveDecoder().decode(Coded(b"", True, 0, 0, 0), show=True)

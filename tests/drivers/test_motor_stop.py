@@ -1,4 +1,4 @@
-"""The emergency stop that all drivers share: its pace, what ends it, and what a reset takes."""
+"""The emergency stop that all drivers share: its pace, its end, and its reset."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BEGUN_NS = nanoseconds(100.0)
 
 
 class Press:
-    """A stop that was pressed just now, and the time. ``sent``: when it was sent [ns since the press]."""
+    """A stop that was just pressed, with a clock. ``sent``: times when it was sent [ns since the press]."""
 
     def __init__(self) -> None:
         self.events: list[VehicleEvent] = []
@@ -36,7 +36,7 @@ class Press:
 
 
 @pytest.mark.parametrize("shown", [None, False])
-def test_it_is_sent_at_once_and_at_a_steady_pace_until_it_is_given_up(shown: bool | None) -> None:
+def test_a_stop_is_sent_at_once_and_steadily_until_it_is_abandoned(shown: bool | None) -> None:
     press = Press()
     press.run(2 * GIVE_UP_NS, shown)
     assert press.sent[0] == 0
@@ -48,12 +48,12 @@ def test_it_is_sent_at_once_and_at_a_steady_pace_until_it_is_given_up(shown: boo
     assert "has not shown it for 10 s" in event.text
 
 
-def test_what_shows_it_ends_the_sending_and_it_lasts_until_the_reset() -> None:
+def test_a_shown_stop_ends_the_sending_and_lasts_until_the_reset() -> None:
     press = Press()
     press.run(SETTLE_NS)
     sent = len(press.sent)
     press.run(3 * GIVE_UP_NS, shown=True)
-    press.run(3 * GIVE_UP_NS, shown=None)  # the link is lost: what was shown stays
+    press.run(3 * GIVE_UP_NS, shown=None)  # the link is lost: the vehicle's last state stays
     assert (len(press.sent), press.stop.active, press.events) == (sent, True, [])
     press.stop.reset()
     assert not press.stop.active
@@ -73,10 +73,10 @@ def test_no_reset_before_it_is_shown() -> None:
     assert press.stop.shown
     press.stop.reset()
     assert not press.stop.shown
-    press.stop.reset()  # nothing to reset is no error
+    press.stop.reset()  # a reset without a stop is not an error
 
 
-def test_motors_that_start_again_soon_are_stopped_again_and_later_they_are_others() -> None:
+def test_motors_that_restart_soon_are_stopped_again_but_not_later() -> None:
     press = Press()
     press.run(nanoseconds(1.0), shown=True)
     assert not press.sent
@@ -89,7 +89,7 @@ def test_motors_that_start_again_soon_are_stopped_again_and_later_they_are_other
     assert "started again" in press.events[0].text
 
 
-def test_a_further_press_begins_the_time_anew_and_keeps_the_pace() -> None:
+def test_another_press_restarts_the_time_limit_and_keeps_the_pace() -> None:
     press = Press()
     for _ in range(30):
         press.run(nanoseconds(0.5))
@@ -100,8 +100,8 @@ def test_a_further_press_begins_the_time_anew_and_keeps_the_pace() -> None:
     assert not press.stop.active
 
 
-def test_the_repeats_of_one_press_neither_make_it_longer_nor_put_off_what_shows_it() -> None:
-    """The library repeats it 32 times a second until it shows."""
+def test_repeats_of_a_press_neither_extend_it_nor_delay_its_confirmation() -> None:
+    """The library repeats the stop 32 times a second until it shows."""
     press = Press()
     while press.now_ns < BEGUN_NS + nanoseconds(8.0):
         press.run(nanoseconds(0.04))
@@ -110,10 +110,10 @@ def test_the_repeats_of_one_press_neither_make_it_longer_nor_put_off_what_shows_
     press.run(nanoseconds(2.1))
     assert not press.stop.active
     press.stop.press(press.now_ns)
-    assert press.stop.step(None, press.now_ns), "one that was given up can be pressed again at once"
+    assert press.stop.step(None, press.now_ns), "an abandoned stop can be pressed again at once"
 
 
-def test_what_was_seen_about_the_time_of_the_press_may_be_from_before() -> None:
+def test_reports_around_the_press_may_be_from_before_it() -> None:
     stop = Press().stop
     assert [stop.settled(BEGUN_NS + span_ns) for span_ns in (-1, 0, SETTLE_NS - 1, SETTLE_NS)] == [False] * 3 + [True]
     stop = MotorStop(lambda _: None)
@@ -121,7 +121,7 @@ def test_what_was_seen_about_the_time_of_the_press_may_be_from_before() -> None:
 
 
 @given(st.lists(st.sampled_from([None, False, True]), max_size=80))
-def test_it_is_never_sent_late_nor_to_what_shows_it(states: list[bool | None]) -> None:
+def test_a_stop_is_never_sent_late_or_after_it_is_shown(states: list[bool | None]) -> None:
     press = Press()
     known = False
     for shown in states:

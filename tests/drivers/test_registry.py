@@ -1,4 +1,4 @@
-"""Drivers are found by entry point, and what is wrong with one is said by name."""
+"""Drivers are found by entry point, and errors name the package at fault."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_our_own_are_known() -> None:
+def test_our_own_drivers_are_known() -> None:
     assert {"sim", "video"} <= set(known_schemes())
 
 
@@ -40,7 +40,7 @@ def test_drivers_of_one_scheme_are_looked_up_once(monkeypatch: pytest.MonkeyPatc
     assert len({type(make_driver(f"mavlink://udpin:127.0.0.1:{port}")) for port in range(20_000, 20_020)}) == 1
     assert len(calls) == 1
     install(site, "later_drone", "laterdrone = skyloop.vehicles.sim.driver:SimDriver")
-    assert driver_class("laterdrone") is driver_class("sim"), "one that is installed meanwhile is found"
+    assert driver_class("laterdrone") is driver_class("sim"), "a newly installed driver is found"
 
 
 def test_an_unknown_scheme_gets_suggestions() -> None:
@@ -49,7 +49,7 @@ def test_an_unknown_scheme_gets_suggestions() -> None:
     assert caught.value.suggestions[0] == "video"
 
 
-def test_what_is_no_address_is_refused() -> None:
+def test_an_invalid_address_is_refused() -> None:
     with pytest.raises(UsageError, match="is not a vehicle's address"):
         make_driver("kitchen")
 
@@ -69,13 +69,13 @@ def test_an_attribute_that_is_missing_names_package_and_cause(site: Path) -> Non
         driver_class("halfdrone")
 
 
-def test_what_is_no_driver_is_refused(site: Path) -> None:
+def test_a_class_that_is_not_a_driver_is_refused(site: Path) -> None:
     install(site, "not_a_drone", "notadrone = collections:OrderedDict")
     with pytest.raises(DriverError, match=r"not_a_drone .*is not a subclass of"):
         driver_class("notadrone")
 
 
-def test_a_missing_extra_is_told_as_such(site: Path) -> None:
+def test_a_missing_extra_is_reported_as_such(site: Path) -> None:
     install(site, "extra_drone", "extradrone = extra_drone_module:Driver")
     (site / "extra_drone_module.py").write_text(
         "from skyloop.errors import MissingExtraError\nraise MissingExtraError('extradrone://', 'extradrone')\n"

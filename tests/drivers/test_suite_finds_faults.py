@@ -1,4 +1,4 @@
-"""The suite is worth something only if it catches drivers that break the contract: each of these breaks one rule."""
+"""The suite must catch drivers that break the contract: each of these breaks one rule."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def _toy() -> type[Driver]:
 
 
 Toy = _toy()
-KEPT: list[socket.socket] = []  # by the drivers that leak
+KEPT: list[socket.socket] = []  # sockets of the leaking drivers
 
 
 class Altered(Toy):  # type: ignore[misc, valid-type]
-    """A toy whose feedback is altered on the way."""
+    """A toy whose feedback is altered."""
 
     def _open(self, sink: Sink) -> None:
         driver = self
@@ -91,7 +91,7 @@ class FromTheFuture(Altered):
 
 
 class LeftIsRight(Altered):
-    """Its world's y axis points south."""
+    """A world whose y axis points south."""
 
     def alter(self, feedback: Feedback) -> Feedback:
         assert feedback.position_m is not None
@@ -114,7 +114,7 @@ class DownIsUp(Toy):  # type: ignore[misc, valid-type]
 
 
 class NeedsRepeats(Toy):  # type: ignore[misc, valid-type]
-    """Forgets what it was told a moment ago."""
+    """Forgets each command after a moment."""
 
     def _apply(self, action: AnyAction) -> AnyAction:
         applied: AnyAction = super()._apply(action)
@@ -161,9 +161,9 @@ class IgnoresParameters(Toy):  # type: ignore[misc, valid-type]
 
 
 class StartsLater(Toy):  # type: ignore[misc, valid-type]
-    """Begins a take-off a moment after it was asked for, whatever became of it meanwhile."""
+    """Starts a take-off a moment after the request, whatever happened since."""
 
-    sink: Sink  # of the one that is open
+    sink: Sink  # sink of the open driver
 
     def capabilities(self) -> Capabilities:
         return Capabilities(vehicle="toy", actions=frozenset({"velocity", "takeoff", "land"}))

@@ -1,4 +1,4 @@
-"""What the sessions of all vehicles share: late packets told apart from a vehicle that was started anew."""
+"""The shared part of all vehicles' sessions: late packets are distinguished from a restarted vehicle."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STEP_NS = 20_000_000
 
 
 def judged(watch: RestartWatch, numbers: list[int]) -> list[Arrival]:
-    """What is said of packets that arrive one after the other."""
+    """Return the verdicts on consecutive packets."""
     return [watch.update(number, place * STEP_NS) for place, number in enumerate(numbers)]
 
 
@@ -26,8 +26,8 @@ def test_a_new_count_needs_a_run_of_packets() -> None:
     ]
 
 
-def test_a_burst_of_late_packets_is_no_new_count() -> None:
-    """However many: they arrive together, and the next one goes on where the count was."""
+def test_a_burst_of_late_packets_does_not_start_a_new_count() -> None:
+    """However many: they arrive together, and the next one continues the old count."""
     watch = RestartWatch()
     assert watch.update(5000, 0) is Arrival.NEW
     assert {watch.update(number, STEP_NS) for number in range(1000, 1020)} == {Arrival.LATE}
@@ -35,14 +35,14 @@ def test_a_burst_of_late_packets_is_no_new_count() -> None:
 
 
 @pytest.mark.parametrize("tolerance", [0, 1000])
-def test_a_count_may_begin_again_where_it_wraps(tolerance: int) -> None:
+def test_a_count_may_restart_where_it_wraps(tolerance: int) -> None:
     watch = RestartWatch(tolerance, 1 << 32)
     numbers = [(1 << 32) - 30, (1 << 32) - 10, 10, (1 << 32) - 5000, 30]
     assert judged(watch, numbers) == [Arrival.NEW, Arrival.NEW, Arrival.NEW, Arrival.LATE, Arrival.NEW]
 
 
 @given(st.lists(st.integers(1, 400), min_size=1, max_size=40), st.integers(1, 5000))
-def test_single_late_packets_never_make_a_new_start(steps: list[int], behind: int) -> None:
+def test_single_late_packets_never_start_a_new_count(steps: list[int], behind: int) -> None:
     watch, number = RestartWatch(), 10_000
     for place, step in enumerate(steps):
         number += step

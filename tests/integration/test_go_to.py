@@ -73,7 +73,7 @@ def test_a_place_that_is_refused_is_not_flown_to_afterwards(vehicle: str) -> Non
 
 
 @pytest.mark.parametrize("vehicle", [SIM, SIM + "&native=velocity", SIM + "&native=attitude", *AUTOPILOTS])
-def test_there_and_back(vehicle: str) -> None:
+def test_round_trip(vehicle: str) -> None:
     with flown(vehicle) as drone:
         native = "position" in drone.capabilities.actions
         assert native is (vehicle in KINDS)

@@ -1,4 +1,4 @@
-"""Writes the packets in ``tests/data/packets``: run it when the wire format gets a new version, never otherwise.
+"""Write the packets in ``tests/data/packets``; run this only for a new version of the wire format.
 
 python -m tests.messages.make_packets
 """

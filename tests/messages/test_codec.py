@@ -1,4 +1,4 @@
-"""The codec: golden packets, truncated and invalid ones, and anything at all."""
+"""The codec, with golden, truncated, invalid and random packets."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_golden_packets_decode_to_their_samples_and_back(name: str) -> None:
     assert encode(decode(golden)) == golden
 
 
-def test_a_camera_told_by_an_older_proxy_has_no_stream() -> None:
+def test_a_camera_of_an_older_proxy_has_no_stream() -> None:
     older = decode((PACKETS / "older" / "reply-welcome.bin").read_bytes())
     assert isinstance(older, Reply)
     assert isinstance(older.body, Welcome)
@@ -65,14 +65,14 @@ def test_a_camera_told_by_an_older_proxy_has_no_stream() -> None:
 
 
 @pytest.mark.parametrize("name", ["feedback", "feedback-minimal"])
-def test_feedback_of_an_older_proxy_has_no_reason_of_its_link_and_nobody_else_who_flies(name: str) -> None:
+def test_feedback_of_an_older_proxy_has_no_link_reason_and_no_other_controller(name: str) -> None:
     older = decode((PACKETS / "older" / f"{name}.bin").read_bytes())
     before: dict[str, object] = {"link_reason": "", "link_remedy": "", "others": None}
     before |= {"start_position_m": None, "return_phase": ReturnPhase.NONE, "skipped": 0, "outcome": None}
     assert older == msgspec.structs.replace(SAMPLES[name], **before)
 
 
-def test_a_command_of_an_older_client_was_asked_for_by_its_application() -> None:
+def test_a_command_of_an_older_client_counts_as_its_applications_request() -> None:
     older = decode((PACKETS / "older" / "command-hover.bin").read_bytes())
     assert older == SAMPLES["command-hover"]
     assert isinstance(older, Command)
@@ -84,14 +84,14 @@ def test_an_older_proxy_marks_no_parameter_as_momentary(name: str) -> None:
     assert decode((PACKETS / "older" / f"{name}.bin").read_bytes()) == SAMPLES[name]
 
 
-def test_an_older_proxy_does_not_tell_its_clock() -> None:
+def test_an_older_proxy_does_not_report_its_clock() -> None:
     older = decode((PACKETS / "older" / "reply-welcome-without-clock.bin").read_bytes())
     newer = SAMPLES["reply-welcome"]
     assert isinstance(newer, Reply)
     assert older == without_software(msgspec.structs.replace(newer.body, clock=""))
 
 
-def test_an_older_proxy_does_not_tell_what_it_adds_to_the_vehicles_actions() -> None:
+def test_an_older_proxy_does_not_report_software_actions() -> None:
     newer = SAMPLES["reply-welcome"]
     assert isinstance(newer, Reply)
     assert isinstance(newer.body, Welcome)
@@ -117,7 +117,7 @@ def without_software(welcome: AnyReply) -> Reply:
         (Position(0.0, 0.0, 1.0, turn_rate=-1.0), "turn_rate is -1 rad/s and must be more than 0"),
     ],
 )
-def test_places_that_make_no_sense_say_so(action: Position, words: str) -> None:
+def test_nonsensical_actions_report_a_problem(action: Position, words: str) -> None:
     assert action.finite
     assert words in action.problem
     assert not Position(1.0, 2.0, 3.0, -7.0, 0.1, 0.1).problem
@@ -132,7 +132,7 @@ def test_places_that_make_no_sense_say_so(action: Position, words: str) -> None:
         ("reply-queued", Reply(2, AuthorityQueued(1, "alice", 0))),
     ],
 )
-def test_what_an_older_end_says_of_the_authority(name: str, known: Sample) -> None:
+def test_authority_messages_of_older_ends(name: str, known: Sample) -> None:
     assert decode((PACKETS / "older" / f"{name}.bin").read_bytes()) == known
 
 
@@ -142,7 +142,7 @@ def test_a_time_that_makes_no_sense_is_refused(for_s: float) -> None:
         decode(encode(Request(1, RequestAuthority(for_s=for_s))))
 
 
-def test_the_largest_picture_that_is_handed_on_fits_a_packet() -> None:
+def test_the_largest_piece_of_a_picture_fits_a_packet() -> None:
     camera = "\N{GRINNING FACE}" * 64
     last = 2**63 - 1
     intrinsics = Intrinsics(0.1, 0.1, 0.1, 0.1, (0.1,) * 14, "fisheye")
@@ -170,7 +170,7 @@ def test_every_truncation_is_refused(name: str) -> None:
     for length in range(len(whole)):
         with pytest.raises(DecodeError):
             decode(whole[:length])
-        if length >= HEADER_SIZE:  # also with a header that fits the shorter body
+        if length >= HEADER_SIZE:  # also with a header that matches the shorter body
             shorter = packet(whole[5], whole[HEADER_SIZE:length])
             with pytest.raises(DecodeError):
                 decode(shorter)
@@ -247,7 +247,7 @@ def test_fields_of_a_later_version_are_skipped_and_defaults_fill_missing_ones() 
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
-def test_non_finite_actions_decode_and_say_so(number: float) -> None:
+def test_non_finite_actions_decode_and_are_marked(number: float) -> None:
     for action in (Attitude(climb=number), Velocity(up=number), Position(0.0, number, 0.0), Position(0, 0, 0, number)):
         sample = decode(encode(Command(1, 1, 1, 1, action)))
         assert isinstance(sample, Command)

@@ -1,4 +1,4 @@
-"""Where world axes lie on the earth, and what a driver's numbers about it have to be."""
+"""The place of the world axes on the earth, and the checks of a driver's numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NEAR = st.floats(-5_000.0, 5_000.0)
 
 
 @given(st.floats(-80.0, 80.0), st.floats(-180.0, 180.0), st.tuples(NEAR, NEAR, NEAR))
-def test_there_and_back(latitude: float, longitude: float, position: tuple[float, float, float]) -> None:
+def test_round_trip(latitude: float, longitude: float, position: tuple[float, float, float]) -> None:
     origin = EarthOrigin(latitude, longitude, 100.0, 6_371_000.0)
     place = origin.place_of(position)
     assert abs(place[1]) <= 180.0
@@ -27,15 +27,15 @@ def test_x_is_east_y_is_north_and_z_up() -> None:
     x, y, z = ZURICH.position_of(47.398742, 8.546594, 500.0)
     metres_per_deg = math.radians(1.0) * 6_371_000.0
     assert (x, y, z) == pytest.approx((0.001 * metres_per_deg * math.cos(math.radians(47.398)), 111.19, 12.0), rel=1e-3)
-    assert x < y, "meridians come together towards the pole"
+    assert x < y, "meridians converge towards the pole"
 
 
-def test_the_shorter_way_round_is_taken() -> None:
+def test_the_shorter_way_round_counts() -> None:
     x, _, _ = EarthOrigin(0.0, 179.9999, 0.0, 6_371_000.0).position_of(0.0, -179.9999, 0.0)
     assert x == pytest.approx(22.24, abs=0.01)
 
 
-def test_a_driver_passes_it_on_in_native() -> None:
+def test_a_driver_publishes_the_origin_in_native() -> None:
     assert Feedback(captured_ns=1, native={**ZURICH.native(), "wifi": 3}).origin == ZURICH
     assert Feedback(captured_ns=1).origin is None
     assert Feedback(captured_ns=1, native={}).origin is None
@@ -53,7 +53,7 @@ def test_a_driver_passes_it_on_in_native() -> None:
         ("origin.radius_m", (1.0, 2.0)),
     ],
 )
-def test_what_makes_no_sense_is_not_known(key: str, value: float | str | tuple[float, ...]) -> None:
+def test_nonsensical_origins_are_ignored(key: str, value: float | str | tuple[float, ...]) -> None:
     assert Feedback(captured_ns=1, native={**ZURICH.native(), key: value}).origin is None
 
 

@@ -1,4 +1,4 @@
-"""Which pictures of a stream can be decoded."""
+"""Which pictures of a stream are decodable, and their assembly from pieces."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from skyloop.messages import EncodedFrame, decode, encode
 from skyloop.messages.frame import MAX_PIECE, Chain, Pieces, split
 
 
-def test_a_chain_begins_at_a_key_and_breaks_at_a_gap() -> None:
+def test_a_chain_starts_at_a_key_picture_and_breaks_at_a_gap() -> None:
     chain = Chain()
     came = [(1, False), (2, True), (3, False), (4, False), (6, False), (7, False), (9, True), (10, False)]
     assert [number for number, key in came if chain.follows(number, key=key)] == [2, 3, 4, 9, 10]
-    assert not chain.follows(10, key=False)  # a second time
+    assert not chain.follows(10, key=False)  # a duplicate
     assert chain.follows(11, key=False)
     chain.restart()
     assert not chain.follows(12, key=False)
     assert chain.follows(13, key=True)
-    assert chain.follows(1, key=True)  # whoever counts them began anew
+    assert chain.follows(1, key=True)  # the sender restarted its numbers
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=40))
-def test_whatever_is_lost_each_picture_that_follows_has_all_since_its_key(sent: list[tuple[bool, bool]]) -> None:
+def test_a_picture_follows_only_if_none_since_its_key_picture_is_lost(sent: list[tuple[bool, bool]]) -> None:
     chain = Chain()
     kept = {number for number, (key, lost) in enumerate(sent) if not lost and chain.follows(number, key=key)}
     for number in kept:
@@ -42,7 +42,7 @@ def picture(seq: int, size: int) -> EncodedFrame:
     st.sets(st.integers(0, 15)),
     st.booleans(),
 )
-def test_a_picture_in_pieces_comes_whole_or_not_at_all(sizes: list[int], lost: set[int], twice: bool) -> None:
+def test_a_picture_in_pieces_arrives_whole_or_not_at_all(sizes: list[int], lost: set[int], twice: bool) -> None:
     pictures = [picture(seq, size) for seq, size in enumerate(sizes)]
     pieces, number, came = Pieces(), 0, []
     whole = set()

@@ -1,4 +1,4 @@
-"""What a consumer of feedback may ask for, and how it is written as a topic."""
+"""Requests for feedback, and their topics."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_every_request_has_one_topic_that_fits(request_: FeedbackRequest) -> Non
 
 
 @given(requests, requests)
-def test_a_union_gives_what_either_asks_for_and_no_more(one: FeedbackRequest, other: FeedbackRequest) -> None:
+def test_a_union_covers_both_requests_and_no_more(one: FeedbackRequest, other: FeedbackRequest) -> None:
     both = one.union(other)
     assert both == other.union(one)
     assert both.period_s == min(one.period_s, other.period_s)
@@ -70,7 +70,7 @@ def test_a_rate_that_makes_no_sense(max_hz: Any) -> None:
         "feedback/x?max_hz=5",
     ],
 )
-def test_topics_that_are_none(topic: str) -> None:
+def test_invalid_topics_are_refused(topic: str) -> None:
     with pytest.raises(UsageError, match="is not a request for feedback"):
         FeedbackRequest.parse(topic)
 
@@ -81,7 +81,7 @@ def test_a_rate_is_kept_on_average(max_hz: float, source_hz: float, begin_ns: in
     times = [begin_ns + round(i * 1e9 / source_hz) for i in range(300)]
     kept = [at for at in times if limiter.in_time(at)]
     span_s = (kept[-1] - kept[0]) / 1e9
-    assert len(kept) - 1 <= (span_s * max_hz) * 1.0 + 0.2  # the tolerance of a single one
+    assert len(kept) - 1 <= (span_s * max_hz) * 1.0 + 0.2  # the tolerance of one sample
     assert len(kept) == len(times) if source_hz <= max_hz else len(kept) >= 300 * min(1.0, max_hz / source_hz) / 2
 
 

@@ -1,4 +1,4 @@
-"""Rotations: axes, signs and the way back."""
+"""Rotations: axes, signs and inverses."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_signs(roll: float, pitch: float, yaw: float, body: tuple[float, ...], w
 
 
 @given(angles, pitches, angles)
-def test_there_and_back(roll: float, pitch: float, yaw: float) -> None:
+def test_round_trip(roll: float, pitch: float, yaw: float) -> None:
     rotation = rotation_from_euler(roll, pitch, yaw)
     assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
@@ -47,7 +47,7 @@ def test_there_and_back(roll: float, pitch: float, yaw: float) -> None:
 
 
 @given(angles, pitches, angles)
-def test_a_quaternion_is_scipys(roll: float, pitch: float, yaw: float) -> None:
+def test_a_quaternion_matches_scipy(roll: float, pitch: float, yaw: float) -> None:
     rotation = Rotation.from_quat(quaternion_from_euler(roll, pitch, yaw))  # x, y, z, w
     assert rotation.as_matrix() == pytest.approx(rotation_from_euler(roll, pitch, yaw), abs=1e-9)
 
@@ -64,12 +64,12 @@ def test_a_quarter_turn_is_counter_clockwise() -> None:
     assert turned(1.0, 0.0, math.pi / 2) == pytest.approx((0.0, 1.0))
 
 
-def test_nan_is_in_the_middle_of_any_range() -> None:
+def test_nan_counts_as_the_middle_of_a_range() -> None:
     assert (clamped(math.nan, 2.0), within(math.nan, 2.0, 3.0), in_16_bits(math.nan)) == (0.0, 2.0, 0)
     assert (in_16_bits(4e4), in_16_bits(-math.inf)) == (32767, -32768)
 
 
-def test_feedback_gives_its_rotation_once_it_knows_it() -> None:
+def test_feedback_has_a_rotation_once_the_attitude_is_known() -> None:
     known = Feedback(captured_ns=1, roll_rad=0.1, pitch_rad=-0.2, yaw_rad=0.3)
     assert euler_from_rotation(known.rotation) == pytest.approx((0.1, -0.2, 0.3))
     with pytest.raises(ValueError, match="not reported its attitude"):

@@ -1,4 +1,4 @@
-"""``docs/wire-format.md`` is true of the code: every table, tag, kind and vocabulary."""
+"""``docs/wire-format.md`` matches the code: every table, tag, kind and vocabulary."""
 
 from __future__ import annotations
 

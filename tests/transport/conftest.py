@@ -1,4 +1,4 @@
-"""Sockets of these tests lie in a directory of their own."""
+"""These tests use their own directory of sockets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def runtime_dir(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An empty directory of sockets, with a short path."""
+    """Create an empty directory of sockets, with a short path."""
     with TemporaryDirectory(prefix="skyloop-") as directory:
         monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", f"{directory}/run")
         monkeypatch.delenv("SKYLOOP_GROUP", raising=False)

@@ -1,4 +1,4 @@
-"""An end in a process of its own, told by lines on its standard input and answering on its standard output.
+"""One end in a separate process, controlled by lines on its standard input; it answers on its standard output.
 
 ``serve NAME``: publishes a packet and a frame every 5 ms. ``watch NAME``: subscribes, and answers each line with the
 newest frame's number, whether every frame was whole, and why the connection ended.

@@ -1,4 +1,4 @@
-"""What waits of one connection: of the set-points only the newest, and everything else in order."""
+"""A connection's backlog: only the newest of the set-points, and everything else in order."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def left(backlog: PacketBacklog) -> list[bytes]:
         ([Takeoff(), FLY, Hover(), FLY, LAND, EmergencyStop()], [1, 3, 4, 5, 6]),
         ([IDLE, IDLE], [2]),
         ([IDLE, FLY], [2]),
-        ([FLY, IDLE], [1, 2]),  # a keep-alive leaves the vehicle as it is: flying so
+        ([FLY, IDLE], [1, 2]),  # a keep-alive leaves the vehicle flying as it is
         ([FLY, IDLE, GO], [3]),
-        ([LAND, LAND], [1, 2]),  # asked for twice
+        ([LAND, LAND], [1, 2]),  # requested twice
     ],
 )
-def test_what_is_left(came: list[AnyAction], kept: list[int]) -> None:
+def test_the_backlog_after_several_packets(came: list[AnyAction], kept: list[int]) -> None:
     backlog = PacketBacklog()
     packets = [command(seq, action) for seq, action in enumerate(came, 1)]
     superseded = sum(backlog.put(packet) for packet in packets)
@@ -59,23 +59,23 @@ def test_what_is_left(came: list[AnyAction], kept: list[int]) -> None:
     assert backlog.lane is None
 
 
-def test_repeats_are_joined_to_the_newest_of_them() -> None:
+def test_repeats_merge_into_the_newest() -> None:
     backlog = PacketBacklog()
     for seq in range(1, 6):
         backlog.put(command(seq, LAND, intent=7))
     backlog.put(command(6, FLY, intent=8))
-    assert backlog.put(command(7, LAND, intent=7)) == 0  # of no library, but nothing is lost
+    assert backlog.put(command(7, LAND, intent=7)) == 0  # not a sequence that the library sends, but nothing is lost
     assert left(backlog) == [command(5, LAND, 7), command(6, FLY, 8), command(7, LAND, 7)]
 
 
-def test_one_that_came_in_another_order_takes_no_newer_ones_place() -> None:
+def test_a_reordered_command_never_replaces_a_newer_one() -> None:
     backlog = PacketBacklog()
     backlog.put(command(5, FLY))
     assert backlog.put(command(4, GO)) == 0
     assert len(left(backlog)) == 2
 
 
-def test_one_that_was_taken_out_is_not_superseded() -> None:
+def test_a_removed_command_is_not_superseded() -> None:
     backlog = PacketBacklog()
     backlog.put(command(1, FLY))
     backlog.get()
@@ -106,10 +106,10 @@ def test_the_lane_is_that_of_the_commands_in_front() -> None:
     while late:
         lanes.append(late.lane)
         late.get()
-    assert lanes == [Lane.STEERING, Lane.OTHERS, Lane.URGENT], "what it sent before its landing is handled before it"
+    assert lanes == [Lane.STEERING, Lane.OTHERS, Lane.URGENT], "packets before the landing are handled before it"
 
 
-def test_it_is_bounded() -> None:
+def test_the_backlog_is_bounded() -> None:
     backlog = PacketBacklog()
     for _ in range(MOST_PACKETS):
         assert not backlog.full

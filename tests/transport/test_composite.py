@@ -1,4 +1,4 @@
-"""Several transport servers as one keep the contract, and number their applications over all of them."""
+"""A composite of transport servers keeps the contract and numbers the applications of all of them."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 
 
 class TestCompositeBySecondEnd(TransportSuite):
-    """What comes by one end is as if there were no other."""
+    """One end works as if there were no other."""
 
     def make_server(self) -> TransportServer:
         self.end = MemoryServer("near")
-        return CompositeServer([MemoryServer("nobody comes here"), self.end])
+        return CompositeServer([MemoryServer("no client connects here"), self.end])
 
     def dialer(self, server: TransportServer) -> Dialer:
         return self.end.dial
 
 
 class TestCompositeByTurns(TransportSuite):
-    """Applications of one transport server come by different ways."""
+    """Applications connect to one server through different ends."""
 
     def make_server(self) -> TransportServer:
         self.ends = itertools.cycle(ends := [MemoryServer("one"), MemoryServer("two")])
@@ -53,7 +53,7 @@ def test_peers_are_numbered_over_all_ends() -> None:
 
 class Taken(MemoryServer):
     def start(self, handler: ServerHandler) -> None:
-        raise NameTakenError("somebody has it")
+        raise NameTakenError("the name is taken")
 
 
 def test_an_end_that_cannot_start_stops_the_others() -> None:
@@ -64,6 +64,6 @@ def test_an_end_that_cannot_start_stops_the_others() -> None:
     first.stop()
 
 
-def test_no_end_at_all_is_refused() -> None:
+def test_a_composite_without_ends_is_refused() -> None:
     with pytest.raises(UsageError, match="at least one"):
         CompositeServer([])

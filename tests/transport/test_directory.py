@@ -1,4 +1,4 @@
-"""The directory of sockets: names, who may enter, what is left by the dead."""
+"""The directory of sockets: names, access, and leftovers of killed proxies."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 
 
 @pytest.mark.parametrize("name", ["", "Alpha", "-a", ".a", "a/b", "a" * 49, "a b", "ä", "a\n"])
-def test_what_cannot_be_a_name_is_refused(name: str) -> None:
+def test_invalid_names_are_refused(name: str) -> None:
     with pytest.raises(UsageError, match="cannot be the name of a proxy"):
         LocalServer(name)
     with pytest.raises(UsageError, match="cannot be the name of a proxy"):
@@ -42,7 +42,7 @@ def test_running_proxies_are_listed(runtime_dir: Path) -> None:
             server.stop()
     assert list_names() == []
     assert list(runtime_dir.iterdir()) == []
-    assert [log.joined for log in logs] == [[], [], []], "looking is not joining"
+    assert [log.joined for log in logs] == [[], [], []], "listing does not connect"
 
 
 def test_only_the_owner_may_enter(runtime_dir: Path) -> None:
@@ -73,15 +73,15 @@ def test_a_directory_in_an_open_place_is_refused(runtime_dir: Path) -> None:
         LocalServer("alpha").start(ServerLog())
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can make somebody else's directory")
-def test_a_directory_of_somebody_else_is_refused(runtime_dir: Path) -> None:
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can create another user's directory")
+def test_another_users_directory_is_refused(runtime_dir: Path) -> None:
     runtime_dir.mkdir(mode=0o700)
     os.chown(runtime_dir, 65534, 65534)
     with pytest.raises(LinkError, match=r"belongs to .* and not to"):
         LocalServer("alpha").start(ServerLog())
 
 
-def test_what_is_no_directory_is_refused(runtime_dir: Path) -> None:
+def test_a_file_in_place_of_the_directory_is_refused(runtime_dir: Path) -> None:
     runtime_dir.write_text("")
     with pytest.raises(LinkError, match="not a directory"):
         LocalServer("alpha").start(ServerLog())
@@ -114,7 +114,7 @@ def test_a_group_must_exist_and_have_a_place(monkeypatch: pytest.MonkeyPatch) ->
         LocalServer("alpha", group=grp.getgrgid(os.getegid()).gr_name)
 
 
-def test_without_a_setting_it_is_the_users_runtime_directory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_is_the_users_runtime_directory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SKYLOOP_RUNTIME_DIR")
     monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/4711")
     assert find_directory().path == Path("/run/user/4711/skyloop")
@@ -124,18 +124,18 @@ def test_without_a_setting_it_is_the_users_runtime_directory(monkeypatch: pytest
 
 def test_a_path_too_long_for_a_socket_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", "/tmp/" + "x" * 100)
-    with pytest.raises(UsageError, match="may have 107"):
+    with pytest.raises(UsageError, match="over the limit of 107"):
         LocalServer("alpha")
 
 
-def test_a_taken_name_is_told_with_its_owner() -> None:
+def test_a_taken_name_is_refused_with_its_owner() -> None:
     first, log = LocalServer("alpha"), ServerLog()
     first.start(log)
     try:
         with pytest.raises(NameTakenError, match=rf"'alpha' is in use by a running proxy .pid {os.getpid()}."):
             LocalServer("alpha").start(ServerLog())
         client = dial("alpha")(ClientLog())
-        wait_until(lambda: log.joined, "the first one serves on")
+        wait_until(lambda: log.joined, "the first one keeps serving")
         client.close()
     finally:
         first.stop()
@@ -154,7 +154,7 @@ def test_an_unknown_name_gets_a_suggestion() -> None:
 
 
 def leave_stale_socket(runtime_dir: Path) -> Path:
-    """What a killed proxy leaves."""
+    """Leave a socket as a killed proxy does."""
     find_directory().create()
     path = runtime_dir / "alpha.sock"
     dead = Socket()
@@ -165,7 +165,7 @@ def leave_stale_socket(runtime_dir: Path) -> Path:
     return path
 
 
-def test_a_stale_socket_is_refused_listed_away_and_replaced(runtime_dir: Path) -> None:
+def test_a_stale_socket_is_refused_unlisted_and_replaced(runtime_dir: Path) -> None:
     path = leave_stale_socket(runtime_dir)
     with pytest.raises(LinkError, match="'alpha' is not running: it was killed"):
         dial("alpha")(ClientLog())
@@ -175,7 +175,7 @@ def test_a_stale_socket_is_refused_listed_away_and_replaced(runtime_dir: Path) -
     server, log = LocalServer("alpha"), ServerLog()
     server.start(log)
     client = dial("alpha")(ClientLog())
-    wait_until(lambda: log.joined, "it is served")
+    wait_until(lambda: log.joined, "the client has joined")
     client.close()
     server.stop()
     assert list(runtime_dir.iterdir()) == []
@@ -202,7 +202,7 @@ def test_a_server_end_is_started_once() -> None:
     server.stop()
 
 
-def test_other_platforms_are_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_platforms_are_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "darwin")
     assert list_names() == [], "no proxy can run there"
     for use in (lambda: dial("alpha"), lambda: local.LocalServer):
@@ -210,8 +210,8 @@ def test_other_platforms_are_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
             use()
 
 
-def test_proxies_of_other_users_are_known_by_name_though_they_can_not_be_reached() -> None:
-    """The kernel names all sockets; ``skyloop list`` said that none runs on this host."""
+def test_proxies_of_other_users_are_known_by_name_but_unreachable() -> None:
+    """The kernel names all sockets, yet ``skyloop list`` reported no proxies on this host."""
     own = os.geteuid()
     table = f"""Num       RefCount Protocol Flags    Type St Inode Path
 0000000000000000: 00000002 00000000 00010000 0005 01 11 /run/user/{own + 1}/skyloop/alpha.sock

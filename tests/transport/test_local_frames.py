@@ -1,4 +1,4 @@
-"""Who gets which slot, without sockets."""
+"""Assignment of slots to viewers, without sockets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skyloop.transport.testing import header, picture
 
 
 class FakeConnection:
-    """Takes what fits."""
+    """Accepts packets until it is full."""
 
     def __init__(self) -> None:
         self.full = False
@@ -63,7 +63,7 @@ def memory_is_given_back(exchange: FrameExchange) -> Iterator[None]:
 
 
 def shared_bytes() -> int:
-    """Of the shared memory that this process has mapped."""
+    """Return the size of this process's mapped shared memory [bytes]."""
     total = 0
     for line in Path("/proc/self/maps").read_text().splitlines():
         if "/memfd:skyloop" in line:
@@ -76,7 +76,7 @@ def publish(exchange: FrameExchange, head: FrameHeader) -> int:
     return exchange.publish(head, picture(head))
 
 
-def test_nothing_is_copied_for_nobody(exchange: FrameExchange) -> None:
+def test_nothing_is_copied_without_viewers(exchange: FrameExchange) -> None:
     before = shared_bytes()
     assert publish(exchange, header(1)) == 0
     assert shared_bytes() == before
@@ -100,7 +100,7 @@ def test_leases_are_bounded_and_the_newest_waits(exchange: FrameExchange, viewer
     assert len(viewer.frames) == MAX_LEASES + 1, "and only once"
 
 
-def test_one_viewers_leases_do_not_hold_others_up(exchange: FrameExchange, viewer: FakeConnection) -> None:
+def test_one_viewers_leases_do_not_delay_others(exchange: FrameExchange, viewer: FakeConnection) -> None:
     fast = FakeConnection()
     exchange.subscribe(fast, "front")
     for seq in range(50):
@@ -121,7 +121,7 @@ def test_a_full_socket_gets_the_newest_at_its_next_release(exchange: FrameExchan
     assert [frame.header.seq for frame in viewer.frames] == [0, 2]
 
 
-def test_releasing_what_is_not_held_changes_nothing(exchange: FrameExchange, viewer: FakeConnection) -> None:
+def test_releasing_a_slot_not_held_changes_nothing(exchange: FrameExchange, viewer: FakeConnection) -> None:
     publish(exchange, header(0))
     slot = viewer.frames[0].slot
     assert not exchange.release(viewer, slot + 1)
@@ -130,7 +130,7 @@ def test_releasing_what_is_not_held_changes_nothing(exchange: FrameExchange, vie
     assert not exchange.release(viewer, slot)
 
 
-def test_memory_of_an_old_geometry_is_given_back(exchange: FrameExchange, viewer: FakeConnection) -> None:
+def test_memory_of_an_old_geometry_is_released(exchange: FrameExchange, viewer: FakeConnection) -> None:
     for seq in range(3):
         publish(exchange, header(seq, 640, 480))
     assert shared_bytes() >= 3 * 640 * 480 * 3
@@ -144,7 +144,7 @@ def test_memory_of_an_old_geometry_is_given_back(exchange: FrameExchange, viewer
     assert shared_bytes() == 0
 
 
-def test_what_is_looked_at_outlives_its_geometry(exchange: FrameExchange, viewer: FakeConnection) -> None:
+def test_a_frame_in_use_outlives_its_geometry(exchange: FrameExchange, viewer: FakeConnection) -> None:
     publish(exchange, header(0, 640, 480))
     publish(exchange, header(1))
     assert shared_bytes() > 640 * 480 * 3
@@ -152,7 +152,7 @@ def test_what_is_looked_at_outlives_its_geometry(exchange: FrameExchange, viewer
     assert shared_bytes() == 4096
 
 
-def test_unsubscribing_keeps_what_is_looked_at(exchange: FrameExchange, viewer: FakeConnection) -> None:
+def test_unsubscribing_keeps_frames_in_use(exchange: FrameExchange, viewer: FakeConnection) -> None:
     publish(exchange, header(0))
     held = viewer.frames[0].slot
     exchange.unsubscribe(viewer, "front")

@@ -1,4 +1,4 @@
-"""What the other end of a local connection may send, and that it costs nobody but itself."""
+"""Misbehaving ends of local connections harm only themselves."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def send_with(sock: socket.socket, packet: bytes, *fds: int) -> None:
     sock.sendmsg([packet], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", fds))])
 
 
-# --- a client that misbehaves ---
+# --- a misbehaving client ---
 
 
 @contextmanager
 def raw_client(*first: bytes) -> Iterator[tuple[Socket, ServerLog, ClientLog]]:
-    """A bare connection to a server, beside a good client that must be there to the end."""
+    """Open a bare connection to a server, beside a good client that must survive it."""
     server, log, good_log = LocalServer("alpha"), ServerLog(), ClientLog()
     server.start(log)
     good = dial("alpha")(good_log)
-    wait_until(lambda: log.joined, "the good one joined")
+    wait_until(lambda: log.joined, "the good client joined")
     raw = Socket()
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
     raw.settimeout(5)
@@ -52,7 +52,7 @@ def raw_client(*first: bytes) -> Iterator[tuple[Socket, ServerLog, ClientLog]]:
             raw.send(packet)
         yield raw, log, good_log
         assert good.send(b"undisturbed")
-        wait_until(lambda: log.from_peer(log.joined[0]) == [b"undisturbed"], "the good one is served")
+        wait_until(lambda: log.from_peer(log.joined[0]) == [b"undisturbed"], "the good client is served")
         assert good_log.closings == []
     finally:
         raw.close()
@@ -76,7 +76,7 @@ def test_an_empty_packet_is_the_end() -> None:
 
 
 @pytest.mark.parametrize("first", [b"x", packets.subscribe("feedback", True), packets.hello()[:-2] + b"\x02\0"])
-def test_who_does_not_say_hello_is_turned_away(first: bytes) -> None:
+def test_a_client_without_hello_is_rejected(first: bytes) -> None:
     with raw_client(first) as (raw, log, _):
         message = packets.parse(raw.recv(1000))
         assert isinstance(message, packets.Bye)
@@ -86,23 +86,23 @@ def test_who_does_not_say_hello_is_turned_away(first: bytes) -> None:
         assert log.left == []
 
 
-def test_what_makes_no_sense_is_left_to_the_handler() -> None:
+def test_nonsense_is_passed_to_the_handler() -> None:
     nonsense = [
-        packets.release(1),  # which it does not have
+        packets.release(1),  # of a slot that it does not hold
         packets.release(1)[:-1],
-        packets.slot(1, 1, 1),  # which only a proxy says
+        packets.slot(1, 1, 1),  # only a proxy sends this
         HEADER.pack(b"SKYL", 1, 0xFF, 0, 0),
         HEADER.pack(b"SKYL", 2, 0x41, 0, 0),
     ]
     with raw_client(packets.hello(), *nonsense) as (_, log, _):
-        wait_until(lambda: len(log.packets) == len(nonsense), "the handler has them")
+        wait_until(lambda: len(log.packets) == len(nonsense), "the handler got them")
         assert log.from_peer(log.joined[1]) == nonsense
         assert log.left == []
 
 
 def test_the_wake_up_that_older_applications_send_before_a_command_is_ignored() -> None:
     with raw_client(packets.hello(), packets.WAKE, b"x") as (_, log, _):
-        wait_until(lambda: log.packets, "the handler has what came after it")
+        wait_until(lambda: log.packets, "the handler got the packet behind it")
         assert log.from_peer(log.joined[1]) == [b"x"]
         assert log.complaints == []
 
@@ -110,14 +110,14 @@ def test_the_wake_up_that_older_applications_send_before_a_command_is_ignored() 
 def test_subscriptions_are_bounded() -> None:
     wishes = [packets.subscribe(f"topic-{number}", True) for number in range(MAX_SUBSCRIPTIONS + 1)]
     with raw_client(packets.hello(), *wishes, *wishes[:3]) as (_, log, _):
-        wait_until(lambda: log.complaints, "the handler was told of one too many")
-        assert "'topic-64' would be one more than the 64 topics" in log.complaints[0][1]
+        wait_until(lambda: log.complaints, "the handler got the complaint")
+        assert "'topic-64' exceeds the 64 topics" in log.complaints[0][1]
         assert log.packets == []
 
 
 @contextmanager
 def joined(log: ServerLog) -> Iterator[tuple[LocalServer, TransportClient]]:
-    """A server and its one client."""
+    """Start a server with one client."""
     server = LocalServer("alpha")
     server.start(log)
     client = dial("alpha")(ClientLog())
@@ -135,20 +135,20 @@ def test_topics_that_do_not_exist_are_refused_and_leave_nothing() -> None:
     with joined(log) as (server, client):
         client.subscribe("video/made-up")
         client.subscribe("video/front?scale=0.5")
-        wait_until(lambda: len(log.complaints) == 2, "the handler was told")
+        wait_until(lambda: len(log.complaints) == 2, "the handler got the complaints")
         assert log.complaints[0][1] == "no such camera"
         assert "subscribe to 'video/front'" in log.complaints[1][1]
         assert server.subscribers("video/made-up") == 0
         assert server._exchange._cameras == {}
 
 
-def test_a_camera_that_nobody_reads_any_more_leaves_nothing() -> None:
+def test_a_camera_without_readers_leaves_nothing() -> None:
     log = ServerLog()
     with joined(log) as (server, client):
         client.subscribe("video/front")
-        wait_until(lambda: server._exchange._cameras, "it is read")
+        wait_until(lambda: server._exchange._cameras, "the camera is subscribed to")
         client.close()
-        wait_until(lambda: log.left, "it is gone")
+        wait_until(lambda: log.left, "the client is gone")
         assert server._exchange._cameras == {}
 
 
@@ -158,7 +158,7 @@ def test_descriptors_sent_to_a_server_are_not_kept() -> None:
         before = descriptors()
         for _ in range(20):
             send_with(raw, b"have these", 0, 0, 0)
-        wait_until(lambda: len(log.packets) == 20, "the packets came")
+        wait_until(lambda: len(log.packets) == 20, "the packets arrived")
         assert descriptors() <= before
 
 
@@ -171,14 +171,14 @@ def test_connections_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         for peer in log.joined:
             assert server.admit(peer, pilot=True) == ""
         client = dial("alpha")(late)
-        wait_until(lambda: late.closings, "it was turned away")
-        assert "has 2 connections already" in late.closings[0]
+        wait_until(lambda: late.closings, "it was rejected")
+        assert "has 2 connections and accepts no more" in late.closings[0]
         client.close()
         second.close()
         assert len(log.joined) == 2
 
 
-def test_a_server_out_of_descriptors_accepts_when_there_are_some_again() -> None:
+def test_a_server_out_of_descriptors_accepts_once_there_are_some() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     server, log = LocalServer("alpha"), ServerLog()
     server.start(log)
@@ -188,7 +188,7 @@ def test_a_server_out_of_descriptors_accepts_when_there_are_some_again() -> None
         os.close(lowest_free)
         resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
         try:
-            for raw in (first, second):  # the kernel may have set one descriptor aside for the accept that waits
+            for raw in (first, second):  # the kernel may have reserved one descriptor for the waiting accept
                 raw.connect(path)
                 raw.send(packets.hello())
             second.settimeout(0.3)
@@ -201,12 +201,12 @@ def test_a_server_out_of_descriptors_accepts_when_there_are_some_again() -> None
     server.stop()
 
 
-# --- a proxy that misbehaves ---
+# --- a misbehaving proxy ---
 
 
 @contextmanager
 def raw_server() -> Iterator[tuple[socket.socket, TransportClient, ClientLog]]:
-    """The bare end of a connection that a client made."""
+    """Open the bare server end of a client's connection."""
     listener, _ = find_directory().listen("alpha")
     log = ClientLog()
     before = descriptors()
@@ -275,7 +275,7 @@ def test_descriptors_out_of_place_are_closed(packet: bytes) -> None:
             try:
                 send_with(raw, packet, 0, 0, 0)
             except ConnectionError:
-                break  # it has refused the first already
+                break  # it has already refused the first
 
 
 @pytest.mark.parametrize(
@@ -303,7 +303,7 @@ def test_the_memory_is_read_only_for_a_client() -> None:
     with raw_server() as (raw, _, log):
         send_with(raw, packets.slot(1, 1, 4096), slot.fd)
         raw.send(packets.frame(1, encode(header(1))))
-        wait_until(lambda: log.frames, "the frame came")
+        wait_until(lambda: log.frames, "the frame arrived")
         pixels = log.frames[0][1]
         with pytest.raises(ValueError, match="WRITEABLE"):
             pixels.flags.writeable = True
@@ -314,7 +314,7 @@ def test_the_memory_is_read_only_for_a_client() -> None:
         assert np.all(pixels == 7)
 
 
-def test_the_end_comes_after_what_was_sent_before_it() -> None:
+def test_the_end_comes_after_earlier_packets() -> None:
     with raw_server() as (raw, _, log):
         for number in range(50):
             raw.send(bytes([number + 1]))
@@ -324,10 +324,10 @@ def test_the_end_comes_after_what_was_sent_before_it() -> None:
         assert log.closings == ["the proxy is gone"]
 
 
-def test_what_does_not_fit_is_sent_later_and_in_order() -> None:
+def test_packets_that_do_not_fit_are_sent_later_and_in_order() -> None:
     with raw_server() as (raw, client, log):
         sent = 0
-        while client.send(bytes(50_000)):  # until the proxy, which does not read, has a full buffer
+        while client.send(bytes(50_000)):  # until the buffer of the proxy, which does not read, is full
             sent += 1
         while client.send(bytes(1)):
             sent += 1

@@ -1,4 +1,4 @@
-"""An application's own thread receives while it waits, and the receiving thread when it does not."""
+"""An application's own thread receives while it waits; otherwise the receiving thread does."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _names = (f"lead-{number}" for number in itertools.count())
 
 
 class Pair:
-    """A server, and a client whose log says which thread each packet came on."""
+    """A server, and a client whose log notes the thread that received each packet."""
 
     def __init__(self) -> None:
         name = next(_names)
@@ -39,7 +39,7 @@ class Pair:
         assert self.server.publish(FEEDBACK, packet) == 0
 
     def lead(self, count: int, timeout_s: float = 10.0) -> None:
-        """Wait on this thread until so many packets are there, as a notifier does."""
+        """Wait on this thread for ``count`` packets, as a notifier does."""
         offered = threading.Event()
         deadline = time.monotonic() + timeout_s
         while len(self.here.packets) < count and time.monotonic() < deadline:
@@ -59,16 +59,16 @@ def pair() -> Iterator[Pair]:
 
 
 def make_it_lead(pair: Pair) -> threading.Thread:
-    """Start a thread that leads, as soon as the first packet makes room for it, until three are there."""
+    """Start a thread that leads from the first packet on, until there are three."""
     thread = threading.Thread(target=pair.lead, args=(3,), name="waiting")
     thread.start()
-    wait_until(lambda: pair.client._candidate, "it would lead")
+    wait_until(lambda: pair.client._candidate, "it is ready to lead")
     pair.send(b"one")
     wait_until(lambda: pair.client._receiver == thread.ident, "it leads")
     return thread
 
 
-def test_what_a_thread_waits_for_comes_on_that_thread(pair: Pair) -> None:
+def test_a_waiting_thread_receives_its_own_packets(pair: Pair) -> None:
     thread = make_it_lead(pair)
     pair.send(b"two")
     pair.send(b"three")
@@ -78,28 +78,28 @@ def test_what_a_thread_waits_for_comes_on_that_thread(pair: Pair) -> None:
     assert pair.threads[0] != "waiting"
 
 
-def test_the_receiving_thread_goes_on_when_the_other_is_busy(pair: Pair) -> None:
+def test_the_receiving_thread_continues_when_the_other_is_busy(pair: Pair) -> None:
     make_it_lead(pair)
     pair.send(b"two")
     pair.send(b"three")
     wait_until(lambda: len(pair.here.packets) == 3, "its wait is over")
     wait_until(lambda: pair.client._receiver == pair.client._thread.ident, "the receiving thread has its turn again")
     pair.send(b"four")
-    wait_until(lambda: len(pair.here.packets) == 4, "it came all the same")
+    wait_until(lambda: len(pair.here.packets) == 4, "the packet arrived nevertheless")
     assert pair.threads[3] == pair.client._thread.name
 
 
-def test_a_wait_that_is_over_without_a_packet_ends(pair: Pair) -> None:
+def test_a_wait_that_ends_without_a_packet_returns(pair: Pair) -> None:
     thread = make_it_lead(pair)
     pair.here.packets += [b"from elsewhere"] * 2
     thread.join(10.0)
     assert not thread.is_alive()
 
 
-def test_the_connection_ends_for_who_leads_as_well(pair: Pair) -> None:
+def test_the_connection_also_ends_for_a_leading_thread(pair: Pair) -> None:
     thread = make_it_lead(pair)
     pair.server.stop()
-    wait_until(lambda: pair.here.closings, "it is told")
+    wait_until(lambda: pair.here.closings, "the client is notified")
     assert pair.here.closings == ["the proxy stopped"]
     assert not pair.client.lead(lambda: False, lambda: None, 1.0)
     pair.here.packets += [b"nothing", b"more"]
@@ -107,7 +107,7 @@ def test_the_connection_ends_for_who_leads_as_well(pair: Pair) -> None:
     assert not thread.is_alive()
 
 
-def test_who_leads_may_close_in_the_middle(pair: Pair) -> None:
+def test_a_leading_thread_may_close_the_connection(pair: Pair) -> None:
     thread = make_it_lead(pair)
     closed = threading.Event()
 
@@ -119,13 +119,13 @@ def test_who_leads_may_close_in_the_middle(pair: Pair) -> None:
     pair.here.on_packet = close
     pair.send(b"two")
     assert closed.wait(10.0)
-    wait_until(lambda: pair.here.closings == ["closed by the application"], "it is told")
+    wait_until(lambda: pair.here.closings == ["closed by the application"], "the client is notified")
     pair.here.packets += [b"nothing", b"more"]
     thread.join(10.0)
     assert not thread.is_alive()
 
 
-def test_a_handler_that_fails_ends_the_connection_and_not_the_thread_that_leads(pair: Pair) -> None:
+def test_a_failing_handler_ends_the_connection_but_not_the_leading_thread(pair: Pair) -> None:
     thread = make_it_lead(pair)
 
     def fail(_: bytes) -> None:
@@ -133,7 +133,7 @@ def test_a_handler_that_fails_ends_the_connection_and_not_the_thread_that_leads(
 
     pair.here.on_packet = fail
     pair.send(b"two")
-    wait_until(lambda: pair.here.closings, "it is told")
+    wait_until(lambda: pair.here.closings, "the client is notified")
     assert "the application is broken" in pair.here.closings[0]
     assert thread.is_alive()
     pair.here.packets += [b"nothing", b"more"]
@@ -141,20 +141,20 @@ def test_a_handler_that_fails_ends_the_connection_and_not_the_thread_that_leads(
     assert not thread.is_alive()
 
 
-def test_a_frame_that_is_dropped_during_a_delivery_is_given_back_after_it(pair: Pair) -> None:
+def test_a_frame_dropped_during_a_delivery_is_released_after_it(pair: Pair) -> None:
     pair.client.subscribe(video(FRONT))
     wait_until(lambda: pair.server.subscribers(video(FRONT)), "it has subscribed")
     pair.here.keep = False
     for seq in range(1, 40):
         head = header(seq)
-        wait_until(lambda head=head: pair.server.publish_frame(head, picture(head)) == 0, "it is sent")  # type: ignore[misc]
-        wait_until(lambda seq=seq: pair.here.saw(seq), "it came")  # type: ignore[misc]
+        wait_until(lambda head=head: pair.server.publish_frame(head, picture(head)) == 0, "sent")  # type: ignore[misc]
+        wait_until(lambda seq=seq: pair.here.saw(seq), "the frame arrived")  # type: ignore[misc]
     assert pair.here.torn == []
 
 
-@pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals come on the main thread")
+@pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals run on the main thread")
 @pytest.mark.parametrize("error", [TimeoutError, KeyboardInterrupt, ValueError])
-def test_what_a_handler_of_a_signal_raises_reaches_who_waits_and_the_connection_goes_on(
+def test_a_signal_handlers_exception_reaches_the_waiting_thread_and_the_connection_survives(
     pair: Pair, error: type[BaseException]
 ) -> None:
     def raise_it(*_: object) -> None:
@@ -164,7 +164,7 @@ def test_what_a_handler_of_a_signal_raises_reaches_who_waits_and_the_connection_
     assert main.ident is not None
 
     def interrupt() -> None:
-        wait_until(lambda: pair.client._candidate, "it would lead")
+        wait_until(lambda: pair.client._candidate, "it is ready to lead")
         pair.send(b"one")
         wait_until(lambda: pair.client._receiver == main.ident, "it leads")
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
@@ -179,13 +179,13 @@ def test_what_a_handler_of_a_signal_raises_reaches_who_waits_and_the_connection_
         helper.join(10.0)
         signal.signal(signal.SIGUSR1, before)
     pair.send(b"two")
-    wait_until(lambda: pair.here.packets == [b"one", b"two"], "the receiving thread goes on")
+    wait_until(lambda: pair.here.packets == [b"one", b"two"], "the receiving thread continues")
     assert pair.here.closings == []
 
 
 def test_the_end_of_a_fork_leaves_the_connection_to_the_parent(pair: Pair) -> None:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads, from Python 3.12 on
+        warnings.simplefilter("ignore", DeprecationWarning)  # about forks beside threads, from Python 3.12
         child = os.fork()
     if child == 0:
         sent = pair.client.send(b"from a fork")
@@ -193,5 +193,5 @@ def test_the_end_of_a_fork_leaves_the_connection_to_the_parent(pair: Pair) -> No
         os._exit(int(sent))
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0, "the fork can send nothing"
     pair.send(b"still there")
-    wait_until(lambda: pair.here.packets == [b"still there"], "the parent's connection goes on")
+    wait_until(lambda: pair.here.packets == [b"still there"], "the parent's connection still works")
     assert pair.there.left == []

@@ -1,4 +1,4 @@
-"""The local transport's own packets: there and back, and nothing else than DecodeError for anything."""
+"""The local transport's own packets: round trips, and DecodeError for anything else."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SAMPLES: list[tuple[bytes, packets.Message]] = [
 
 
 @pytest.mark.parametrize(("packet", "message"), SAMPLES)
-def test_there_and_back(packet: bytes, message: packets.Message) -> None:
+def test_round_trip(packet: bytes, message: packets.Message) -> None:
     assert packets.is_own(packet)
     assert packets.parse(packet) == message
 

@@ -1,4 +1,4 @@
-"""The local transport between processes: killed, stopped, and many of them."""
+"""The local transport between processes: killed ones, stopped ones, and many."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.process
 
 @contextmanager
 def process(role: str, name: str = "alpha") -> Iterator[subprocess.Popen[str]]:
-    """Another process, ready; killed at the end if it still runs."""
+    """Start another process and wait for it; kill it at the end if it still runs."""
     command = [sys.executable, str(Path(__file__).with_name("other_process.py")), role, name]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
         try:
@@ -42,7 +42,7 @@ def process(role: str, name: str = "alpha") -> Iterator[subprocess.Popen[str]]:
 
 
 def ask(child: subprocess.Popen[str]) -> list[str]:
-    """What a watching process has seen."""
+    """Return what a watching process has seen."""
     assert child.stdin is not None
     assert child.stdout is not None
     child.stdin.write("?\n")
@@ -60,7 +60,7 @@ def serving() -> Iterator[tuple[LocalServer, ServerLog]]:
         server.stop()
 
 
-def test_a_killed_proxy_is_told_at_once_and_its_name_is_free(runtime_dir: Path) -> None:
+def test_a_killed_proxy_is_noticed_at_once_and_its_name_is_free(runtime_dir: Path) -> None:
     log = ClientLog(keep=False)
     with process("serve") as child:
         client = dial("alpha")(log)
@@ -69,7 +69,7 @@ def test_a_killed_proxy_is_told_at_once_and_its_name_is_free(runtime_dir: Path) 
         assert f"(pid {child.pid})" in client.address
         killed = time.monotonic()
         child.kill()
-        wait_until(lambda: log.closings, "it is told")
+        wait_until(lambda: log.closings, "the client is notified")
         assert time.monotonic() - killed < 2.0
         child.wait()
         assert log.closings == ["the proxy is gone"]
@@ -81,25 +81,25 @@ def test_a_killed_proxy_is_told_at_once_and_its_name_is_free(runtime_dir: Path) 
         dial("alpha")(log)
     with serving() as (_, server_log):
         client = dial("alpha")(ClientLog())
-        wait_until(lambda: server_log.joined, "a new proxy has the name")
+        wait_until(lambda: server_log.joined, "a new proxy took the name")
         client.close()
     assert list(runtime_dir.iterdir()) == []
 
 
-def test_a_proxy_that_ends_says_so() -> None:
+def test_a_stopping_proxy_notifies_its_clients() -> None:
     log = ClientLog()
     with process("serve") as child:
         client = dial("alpha")(log)
         assert child.stdin is not None
         child.stdin.close()
-        wait_until(lambda: log.closings, "it is told")
+        wait_until(lambda: log.closings, "the client is notified")
         assert log.closings == ["the proxy stopped"]
         client.close()
         assert child.wait() == 0
     assert list_names() == []
 
 
-def test_a_killed_application_is_told_at_once() -> None:
+def test_a_killed_application_is_noticed_at_once() -> None:
     with serving() as (server, log), process("watch") as child:
         wait_until(lambda: server.subscribers(FEEDBACK) == 1, "it is subscribed")
         assert log.joined[0].address.startswith(f"pid {child.pid} (")
@@ -107,13 +107,13 @@ def test_a_killed_application_is_told_at_once() -> None:
             server.publish_frame(header(seq), picture(header(seq)))
         killed = time.monotonic()
         child.kill()
-        wait_until(lambda: log.left, "it is told")
+        wait_until(lambda: log.left, "the server is notified")
         assert time.monotonic() - killed < 2.0
         assert log.left == [(log.joined[0], f"the application is gone ({log.joined[0].address})")]
         assert server.subscribers(FEEDBACK) == 0
 
 
-def test_a_stopped_observer_delays_nobody_and_comes_back_to_the_newest() -> None:
+def test_a_stopped_observer_delays_no_one_and_resumes_with_the_newest() -> None:
     fast = ClientLog(keep=False)
     with serving() as (server, log), process("watch") as child:
         wait_until(lambda: server.subscribers(FEEDBACK) == 1, "the observer is subscribed")
@@ -127,28 +127,28 @@ def test_a_stopped_observer_delays_nobody_and_comes_back_to_the_newest() -> None
             missed += server.publish(FEEDBACK, bytes(300))
             missed += server.publish_frame(header(seq), picture(header(seq)))
             durations.append(time.perf_counter() - began)
-            wait_until(lambda: fast.saw(seq), "the other has the frame")  # noqa: B023
+            wait_until(lambda: fast.saw(seq), "the other client got the frame")  # noqa: B023
         assert missed > 600, "its buffers are full"
         assert sorted(durations)[len(durations) // 2] < 0.002
         assert log.left == []
         child.send_signal(signal.SIGCONT)
-        wait_until(lambda: ask(child) == ["599", "0"], "it has the newest frame, and none was torn")
+        wait_until(lambda: ask(child) == ["599", "0"], "it got the newest frame, and none was torn")
         assert fast.torn == []
         client.close()
 
 
-def test_a_proxy_that_does_not_accept_does_not_hold_a_caller_up() -> None:
+def test_a_proxy_that_does_not_accept_does_not_block_a_caller() -> None:
     directory = find_directory()
     directory.create()
     with Socket() as listener:
         listener.bind(str(directory.path / "alpha.sock"))
-        listener.listen(0)  # and it never accepts, as a stopped process does not
+        listener.listen(0)  # never accepts, like a stopped process
         waiting = dial("alpha")(ClientLog())
         began = time.monotonic()
         with pytest.raises(LinkError, match="does not accept"):
             dial("alpha")(ClientLog())
         assert time.monotonic() - began < 2
-        assert [proxy.name for proxy in list_names()] == ["alpha"], "it is there, if busy"
+        assert [proxy.name for proxy in list_names()] == ["alpha"], "it is listed, although busy"
         waiting.close()
 
 
@@ -169,7 +169,7 @@ def test_a_thousand_connections_leave_nothing(runtime_dir: Path) -> None:
         wait_until(lambda: len(log.left) == len(log.joined), "all left")
         stop.set()
         publisher.join()
-        wait_until(lambda: not (resources() - before), f"nothing is left: before {before}, now {resources()}")
+        wait_until(lambda: not (resources() - before), f"resources return to {before} from {resources()}")
         assert len(log.joined) == 1004
     assert list(runtime_dir.iterdir()) == []
 
@@ -183,7 +183,7 @@ def publish_until(server: LocalServer, stop: threading.Event) -> None:
 
 
 def come_and_go(log: ServerLog, rng: random.Random) -> None:
-    """One connection that ends in one of several ways."""
+    """Open one connection and end it in one of several ways."""
     known = len(log.joined)
     if rng.random() < 0.5:
         client = dial("alpha")(ClientLog())
@@ -192,7 +192,7 @@ def come_and_go(log: ServerLog, rng: random.Random) -> None:
         if rng.random() < 0.5:
             wait_until(lambda: len(log.joined) > known, "it joined")
         client.close()
-    else:  # without a word of goodbye, and with what was sent unread
+    else:  # without a goodbye, and with unread packets
         with Socket() as raw:
             raw.connect(str(find_directory().path / "alpha.sock"))
             raw.send(packets.hello())
@@ -203,7 +203,7 @@ def come_and_go(log: ServerLog, rng: random.Random) -> None:
 
 
 def resources() -> Counter[str]:
-    """How many there are of each: descriptors by kind, threads by name, mappings of shared memory."""
+    """Count descriptors by kind, threads by name, and mappings of shared memory."""
     held: Counter[str] = Counter()
     for path in Path("/proc/self/fd").iterdir():
         try:
@@ -225,7 +225,7 @@ sock.connect(sys.argv[1])
 try:
     sock.send(bytes.fromhex("534b594c 01 40 0000 02000000 0100"))
 except BrokenPipeError:
-    pass  # turned away already; the reason can still be read
+    pass  # already rejected; the reason can still be read
 try:
     answer = sock.recv(1000)
 except ConnectionResetError:
@@ -239,8 +239,8 @@ def call_as_nobody(path: Path, *groups: int) -> subprocess.CompletedProcess[str]
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
-def test_somebody_else_is_turned_away_even_if_he_gets_in(runtime_dir: Path) -> None:
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_another_user_is_rejected_even_with_access_to_the_directory(runtime_dir: Path) -> None:
     with serving() as (_, log):
         path = runtime_dir / "alpha.sock"
         runtime_dir.parent.chmod(0o755)
@@ -251,8 +251,8 @@ def test_somebody_else_is_turned_away_even_if_he_gets_in(runtime_dir: Path) -> N
         assert log.joined == []
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
-def test_a_member_of_the_group_is_let_in(runtime_dir: Path) -> None:
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_a_member_of_the_group_is_accepted(runtime_dir: Path) -> None:
     group = next(group for group in grp.getgrall() if group.gr_gid not in (0, 65534))
     runtime_dir.parent.chmod(0o755)
     server, log = LocalServer("alpha", group=group.gr_name), ServerLog()
@@ -278,7 +278,7 @@ def test_a_default_timeout_of_sockets_changes_nothing() -> None:
             wait_until(lambda: log.joined, "it joined")
             time.sleep(0.05)  # longer than that time-out
             assert server.send(log.joined[0], b"x")
-            wait_until(lambda: client_log.packets, "the packet came")
+            wait_until(lambda: client_log.packets, "the packet arrived")
             assert client_log.closings == []
             client.close()
     finally:

@@ -1,4 +1,4 @@
-"""The local transport with one receiving thread for many servers: the contract, and what a blocked handler delays."""
+"""The local transport with one receiving thread for many servers: the contract, and the effect of a blocked handler."""
 
 from __future__ import annotations
 
@@ -87,15 +87,15 @@ def test_a_split_leaves_the_blocked_server_its_thread_and_moves_the_others(react
     assert reactor.inside is stuck.server
     assert [other.client.send(bytes([number])) for number in range(1, 100)] == [True] * 99
     new = reactor.split(stuck.server)
-    wait_until(lambda: other.packets == [bytes([number]) for number in range(1, 100)], "all came, in order")
+    wait_until(lambda: other.packets == [bytes([number]) for number in range(1, 100)], "all arrived, in order")
     assert other.server.reactor is new
     assert stuck.server.reactor is reactor
     assert stuck.client.send(b"after")
     gate.set()
-    wait_until(lambda: stuck.packets == [b"block", b"after"], "it goes on when its handler is back")
+    wait_until(lambda: stuck.packets == [b"block", b"after"], "it continues when its handler returns")
     assert len(threads) == 1
     late = ClientLog()
-    client = dial(other.name)(late)  # a caller of a server that has moved
+    client = dial(other.name)(late)  # a caller of a moved server
     wait_until(lambda: len(other.log.joined) == 2, "it joined")
     client.close()
     for each in (stuck, other):
@@ -104,7 +104,7 @@ def test_a_split_leaves_the_blocked_server_its_thread_and_moves_the_others(react
 
 
 def test_packets_that_wait_behind_a_blocked_handler_are_handled_after_the_split(reactor: Reactor) -> None:
-    """The stuck thread has received one packet of each connection of its turn, and handles none of them."""
+    """The blocked thread has received one packet from each connection in its turn, and handles none."""
     servers = [Served(reactor) for _ in range(4)]
     gate, first = threading.Event(), threading.Event()
 
@@ -131,7 +131,7 @@ def test_packets_that_wait_behind_a_blocked_handler_are_handled_after_the_split(
     for server in (servers[2], servers[3]):
         wait_until(partial(server.got, b"\1", b"\2", b"\3"), "in order, and once")
     gate2.set()
-    wait_until(lambda: servers[1].packets == [b"\1", b"\2", b"\3"], "its own too")
+    wait_until(lambda: servers[1].packets == [b"\1", b"\2", b"\3"], "its own, too")
     for server in servers:
         server.close()
     new.close()
@@ -145,7 +145,7 @@ def test_a_reactor_that_is_split_while_packets_flow_loses_none(reactor: Reactor)
         for server in servers:
             while not server.client.send(number.to_bytes(2, "little")):
                 pass
-        if number % 40 == 20:  # nobody is stuck: the thread that is left behind is in the middle of its turn
+        if number % 40 == 20:  # none is blocked: the thread left behind is in the middle of its turn
             made.append(servers[number % 5].server.reactor.split(servers[number % 5].server))
     for server in servers:
         wanted = [number.to_bytes(2, "little") for number in range(count)]
@@ -156,7 +156,7 @@ def test_a_reactor_that_is_split_while_packets_flow_loses_none(reactor: Reactor)
         each.close()
 
 
-def test_one_that_sends_no_hello_is_sent_away(reactor: Reactor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_connection_is_closed(reactor: Reactor, monkeypatch: pytest.MonkeyPatch) -> None:
     from skyloop.transport.local.directory import connect, find_directory
 
     monkeypatch.setattr("skyloop.transport.local.reactor.HELLO_S", 0.05)
@@ -165,7 +165,7 @@ def test_one_that_sends_no_hello_is_sent_away(reactor: Reactor, monkeypatch: pyt
     assert b"no Hello" in silent.recv(1000)
     assert silent.recv(1000) == b""
     assert server.client.send(b"here")
-    wait_until(lambda: server.packets == [b"here"], "others are not disturbed")
+    wait_until(lambda: server.packets == [b"here"], "others are unaffected")
     server.close()
 
 
@@ -183,12 +183,12 @@ def test_without_descriptors_callers_wait_and_packets_do_not(reactor: Reactor, m
     source.sock = Full()  # type: ignore[assignment]
     log = ClientLog()
     client = dial(server.name)(log)
-    wait_until(lambda: failures, "it was tried")
+    wait_until(lambda: failures, "accept was tried")
     assert server.client.send(b"x")
-    wait_until(lambda: server.packets == [b"x"], "packets are handled meanwhile")
+    wait_until(lambda: server.packets == [b"x"], "packets are still handled")
     source.sock = real
-    wait_until(lambda: len(server.log.joined) == 2, "the caller is let in when it is tried again")
-    assert len(failures) < 10, "it must not spin"
+    wait_until(lambda: len(server.log.joined) == 2, "the caller is accepted on a retry")
+    assert len(failures) < 10, "the thread must not spin"
     client.close()
     server.close()
 
@@ -223,7 +223,7 @@ def test_a_connection_that_can_not_be_received_from_ends_with_the_reason(served:
     assert served.packets == []
 
 
-def test_a_packet_that_only_wakes_is_nobody_s_business(served: Served) -> None:
+def test_a_wake_packet_is_ignored(served: Served) -> None:
     client = served.client
     assert isinstance(client, LocalClient)
     assert client._socket is not None
@@ -233,8 +233,8 @@ def test_a_packet_that_only_wakes_is_nobody_s_business(served: Served) -> None:
     assert served.packets == [b"next"]
 
 
-def test_a_socket_that_was_dropped_meanwhile_is_left_alone(served: Served, reactor: Reactor) -> None:
-    """A reactor's turn may hold sockets that another thread has ended, or moved."""
+def test_a_socket_dropped_during_the_turn_is_left_alone(served: Served, reactor: Reactor) -> None:
+    """A reactor's turn may include sockets that another thread has closed or moved."""
     (connection,) = served.server._served
     ended, empty = Source(served.server, connection=connection), Source(served.server, connection=connection)
     ended.ended = True
@@ -250,12 +250,12 @@ def test_a_socket_that_was_dropped_meanwhile_is_left_alone(served: Served, react
 
 
 def test_a_server_stops_after_its_reactor_has_ended() -> None:
-    """It waited for ever for its connections, or raised that the reactor's epoll was closed."""
+    """It waited for ever for its connections, or raised because the reactor's epoll was closed."""
     reactor = Reactor()
     served = Served(reactor)
     reactor.close()
     served.server.stop()
-    wait_until(lambda: bool(served.heard.closings), "the client hears of the end")
+    wait_until(lambda: bool(served.heard.closings), "the client is notified")
     assert served.log.left
     assert reactor.empty
     served.client.close()

@@ -1,4 +1,4 @@
-"""The memory transport keeps the contract, and its faults are exactly the same for the same seed."""
+"""The memory transport keeps the contract, and the same seed gives exactly the same faults."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class TestMemory(TransportSuite):
 
 
 def received(faults: Faults, count: int = 200) -> tuple[list[bytes], list[bytes], list[int]]:
-    """What arrives of so many packets each way and frames."""
+    """Return what arrives of ``count`` packets in each direction and frames."""
     server, log, client_log = MemoryServer(faults=faults), ServerLog(), ClientLog(keep=False)
     server.start(log)
     client = server.dial(client_log)
@@ -33,9 +33,9 @@ def received(faults: Faults, count: int = 200) -> tuple[list[bytes], list[bytes]
         assert server.publish(FEEDBACK, packet) == 0
     for seq in range(4):
         server.publish_frame(header(seq), picture(header(seq)))
-    wait_until(lambda: not client.outgoing, "the server has them")
+    wait_until(lambda: not client.outgoing, "the server got them")
     server.stop()
-    wait_until(lambda: client_log.closings, "the client has them")
+    wait_until(lambda: client_log.closings, "the client got them")
     return [packet for _, packet in log.packets], client_log.packets, client_log.seen
 
 
@@ -93,13 +93,13 @@ def test_the_queue_is_bounded() -> None:
     client = server.dial(client_log)
     client.subscribe(FEEDBACK)
     missed = sum(server.publish(FEEDBACK, b"x") for _ in range(DEPTH + 50))
-    assert 49 <= missed <= 50  # one may have been taken out already
+    assert 49 <= missed <= 50  # one may already have been taken out
     client_log.gate.set()
     client.close()
     server.stop()
 
 
-def test_it_may_be_started_again() -> None:
+def test_the_server_can_be_restarted() -> None:
     server = MemoryServer()
     for _ in range(2):
         serve_once(server)
@@ -111,6 +111,6 @@ def serve_once(server: MemoryServer) -> None:
     client = server.dial(client_log)
     assert client.same_clock
     client.send(b"x")
-    wait_until(lambda: log.packets, "the packet came")
+    wait_until(lambda: log.packets, "the packet arrived")
     server.stop()
-    wait_until(lambda: client_log.closings, "the client was told")
+    wait_until(lambda: client_log.closings, "the client was notified")

@@ -1,4 +1,4 @@
-"""A proxy that comes late takes all that waits: the newest set-point, and everything else in order."""
+"""A late proxy handles its whole backlog: the newest set-point, and everything else in order."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def reactor() -> Iterator[Reactor]:
 
 
 class Late:
-    """A server whose handler stands still from the first request on, until it is let go."""
+    """A server whose handler blocks at the first request until it is released."""
 
     def __init__(self, server: TransportServer, dialer: Dialer) -> None:
         self.server, self.log = server, ServerLog()
         self.log.on_packet = self._packet
-        self.order: list[bytes] = []  #: of the packets of several servers
+        self.order: list[bytes] = []  #: packets of several servers, in order
         self.gate, self.entered = threading.Event(), threading.Event()
         server.start(self.log)
         self.client = dialer(ClientLog())
@@ -88,7 +88,7 @@ EVERY = pytest.mark.parametrize("make", [local, shared, composite])
 
 
 @EVERY
-def test_after_a_stall_the_landing_and_the_newest_set_point_are_handed_on(
+def test_after_a_stall_the_landing_and_the_newest_set_point_arrive(
     make: Callable[[Reactor], Late], reactor: Reactor
 ) -> None:
     late = make(reactor)
@@ -99,25 +99,23 @@ def test_after_a_stall_the_landing_and_the_newest_set_point_are_handed_on(
     asked = encode(Request(2, Ping(2)))
     assert late.client.send(asked)
     late.gate.set()
-    wait_until(lambda: asked in late.packets, "all was handled")
+    wait_until(lambda: asked in late.packets, "all packets were handled")
     assert late.packets == [burst[0], burst[59], burst[-1], asked]
     assert late.server.counters[SUPERSEDED] == 117
     late.close()
 
 
 @EVERY
-def test_a_landing_that_does_not_fit_any_more_follows_and_is_handed_on(
-    make: Callable[[Reactor], Late], reactor: Reactor
-) -> None:
-    """A full socket: what was sent before it was full is taken in one go."""
+def test_a_landing_that_does_not_fit_follows_and_arrives(make: Callable[[Reactor], Late], reactor: Reactor) -> None:
+    """The packets in a full socket are read in one go."""
     late = make(reactor)
     late.stall()
     seq = next(seq for seq in itertools.count(1) if not late.client.send(command(seq, FLY)))
     late.gate.set()
     landing = command(seq + 1, LAND)
-    wait_until(lambda: late.client.send(landing), "it is taken in")
+    wait_until(lambda: late.client.send(landing), "the packet is accepted")
     wait_until(lambda: landing in late.packets, "it came")
-    assert len(late.packets) <= 4, "set-points were taken in at most a few times, not one by one"
+    assert len(late.packets) <= 4, "set-points were read in a few batches, not one by one"
     late.close()
 
 
@@ -125,7 +123,7 @@ def test_a_landing_that_does_not_fit_any_more_follows_and_is_handed_on(
 def test_a_stalled_proxy_lands_and_refuses_nothing_for_its_age(
     kind: str, reactor: Reactor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The vehicle's driver stands still for eight seconds, in which its pilot goes on to fly, and lands."""
+    """The vehicle's driver blocks for eight seconds, while the pilot keeps flying and then lands."""
     name = next(_names)
     server = LocalServer(name) if kind == "a thread for each" else SharedLocalServer(name, reactor)
     gate, entered = threading.Event(), threading.Event()
@@ -146,14 +144,14 @@ def test_a_stalled_proxy_lands_and_refuses_nothing_for_its_age(
             pilot.command(LAND if number == 99 else Velocity(forward=number / 1000), sync=False)
         gate.set()
         pilot.sync()
-        assert driver.told == [Velocity(forward=0.0), LAND]  # the set-point after it does not break the landing off
+        assert driver.told == [Velocity(forward=0.0), LAND]  # the set-point after the landing does not abort it
         counters = bench.proxy.statistics()
         assert "commands.refused" not in counters
         assert counters[SUPERSEDED] == 98
-        assert counters["commands.applied"] == 4  # the take-off, and three
+        assert counters["commands.applied"] == 4  # the take-off and three more
 
 
-def test_over_the_network_too() -> None:
+def test_the_same_over_the_network() -> None:
     from skyloop.network import FabricServer, FabricSettings, config
     from skyloop.network import dial as dial_fabric
 
@@ -163,7 +161,7 @@ def test_over_the_network_too() -> None:
     late.stall()
     (connection,) = server._registry.connections
     burst = [command(seq, LAND if seq == 60 else FLY) for seq in range(1, 121)]
-    for count, packet in enumerate(burst, 1):  # one by one, as Zenoh may drop what comes in a burst
+    for count, packet in enumerate(burst, 1):  # one by one, as Zenoh may drop parts of a burst
         assert late.client.send(packet)
         wait_until(partial(late.took, connection.commands, count), "it came")
     late.gate.set()
@@ -172,7 +170,7 @@ def test_over_the_network_too() -> None:
     late.close()
 
 
-def test_landings_and_stops_go_before_set_points_of_other_vehicles(reactor: Reactor) -> None:
+def test_landings_and_stops_precede_set_points_of_other_vehicles(reactor: Reactor) -> None:
     order: list[bytes] = []
     late = [shared(reactor) for _ in range(6)]
     stalled, *steered, stopping, landing = late
@@ -186,16 +184,16 @@ def test_landings_and_stops_go_before_set_points_of_other_vehicles(reactor: Reac
     assert landing.client.send(command(9, FLY))
     assert landing.client.send(land)
     stalled.gate.set()
-    wait_until(lambda: len(order) == 7, "all was handled")
+    wait_until(lambda: len(order) == 7, "all packets were handled")
     assert order.index(stop) <= 2
-    assert order.index(land) <= 4  # its own set-point before it
+    assert order.index(land) <= 4  # behind its own set-point
     assert set(order[-2:]) < {command(number, FLY) for number in range(3)}
     for each in late:
         each.close()
 
 
-def test_no_vehicle_waits_while_another_ones_pilot_floods(reactor: Reactor) -> None:
-    """Two hundred requests of one connection, a landing after the other of a second: each has its turns."""
+def test_a_flood_from_one_pilot_delays_no_other_vehicle(reactor: Reactor) -> None:
+    """Two hundred requests on one connection, repeated landings on another: both get their turns."""
     order: list[bytes] = []
     stalled, flooding, asking, flying = late = [shared(reactor) for _ in range(4)]
     for each in late:
@@ -209,7 +207,7 @@ def test_no_vehicle_waits_while_another_ones_pilot_floods(reactor: Reactor) -> N
     steer = command(1, FLY)
     assert flying.client.send(steer)
     stalled.gate.set()
-    wait_until(lambda: len(order) == 202, "all was handled")
+    wait_until(lambda: len(order) == 202, "all packets were handled")
     assert order.index(steer) <= 5
     assert order.index(questions[20]) < order.index(landings[-1])
     assert [packet for packet in order if packet in landings] == landings

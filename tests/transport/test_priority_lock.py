@@ -1,4 +1,4 @@
-"""A lock in the order of arrival, commands first."""
+"""A lock that is granted in order of arrival, commands first."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from skyloop.transport.priority import PriorityLock, is_command
 from skyloop.transport.testing import wait_until
 
 
-def test_commands_are_in_a_hurry_and_nothing_else_is() -> None:
+def test_only_commands_are_urgent() -> None:
     assert is_command(encode(Command(1, 1, 1, 1, Hover())))
     assert not is_command(encode(Request(1, Ping(1))))
     assert not is_command(b"")
 
 
 def queue_up(turns: PriorityLock, came: list[str], name: str, *, first: bool = False) -> threading.Thread:
-    """A thread that waits for its turn now."""
+    """Start a thread that waits for its turn."""
 
     def wait() -> None:
         with turns.urgent if first else turns:
@@ -29,11 +29,11 @@ def queue_up(turns: PriorityLock, came: list[str], name: str, *, first: bool = F
     return thread
 
 
-def test_those_in_a_hurry_come_first_and_the_others_as_they_came() -> None:
+def test_urgent_waiters_come_first_and_the_others_in_order() -> None:
     turns, came = PriorityLock(), list[str]()
     with turns:
         assert turns.held
-        with turns:  # the same thread may take it again
+        with turns:  # the same thread may acquire it again
             threads = [queue_up(turns, came, name) for name in ("one", "two")]
             threads.append(queue_up(turns, came, "command", first=True))
         threads.append(queue_up(turns, came, "three"))
@@ -44,8 +44,8 @@ def test_those_in_a_hurry_come_first_and_the_others_as_they_came() -> None:
     assert not turns.held
 
 
-def test_who_takes_it_again_and_again_lets_each_that_waits_through_first() -> None:
-    """With ``threading.RLock`` the others get it by chance."""
+def test_a_thread_that_keeps_acquiring_lets_each_waiter_go_first() -> None:
+    """With ``threading.RLock``, the others get it only by chance."""
     turns, came = PriorityLock(), list[str]()
     ended = threading.Event()
 

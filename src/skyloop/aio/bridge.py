@@ -34,24 +34,24 @@ Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 class LoopNotifier(Notifier):
     """Wakes the coroutine that waits in :meth:`within`, from any thread."""
 
-    __slots__ = ("_came", "_loop")
+    __slots__ = ("_notified", "_loop")
 
     def __init__(self) -> None:
         super().__init__()
-        self._came = asyncio.Event()
+        self._notified = asyncio.Event()
         self._loop = asyncio.get_running_loop()
 
     def notify(self) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(self._came.set)
+            self._loop.call_soon_threadsafe(self._notified.set)
 
     async def within(self, timeout_s: float) -> bool:
         """Wait for a notification; return whether a new one arrived in time."""
         try:
-            await asyncio.wait_for(self._came.wait(), timeout_s)
+            await asyncio.wait_for(self._notified.wait(), timeout_s)
         except TimeoutError:
             return False
-        self._came.clear()
+        self._notified.clear()
         return True
 
 

@@ -19,8 +19,8 @@ from skyloop.files import wait_readable
 
 CONNECT_S: Final = 1.0
 STUCK_NS: Final = nanoseconds(0.5)  #: a connection without room for this long counts as no longer read
-_MOST: Final = 65_536  # bytes read at once
-_BITS: Final = 10  # on a serial line for each byte
+_READ_BYTES: Final = 65_536  # bytes read at once
+_BITS_PER_BYTE: Final = 10  # on a serial line for each byte
 _DRAIN_S: Final = 0.1  # time for closing a connection while a new one is to be opened
 END_S: Final = 0.5  #: the same at the final end: TCP resends a lost packet 0.2 s later
 _UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection ends, so that nothing older is delivered
@@ -145,7 +145,7 @@ class ByteStream(ABC):
                 sent = self._attempt(packet)
                 self._cleared = stalled = not self._waiting()
             whole = sent == len(packet)
-            self._rest = self._left_of(packet, sent)
+            self._rest = self._rest_of(packet, sent)
         if sent:
             self._pace.on_written(sent, now_ns)
             self._whole += sent
@@ -153,7 +153,7 @@ class ByteStream(ABC):
         self.dropped += not whole
         self._check_room(now_ns, room=whole and not stalled)
 
-    def _left_of(self, packet: bytes, sent: int) -> bytes:
+    def _rest_of(self, packet: bytes, sent: int) -> bytes:
         """Return the bytes to write before the next packet: the end of a frame whose start was sent.
 
         By then the frame is old. Its last byte, part of a checksum, is inverted so that the receiver discards it;
@@ -230,7 +230,7 @@ class TcpStream(ByteStream):
     def read(self) -> bytes:
         """Return the received bytes, possibly none."""
         try:
-            data = self._socket.recv(_MOST)
+            data = self._socket.recv(_READ_BYTES)
         except BlockingIOError:
             return b""
         if not data:
@@ -285,7 +285,7 @@ class SerialStream(ByteStream):
         """Return the received bytes, possibly none."""
         if not wait_readable(self, 0.0):
             return b""
-        data = os.read(self.fileno(), _MOST)  # pyserial's waits in select.select: only descriptors below 1024
+        data = os.read(self.fileno(), _READ_BYTES)  # pyserial's waits in select.select: only descriptors below 1024
         if not data:
             raise ConnectionError("the port was unplugged, or another program reads it")
         return data
@@ -318,4 +318,4 @@ class SerialStream(ByteStream):
 def line_speed(path: str, baud: int) -> float | None:
     """Return a serial port's speed in bytes per second; None for USB, where the bit rate means nothing."""
     device = Path(path).resolve().name
-    return None if re.match(r"ttyACM|(cu|tty)\.usbmodem", device) else baud / _BITS
+    return None if re.match(r"ttyACM|(cu|tty)\.usbmodem", device) else baud / _BITS_PER_BYTE

@@ -84,7 +84,7 @@ class LiveCamera:
             on_event=on_event or self._publish_event,
             wants=lambda: sink.wants(settings.name),
             wants_checked=lambda: settings.stream and self._checks and sink.wants_stream(settings.name),
-            came=self._came,
+            came=self._on_coded,
             name="skyloop-camera",
         )
 
@@ -139,9 +139,9 @@ class LiveCamera:
                 self._report(problem)
         return stream
 
-    def _came(self, coded: Coded) -> None:
+    def _on_coded(self, coded: Coded) -> None:
         if not self._checks:
-            self._hand_on(coded)
+            self._forward(coded)
 
     # On the decoding thread --------------------------------------------------------------------------------------
 
@@ -155,14 +155,14 @@ class LiveCamera:
 
     def _decoded(self, coded: Coded) -> None:
         if self._checks:
-            self._hand_on(coded)
+            self._forward(coded)
 
     def _show(self, picture: Picture) -> None:
         picture.show(self._sink, self._settings.name, self._intrinsics(picture.width, picture.height))
 
     # On either thread --------------------------------------------------------------------------------------------
 
-    def _hand_on(self, coded: Coded) -> None:
+    def _forward(self, coded: Coded) -> None:
         from skyloop.drivers.live_container import Piece
 
         if self._stopped or not self._settings.stream:

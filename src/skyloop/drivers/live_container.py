@@ -116,7 +116,7 @@ class ContainerStream:
             self._container.close()
             raise
         held_back = _HELD_BACK.get(self._container.format.name, 0)
-        self._came: deque[int] = deque(maxlen=held_back + 1)  # arrival times of the last pictures from FFmpeg
+        self._arrivals: deque[int] = deque(maxlen=held_back + 1)  # arrival times of the last pictures from FFmpeg
         self._number = 0
         self._live_clock = LiveClock()
         self._newest_ns: int | None = None  # newest timestamp
@@ -134,7 +134,7 @@ class ContainerStream:
         if packet is None or not packet.size:
             raise ConnectionError("the stream ended")
         now_ns = self._clock()
-        self._came.append(now_ns)
+        self._arrivals.append(now_ns)
         unit = self._units.of(packet)
         captured_ns = min(self._captured_ns(packet), now_ns)
         if self._units.in_order:  # a timestamp learned since then must not set the time back
@@ -166,13 +166,13 @@ class ContainerStream:
         """Return a picture's capture time: from its timestamp and the smallest recent delay, else its arrival."""
         stamp_ns = _stamp_ns(packet)
         if stamp_ns is None or self._container.format.flags & _NO_STAMPS:
-            return self._came[0]
+            return self._arrivals[0]
         back_ns = 0 if self._newest_ns is None else self._newest_ns - stamp_ns
         if not self._units.in_order and 0 < back_ns < _REORDERED_NS:  # of a picture that others refer to
             return stamp_ns + self._offset_ns
         if self._newest_ns is None or back_ns:
             self._newest_ns = stamp_ns
-            self._offset_ns = self._live_clock.captured_ns(stamp_ns / 1e9, self._came[0]) - stamp_ns
+            self._offset_ns = self._live_clock.captured_ns(stamp_ns / 1e9, self._arrivals[0]) - stamp_ns
         return stamp_ns + self._offset_ns
 
 
@@ -245,7 +245,7 @@ class LiveDecoder:
         """Forget the stream so far: the next picture does not continue it."""
         self._before: Piece | None = None
         self._failing_ns: int | None = None  # since when no piece could be decoded
-        self._barren_ns: int | None = None  # since when no H.264 picture came out
+        self._no_picture_since_ns: int | None = None  # since when no H.264 picture came out
         self._strict: VideoCodecContext | None = None  # None: H.264 waits for a key picture
         self._shown_ns = 0  # capture time of the newest picture: later ones can't have been captured earlier
         self._reorders = False  # it holds back pictures that refer to later ones
@@ -261,10 +261,10 @@ class LiveDecoder:
         before, self._before = self._before, piece
         follows = not piece.number or (before is not None and before.number + 1 == piece.number)
         self._note_stamp(piece, coded)
-        image = self._of_h264(piece, coded, follows) if piece.is_h264 else self._of_other(piece, coded, follows)
+        image = self._decode_h264(piece, coded, follows) if piece.is_h264 else self._decode_other(piece, coded, follows)
         if image is None:
             return None
-        self._failing_ns = self._barren_ns = None
+        self._failing_ns = self._no_picture_since_ns = None
         if not show:
             return None
         self._shown += 1
@@ -274,12 +274,12 @@ class LiveDecoder:
         self._shown_ns = max(self._shown_ns, captured_ns)
         return Decoded(self._shown, pixels, self._shown_ns)
 
-    def _of_other(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
+    def _decode_other(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
         if not follows:
             piece.context.flush_buffers()  # left-out pictures would otherwise show as a smear
         return self._judged(piece.context, piece.packet, coded)
 
-    def _of_h264(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
+    def _decode_h264(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
         unit = piece.unit
         if unit is None:  # only parameters, or noise
             self._note_failure(coded)
@@ -289,19 +289,21 @@ class LiveDecoder:
             self._strict = None
             if self._forgiving is not None:
                 self._forgiving.flush_buffers()
-        image = self._of_strict(piece, unit, coded)
+        image = self._decode_strict(piece, unit, coded)
         if image is not None:
             self._forgiving = None
             return image
         if self._forgiving is not None:
             return self._judged(self._forgiving, piece.packet, coded)
         if self._strict is None:
-            self._barren_ns = coded.arrived_ns if self._barren_ns is None else self._barren_ns
-            if coded.arrived_ns - self._barren_ns > nanoseconds(STRICT_S):
+            self._no_picture_since_ns = (
+                coded.arrived_ns if self._no_picture_since_ns is None else self._no_picture_since_ns
+            )
+            if coded.arrived_ns - self._no_picture_since_ns > nanoseconds(STRICT_S):
                 self._forgive(piece)
         return None
 
-    def _of_strict(self, piece: Piece, unit: Unit, coded: Coded) -> av.VideoFrame | None:
+    def _decode_strict(self, piece: Piece, unit: Unit, coded: Coded) -> av.VideoFrame | None:
         if self._strict is None:
             if not unit.is_key:
                 self.waited += 1

@@ -189,11 +189,11 @@ class LiveVideo:
         self._on_event = on_event
         self._wants = wants
         self._wants_checked = wants_checked
-        self._frame_came = came
+        self._on_frame = came
         self._clock = clock
         self._name = name
         self._stop = threading.Event()
-        self._came = threading.Condition()  # guards the backlog and the reading thread's counts
+        self._changed = threading.Condition()  # guards the backlog and the reading thread's counts
         self._backlog = FrameBacklog()
         self._wanted = False  # when the last frame arrived
         self._shows = False  # pictures are wanted, not only decoding for the check
@@ -221,8 +221,8 @@ class LiveVideo:
         Takes up to 4 s; a connection that takes longer to open or read is left to end unseen.
         """
         self._stop.set()
-        with self._came:
-            self._came.notify_all()
+        with self._changed:
+            self._changed.notify_all()
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(_CLOSE_S)
@@ -230,7 +230,7 @@ class LiveVideo:
     @property
     def counters(self) -> VideoCounters:
         """The counters so far. Thread-safe."""
-        with self._came:
+        with self._changed:
             stream, decoder = self._stream, self._decoder
             return VideoCounters(
                 received=self._received,
@@ -269,7 +269,7 @@ class LiveVideo:
     def _follow(self) -> None:
         """Serve one connection from start to end."""
         stream = self._connect(self._connections)
-        with self._came:
+        with self._changed:
             self._stream = stream
         streaming = False
         try:
@@ -278,23 +278,23 @@ class LiveVideo:
                 if frames and not streaming:
                     streaming = True
                     self._emit(VideoEvent.STREAMING, self._place)
-                    with self._came:
+                    with self._changed:
                         self._connections += 1
                 shows = bool(frames) and self._wants()
                 wanted = shows or (bool(frames) and self._wants_checked())
-                with self._came:
+                with self._changed:
                     for frame in frames:
                         self._backlog.put(frame, wanted=wanted)
                     if frames:
                         self._received += len(frames)
                         self._wanted, self._shows = wanted, shows
-                        self._came.notify()
-                if self._frame_came is not None and not self._stop.is_set():
+                        self._changed.notify()
+                if self._on_frame is not None and not self._stop.is_set():
                     for frame in frames:
-                        self._frame_came(frame)
+                        self._on_frame(frame)
         finally:
             stream.close()
-            with self._came:
+            with self._changed:
                 self._stream = None
                 self._broken += stream.broken
                 self._lost_bytes += stream.lost_bytes
@@ -333,8 +333,8 @@ class LiveVideo:
 
     def _next(self) -> tuple[Coded, bool] | None:
         """Wait for a frame while pictures are wanted. Return it and whether to show it; None after :meth:`stop`."""
-        with self._came:
-            self._came.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
+        with self._changed:
+            self._changed.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
             if self._stop.is_set():
                 return None
             coded, newest = self._backlog.take(self._clock())

@@ -13,7 +13,7 @@ from skyloop.address import HIDDEN, is_broken, shown_address, shown_name, withou
 from skyloop.errors import UsageError
 
 _HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
-_SHORT: Final = 4  # characters: shorter secrets occur within ordinary words
+_SHORT_SECRET: Final = 4  # characters: shorter secrets occur within ordinary words
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
 
@@ -95,7 +95,7 @@ class VehicleUri:
     def scrub(self, text: str) -> str:
         """Return a text, for example a library's error, with the secrets of this address hidden."""
         for given, shown in self._secrets:
-            if len(given) < _SHORT:  # inside words it would hide, and so reveal, too much
+            if len(given) < _SHORT_SECRET:  # inside words it would hide, and so reveal, too much
                 text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(given)}(?![A-Za-z0-9])", HIDDEN, text)
             else:
                 text = text.replace(given, shown)

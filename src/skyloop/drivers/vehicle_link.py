@@ -52,7 +52,7 @@ class NameLookup:
     def __init__(self, family: socket.AddressFamily = socket.AF_INET, wait_s: float = NAME_WAIT_S) -> None:
         self._family = family
         self._wait_s = wait_s
-        self._asking: _Question | None = None
+        self._asking: _PendingLookup | None = None
 
     @property
     def answered(self) -> bool:
@@ -66,7 +66,7 @@ class NameLookup:
         except ValueError:
             pass
         if self._asking is None:
-            self._asking = _Question(host, self._family)
+            self._asking = _PendingLookup(host, self._family)
         question = self._asking
         if not question.answered.wait(self._wait_s):
             raise OSError(errno.ETIMEDOUT, f"the name {host} is still being looked up")
@@ -76,13 +76,13 @@ class NameLookup:
         return question.answer
 
 
-class _Question:
+class _PendingLookup:
     def __init__(self, host: str, family: socket.AddressFamily) -> None:
         self.answered = threading.Event()
         self.answer: str | OSError = ""
-        threading.Thread(target=self._ask, args=(host, family), name="skyloop-lookup", daemon=True).start()
+        threading.Thread(target=self._resolve, args=(host, family), name="skyloop-lookup", daemon=True).start()
 
-    def _ask(self, host: str, family: socket.AddressFamily) -> None:
+    def _resolve(self, host: str, family: socket.AddressFamily) -> None:
         try:
             self.answer = str(socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)[0][4][0])
         except OSError as error:

@@ -23,7 +23,7 @@ from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severi
 REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reported reasons while nothing is received
 _BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # of a port locked by another program
 _PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # below /dev
-_MOST_PORTS: Final = 4  # that are listed
+_MAX_LISTED_PORTS: Final = 4  # that are listed
 
 SinkCallback: TypeAlias = Callable[[Sink], None]
 
@@ -299,7 +299,7 @@ def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path(
     except PermissionError:
         return LinkTrouble(f"{port} can't be accessed", f"let this user enter {path.parent}")
     except OSError:
-        there = sorted(str(found) for pattern in _PORTS for found in devices.glob(pattern))[:_MOST_PORTS]
+        there = sorted(str(found) for pattern in _PORTS for found in devices.glob(pattern))[:_MAX_LISTED_PORTS]
         known = f"; available ports: {', '.join(there)}" if there else ""
         return LinkTrouble(f"there is no {port}", f"plug the vehicle in, or correct the port in the address{known}")
     if not stat.S_ISCHR(status.st_mode):

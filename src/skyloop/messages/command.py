@@ -16,8 +16,8 @@ import msgspec
 from skyloop.errors import UsageError
 from skyloop.messages.fields import Count, Refusal, TimeNs
 
-FARTHEST_M: Final = 100_000.0  #: a position beyond this along any axis is treated as a mistake
-MOST_TURNS_RAD: Final = 1000.0  #: and so is a larger yaw
+MAX_COORDINATE_M: Final = 100_000.0  #: a position beyond this along any axis is treated as a mistake
+MAX_YAW_RAD: Final = 1000.0  #: and so is a larger yaw
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
@@ -120,12 +120,10 @@ class Position(Action, frozen=True, array_like=True, tag=8):
     def problem(self) -> str:
         """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
         for name in ("x", "y", "z"):
-            if abs(value := getattr(self, name)) > FARTHEST_M:
-                return (
-                    f"{name} is {value:g} m and must be within {FARTHEST_M:g} m of the origin of the vehicle's position"
-                )
-        if self.yaw is not None and abs(self.yaw) > MOST_TURNS_RAD:
-            return f"yaw is {self.yaw:g} rad and must be from {-MOST_TURNS_RAD:g} to {MOST_TURNS_RAD:g} rad"
+            if abs(value := getattr(self, name)) > MAX_COORDINATE_M:
+                return f"{name} is {value:g} m and must be within {MAX_COORDINATE_M:g} m of the origin of the vehicle's position"
+        if self.yaw is not None and abs(self.yaw) > MAX_YAW_RAD:
+            return f"yaw is {self.yaw:g} rad and must be from {-MAX_YAW_RAD:g} to {MAX_YAW_RAD:g} rad"
         if self.speed is not None and not self.speed > 0.0:
             return f"speed is {self.speed:g} m/s and must be more than 0 (None: as fast as the limits allow)"
         if self.turn_rate is not None and not self.turn_rate > 0.0:
@@ -156,8 +154,8 @@ class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
     @property
     def problem(self) -> str:
         """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
-        if self.height is not None and not 0.0 <= self.height <= FARTHEST_M:
-            return f"height is {self.height:g} m above the start and must be from 0 to {FARTHEST_M:g} m"
+        if self.height is not None and not 0.0 <= self.height <= MAX_COORDINATE_M:
+            return f"height is {self.height:g} m above the start and must be from 0 to {MAX_COORDINATE_M:g} m"
         return ""
 
 

@@ -137,9 +137,7 @@ class EventKind(StrEnum):
     AUTHORITY_QUEUED = "authority_queued"  #: waits, or has moved up; data: app_id, priority, position; wait_s if known
     AUTHORITY_LOST = "authority_lost"  #: data: app_id, lease, reason (released, silent, gone, expired), by (app name)
     AUTHORITY_PREEMPTED = "authority_preempted"  #: data: app_id, lease, by, by_id, by_priority, granted
-    AUTHORITY_ASKED = (
-        "authority_asked"  #: a request to the holder; data: app_id, lease, by, by_id, by_priority …
-    )
+    AUTHORITY_ASKED = "authority_asked"  #: a request to the holder; data: app_id, lease, by, by_id, by_priority …
     AUTHORITY_DECLINED = "authority_declined"  #: data: app_id (the requester), by (the holder), reason
     AUTHORITY_WITHDRAWN = "authority_withdrawn"  #: the requester gave up; data: app_id (the holder), lease, by, by_id
     AUTHORITY_EXPIRED = "authority_expired"  #: the holder's time is over, and no one waits; data: app_id, lease

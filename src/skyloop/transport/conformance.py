@@ -224,7 +224,7 @@ class TransportSuite(ABC):
             for wrong in (picture(head)[:-1], np.zeros((head.height, head.width * 2, 3), np.uint8)[:, ::2]):
                 raises(UsageError, partial(server.publish_frame, head, wrong))
 
-    def test_frames_that_are_looked_at_are_never_overwritten(self) -> None:
+    def test_frames_in_use_are_never_overwritten(self) -> None:
         with self.serving() as (server, log), self.connected(server, log, video(FRONT)) as app:
             views: dict[int, Pixels] = {}
             for seq in range(40):
@@ -277,7 +277,7 @@ class TransportSuite(ABC):
 
     # --- ends ---
 
-    def test_nobody_there_is_a_link_error(self) -> None:
+    def test_a_missing_server_is_a_link_error(self) -> None:
         server = self.make_server()
         raises(LinkError, lambda: self.dial_or_link_error(server))
         server.stop()
@@ -292,7 +292,7 @@ class TransportSuite(ABC):
         except UsageError as error:
             raise LinkError(str(error)) from error
 
-    def test_close_is_told_to_both_ends_once(self) -> None:
+    def test_close_notifies_both_ends_once(self) -> None:
         with self.serving() as (server, log), self.connected(server, log, FEEDBACK) as app:
             assert app.client.send(b"last words")
             app.client.close()
@@ -324,7 +324,7 @@ class TransportSuite(ABC):
             assert other.client.send(b"still here")
             wait_until(lambda: log.from_peer(other.peer), "the other one is unaffected")
 
-    def test_stop_is_told_to_everybody(self) -> None:
+    def test_stop_notifies_every_client(self) -> None:
         with self.serving() as (server, log):
             with self.connected(server, log) as one, self.connected(server, log) as two:
                 assert server.send(one.peer, b"goodbye")

@@ -27,7 +27,7 @@ from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set
 _MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is a few bytes larger than its header's
 _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
 _RETRY_S: Final = 0.25  # for packets that did not fit into a full socket
-_LOOK_S: Final = 0.05  # how often a leading thread checks whether its wait is over, while nothing arrives
+_CHECK_S: Final = 0.05  # how often a leading thread checks whether its wait is over, while nothing arrives
 _STAND_BY_S: Final = 0.002  # how long no thread receives after the leading thread returned with its sample
 _MAX_CAPACITY: Final = 1 << 31  # most memory that a client lets a server make it map
 _log = logging.getLogger(__name__)
@@ -164,7 +164,7 @@ class LocalClient(TransportClient):
                 self._take_turn(sock, lambda: self._candidate is not None)
             wake, self._candidate = self._candidate, None
             if wake is not None and not self._ended:
-                set_timeout(sock, socket.SO_RCVTIMEO, _LOOK_S)
+                set_timeout(sock, socket.SO_RCVTIMEO, _CHECK_S)
                 wake()
                 self._stand_by()
         reason = self._ended
@@ -397,7 +397,7 @@ class Leases:
         the client, its handler and the frames that the handler keeps would therefore keep all of them for ever.
         """
         self._slots.clear()
-        self._send_release = _to_nobody
+        self._send_release = _discard_release
 
     def pixels(self, number: int, size: int) -> Pixels:
         """Return a slot's frame: in place, or as a copy if the application already has :attr:`IN_PLACE` frames.
@@ -429,5 +429,5 @@ class Leases:
         self._send_release(slot.number)
 
 
-def _to_nobody(_: int) -> None:
+def _discard_release(_: int) -> None:
     """Drop a release, because the connection has ended."""

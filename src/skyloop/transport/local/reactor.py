@@ -31,7 +31,7 @@ from skyloop.transport.priority import MOST_PACKETS, Lane, is_command
 CHECK_S: Final = 0.5  #: how often to check silent connections, and listeners that could not accept
 _AFTER_FAILURE_S: Final = 0.01
 _PAUSE_S: Final = 100e-6  # a wait this long shows that nothing was pending
-_IN_A_ROW: Final = 8  # packets handled before the next check for new ones
+_PACKETS_PER_POLL: Final = 8  # packets handled before the next check for new ones
 _FIRST_COME: Final = tuple(Lane)
 #: The lane of each turn: even if there is always something urgent, the others each get one turn in four.
 _ORDERS: Final = (
@@ -40,7 +40,7 @@ _ORDERS: Final = (
     _FIRST_COME,
     (Lane.OTHERS, Lane.URGENT, Lane.STEERING),
 )
-_LOOK_S: Final = 0.1  # how often a wait for connections checks whether their thread has ended
+_THREAD_CHECK_S: Final = 0.1  # how often a wait for connections checks whether their thread has ended
 _log = logging.getLogger(__name__)
 
 
@@ -111,7 +111,7 @@ class Reactor:
         """Whether its thread has ended, so that nothing receives for its servers."""
         return not self._thread.is_alive()
 
-    def left_of(self, server: SharedLocalServer) -> list[Source]:
+    def remaining_of(self, server: SharedLocalServer) -> list[Source]:
         """Return a server's sockets that remained when the thread ended; none while it runs. Thread-safe."""
         with self._lock:
             return [source for source in self._sources.values() if source.server is server] if self.over else []
@@ -179,7 +179,7 @@ class Reactor:
                     for _ in range(MOST_PACKETS):
                         if not self._receive(self._epoll.poll(0), at_once=False):
                             break
-                for _ in range(_IN_A_ROW):
+                for _ in range(_PACKETS_PER_POLL):
                     if not any(self._lanes):
                         break
                     self._deliver()
@@ -294,9 +294,9 @@ class SharedLocalServer(LocalServer):
         if not isinstance(threading.current_thread(), _Thread):
             with self._left:
                 while self._served and not self.reactor.over:
-                    self._left.wait(_LOOK_S)
+                    self._left.wait(_THREAD_CHECK_S)
             with self._lock:
-                for left in self.reactor.left_of(self):  # the thread ended first: nothing else returns these
+                for left in self.reactor.remaining_of(self):  # the thread ended first: nothing else returns these
                     assert left.connection is not None
                     self._finish_connection(left, left.connection, "the proxy stopped")
 
@@ -319,7 +319,7 @@ class SharedLocalServer(LocalServer):
             Whether the packet waits for :meth:`deliver`, possibly with more behind it.
         """
         with self._lock:  # from receiving to handling, so that after a split nothing overtakes this thread's packet
-            if not self._is_mine(reactor, source):
+            if not self._is_current(reactor, source):
                 return False
             connection = source.connection
             if connection is None:
@@ -356,7 +356,7 @@ class SharedLocalServer(LocalServer):
             The lane to queue the source in again; None: no lane.
         """
         with self._lock:
-            if not self._is_mine(reactor, source) or source.lane is not lane:
+            if not self._is_current(reactor, source) or source.lane is not lane:
                 return None  # it has become more urgent and moved to that lane
             source.lane = None
             connection = source.connection
@@ -379,11 +379,11 @@ class SharedLocalServer(LocalServer):
         """End a connection whose first packet takes too long."""
         with self._lock:
             connection = source.connection
-            if connection is None or now_s - source.since_s <= HELLO_S or not self._is_mine(reactor, source):
+            if connection is None or now_s - source.since_s <= HELLO_S or not self._is_current(reactor, source):
                 return
             self._finish_connection(source, connection, f"it sent no Hello within {HELLO_S:g} s")
 
-    def _is_mine(self, reactor: Reactor, source: Source) -> bool:
+    def _is_current(self, reactor: Reactor, source: Source) -> bool:
         """Return whether this reactor still receives from a source; otherwise pass it on or drop it."""
         if source.ended:
             reactor.remove(source)

@@ -148,9 +148,7 @@ class LocalServer(TransportServer):
                 return ""
             observers = sum(other.admitted and not other.pilot for other in self._peers.values())
             if not pilot and observers >= MAX_CLIENTS - PILOT_PLACES:
-                return (
-                    f"{self.address} has {observers} observers; the other {PILOT_PLACES} are reserved for pilots"
-                )
+                return f"{self.address} has {observers} observers; the other {PILOT_PLACES} are reserved for pilots"
             connection.admitted, connection.pilot = True, pilot
             return ""
 
