@@ -34,7 +34,7 @@ Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 class LoopNotifier(Notifier):
     """Wakes the coroutine that waits in :meth:`within`, from any thread."""
 
-    __slots__ = ("_notified", "_loop")
+    __slots__ = ("_loop", "_notified")
 
     def __init__(self) -> None:
         super().__init__()

@@ -245,7 +245,7 @@ class LiveDecoder:
         """Forget the stream so far: the next picture does not continue it."""
         self._before: Piece | None = None
         self._failing_ns: int | None = None  # since when no piece could be decoded
-        self._no_picture_since_ns: int | None = None  # since when no H.264 picture came out
+        self._barren_since_ns: int | None = None  # since when no H.264 picture came out
         self._strict: VideoCodecContext | None = None  # None: H.264 waits for a key picture
         self._shown_ns = 0  # capture time of the newest picture: later ones can't have been captured earlier
         self._reorders = False  # it holds back pictures that refer to later ones
@@ -264,7 +264,7 @@ class LiveDecoder:
         image = self._decode_h264(piece, coded, follows) if piece.is_h264 else self._decode_other(piece, coded, follows)
         if image is None:
             return None
-        self._failing_ns = self._no_picture_since_ns = None
+        self._failing_ns = self._barren_since_ns = None
         if not show:
             return None
         self._shown += 1
@@ -296,10 +296,8 @@ class LiveDecoder:
         if self._forgiving is not None:
             return self._judged(self._forgiving, piece.packet, coded)
         if self._strict is None:
-            self._no_picture_since_ns = (
-                coded.arrived_ns if self._no_picture_since_ns is None else self._no_picture_since_ns
-            )
-            if coded.arrived_ns - self._no_picture_since_ns > nanoseconds(STRICT_S):
+            self._barren_since_ns = coded.arrived_ns if self._barren_since_ns is None else self._barren_since_ns
+            if coded.arrived_ns - self._barren_since_ns > nanoseconds(STRICT_S):
                 self._forgive(piece)
         return None
 

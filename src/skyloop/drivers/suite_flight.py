@@ -63,9 +63,7 @@ class Flight:
         def holds() -> bool:
             return sink.newest is not None and condition(sink.newest)
 
-        assert sink.wait(holds, timeout_s), (
-            f"not {what} within {timeout_s} s; newest feedback: {_described(sink.newest)}"
-        )
+        assert sink.wait(holds, timeout_s), f"not {what} within {timeout_s} s; newest feedback: {_summary(sink.newest)}"
         assert sink.newest is not None
         return sink.newest
 
@@ -178,7 +176,7 @@ class Flight:
             gone = measure(start, feedback)
             return gone is not None and gone * math.copysign(1.0, goal) >= abs(goal)
 
-        self.until(far_enough, self.suite.motion_timeout_s, f"{goal:+g} along {axis} from {_described(start)}")
+        self.until(far_enough, self.suite.motion_timeout_s, f"{goal:+g} along {axis} from {_summary(start)}")
         self.set_point()
         self._settle()
 
@@ -190,7 +188,7 @@ class Flight:
         self.sink.wait(lambda: _speed(self.sink.newest) < 0.25, 2.0 if brake else 0.3)
 
 
-def _described(feedback: Feedback | None) -> str:
+def _summary(feedback: Feedback | None) -> str:
     """Return the fields that a driver filled in, and their age, for an error message."""
     if feedback is None:
         return "none"

@@ -16,7 +16,7 @@ import msgspec
 from skyloop.errors import UsageError
 from skyloop.messages.fields import Count, Refusal, TimeNs
 
-MAX_COORDINATE_M: Final = 100_000.0  #: a position beyond this along any axis is treated as a mistake
+MAX_RANGE_M: Final = 100_000.0  #: a position beyond this along any axis is treated as a mistake
 MAX_YAW_RAD: Final = 1000.0  #: and so is a larger yaw
 
 
@@ -120,8 +120,8 @@ class Position(Action, frozen=True, array_like=True, tag=8):
     def problem(self) -> str:
         """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
         for name in ("x", "y", "z"):
-            if abs(value := getattr(self, name)) > MAX_COORDINATE_M:
-                return f"{name} is {value:g} m and must be within {MAX_COORDINATE_M:g} m of the origin of the vehicle's position"
+            if abs(value := getattr(self, name)) > MAX_RANGE_M:
+                return f"{name} is {value:g} m and must be within {MAX_RANGE_M:g} m of the vehicle's origin"
         if self.yaw is not None and abs(self.yaw) > MAX_YAW_RAD:
             return f"yaw is {self.yaw:g} rad and must be from {-MAX_YAW_RAD:g} to {MAX_YAW_RAD:g} rad"
         if self.speed is not None and not self.speed > 0.0:
@@ -154,8 +154,8 @@ class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
     @property
     def problem(self) -> str:
         """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
-        if self.height is not None and not 0.0 <= self.height <= MAX_COORDINATE_M:
-            return f"height is {self.height:g} m above the start and must be from 0 to {MAX_COORDINATE_M:g} m"
+        if self.height is not None and not 0.0 <= self.height <= MAX_RANGE_M:
+            return f"height is {self.height:g} m above the start and must be from 0 to {MAX_RANGE_M:g} m"
         return ""
 
 
