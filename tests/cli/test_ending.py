@@ -79,7 +79,7 @@ def test_a_drone_returns_to_its_start(run: Run) -> None:
         drone.release_authority()
         ended = run("return", "alpha")
         assert ended.code == 1
-        assert "alpha: NOT returned: skyloop return: return_to_start refused: a no-fly zone is in" in ended.err
+        assert "alpha: NOT returned: skyloop return: return_to_start refused: a no-fly zone blocks" in ended.err
         drone.request_authority(wait_s=10.0)
         drone.config["safety.zones"] = ""
         drone.land()

@@ -130,7 +130,7 @@ def places(*points: tuple[float, float, float], **more: Any) -> Route:
         (places((1, 1, 1)), HERE, []),
         (places((1, 1, 1), (50, 0, -3)), HERE, [(2, "outside the room")]),
         (places((0, 2, 1), (3.5, 0, 1)), HERE, []),
-        (places((0.1, 0, 1), (3.5, 0, 1)), HERE, [(2, "blocks the straight line there, cylinder 2 0 0.5 0 3")]),
+        (places((0.1, 0, 1), (3.5, 0, 1)), HERE, [(2, "blocks the straight line, cylinder 2 0 0.5 0 3")]),
         (places((2, 0.1, 1)), HERE, [(1, "in a no-fly zone")]),
         (places((3.5, 0, 1)), HERE, [(1, "blocks the straight line")]),
         (places((1, 0, -0.5)), Conditions(start=(0, 0, 1), ground_m=0.0, battery=1.0), [(1, "below the ground")]),

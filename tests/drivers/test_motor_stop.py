@@ -86,7 +86,7 @@ def test_motors_that_restart_soon_are_stopped_again_but_not_later() -> None:
     press.run(TICK_NS, shown=False)
     assert len(press.sent) == 10
     assert not press.stop.active
-    assert "started again" in press.events[0].text
+    assert "motors again" in press.events[0].text
 
 
 def test_another_press_restarts_the_time_limit_and_keeps_the_pace() -> None:

@@ -31,15 +31,15 @@ GOOD = msgspec.msgpack.encode([1, 7, 3, 99, [7, 0.5, 0.0, 0.0, 0.0]])
 
 #: name: (packet, what the error must match)
 INVALID: dict[str, tuple[bytes, str]] = {
-    "empty": (b"", "0 bytes are less"),
-    "header-cut": (packed(GOOD)[:11], "11 bytes are less"),
+    "empty": (b"", "0 bytes are too few"),
+    "header-cut": (packed(GOOD)[:11], "11 bytes are too few"),
     "signature": (b"SKYX" + packed(GOOD)[4:], "signature b'SKYX'"),
     "version": (packed(GOOD, version=2), "version 2 is not 1"),
     "kind": (packed(GOOD, kind=63), "unknown kind 63"),
     "reserved": (packed(GOOD, reserved=1), "reserved bytes"),
     "length-short": (packed(GOOD, length=len(GOOD) - 1), "header announces"),
     "length-long": (packed(GOOD, length=len(GOOD) + 1), "header announces"),
-    "oversized": (packed(b"\xc0" * (MAX_BODY + 1)), "over the 60000"),
+    "oversized": (packed(b"\xc0" * (MAX_BODY + 1)), "exceed the 60000"),
     "body-cut": (packed(GOOD[:-3]), "truncated"),
     "body-trailing": (packed(GOOD + b"\xc0"), "trailing"),
     "body-not-array": (packed(msgspec.msgpack.encode({"seq": 1})), "Expected `array`, got `object`"),

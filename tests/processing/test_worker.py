@@ -171,7 +171,7 @@ def test_what_process_raises_is_told_and_work_goes_on(node: Node, eye: Drone) ->
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        (lambda: 0, "a result can't be sent: there is a builtins.function in it"),
+        (lambda: 0, "a result can't be sent: it contains a builtins.function"),
         (np.zeros(100_000), "an array of 800000 bytes"),
         (Output(1, ["circle"]), "this can't be drawn on a frame"),  # type: ignore[list-item]
     ],

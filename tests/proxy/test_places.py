@@ -156,7 +156,7 @@ def test_repeats_are_lowered_to_a_lower_ceiling_and_drift_past_a_zone_is_not_ref
 
 
 REFUSED = [
-    (Position(3.5, 0.1, 1.0), "blocks the straight line"),
+    (Position(3.5, 0.1, 1.0), "zone blocks the straight line"),
     (Position(0.0, 0.0, 6.0), "at most 5.00 m is allowed"),
     (Position(-2.0, 0.0, -3.0), "3.00 m below the ground"),
 ]

@@ -216,9 +216,9 @@ def test_the_height_is_kept_where_it_may_fly(space: Space, limits: Limits, feedb
         (None, ANYWHERE, at(5, 0, 1, position_m=None), Refusal.WRONG_STATE, "does not report its position"),
         (HOME, ANYWHERE, at(5, 0, 1, yaw_rad=None), Refusal.WRONG_STATE, "does not report its yaw"),
         (HOME, ANYWHERE, at(5, 0, 1, NOW - 3 * S), Refusal.WRONG_STATE, "3.0 s old"),
-        (HOME, Space(zones=(Cylinder(2, 0, 0.5, 0, 5),)), at(5, 0, 1), Refusal.OUT_OF_RANGE, "a no-fly zone is in"),
-        (HOME, Space(zones=(Box((-1, -1, 0), (1, 1, 1)),)), at(5, 0, 1), Refusal.OUT_OF_RANGE, "a no-fly zone is in"),
-        (HOME, Space(zones=(Box((4, -1, 1.5), (6, 1, 1.8)),)), at(5, 0, 1), Refusal.OUT_OF_RANGE, "no-fly zone is in"),
+        (HOME, Space(zones=(Cylinder(2, 0, 0.5, 0, 5),)), at(5, 0, 1), Refusal.OUT_OF_RANGE, "a no-fly zone blocks"),
+        (HOME, Space(zones=(Box((-1, -1, 0), (1, 1, 1)),)), at(5, 0, 1), Refusal.OUT_OF_RANGE, "a no-fly zone blocks"),
+        (HOME, Space(zones=(Box((4, -1, 1.5), (6, 1, 1.8)),)), at(5, 0, 1), Refusal.OUT_OF_RANGE, "no-fly zone blocks"),
         (HOME, Space(box=Box((1, -9, 0), (9, 9, 9))), at(5, 0, 1), Refusal.OUT_OF_RANGE, "outside the safety box"),
     ],
 )

@@ -313,7 +313,7 @@ def test_safety_as_they_are_written() -> None:
     ("text", "why"),
     [
         ("sphere 1 2 3", "a box or a cylinder"),
-        ("box 1 2 3", "6 finite numbers, not 3"),
+        ("box 1 2 3", "6 finite numbers, got 3"),
         ("box 1 2 3 4 5 nan", "finite"),
         ("box 1 2 3 4 5 x", "must be followed by numbers"),
         ("box 1 2 3 1 5 6", "extent"),
@@ -412,7 +412,7 @@ def test_thin_zones_are_kept_clear_of_as_if_they_were_thicker_and_that_is_told(b
     assert (mast.radius, mast.low, mast.high) == pytest.approx((0.25, -0.2, 0.3))
     assert thick is thin.zones[2]
     assert [str(zone) for zone in thin.thin] == ["net: box 1 -5 0 1.05 5 3", "mast: cylinder 3 3 0.02 0 0.1"]
-    assert "kept clear of as if it were 0.5 m thick" in thin.problem_at((0.8, 0.0, 1.0))
+    assert "enforced as if it were 0.5 m thick" in thin.problem_at((0.8, 0.0, 1.0))
     pilot.ask(SetParameter(ZONES, "net: box 1 -5 0 1.05 5 3", pilot.lease))
     pilot.ask(SetParameter("limits.speed", 1.0, pilot.lease))
     (event,) = pilot.told(EventKind.VEHICLE_MESSAGE)

@@ -235,9 +235,9 @@ def memfd(size: int, seals: int) -> int:
     [
         (8192, 0, 8192, "not sealed"),
         (8192, fcntl.F_SEAL_GROW, 8192, "not sealed"),
-        (4096, fcntl.F_SEAL_SHRINK, 8192, "8192 bytes in 4096"),
-        (4096, fcntl.F_SEAL_SHRINK, 0, "0 bytes in 4096"),
-        (1 << 40, fcntl.F_SEAL_SHRINK, 1 << 40, "1099511627776 bytes in"),
+        (4096, fcntl.F_SEAL_SHRINK, 8192, "8192 bytes, but only 4096"),
+        (4096, fcntl.F_SEAL_SHRINK, 0, "0 bytes, but only 4096"),
+        (1 << 40, fcntl.F_SEAL_SHRINK, 1 << 40, "1099511627776 bytes, but only"),
     ],
 )
 def test_memory_that_could_vanish_is_refused(size: int, seals: int, capacity: int, complaint: str) -> None:

@@ -435,14 +435,14 @@ def checked_value(parameter: Parameter, value: Value) -> Value:
     if kind in (ParameterType.FLOAT, ParameterType.INT) and not parameter.choices:
         whole = kind is ParameterType.INT
         if isinstance(value, bool) or not isinstance(value, int | float) or (whole and value % 1):
-            raise ParameterError(f"{name} must be a {'whole ' * whole}number: {value!r:.60}", code=Refusal.WRONG_TYPE)
+            raise ParameterError(f"{name} takes a {'whole ' * whole}number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
         low = -sys.float_info.max if parameter.minimum is None else parameter.minimum
         high = sys.float_info.max if parameter.maximum is None else parameter.maximum
         if not low <= value <= high:  # also rejects NaN, infinities and huge ints
-            raise ParameterError(f"{name} must be from {low:g} to {high:g}, got {value!r}", code=Refusal.OUT_OF_RANGE)
+            raise ParameterError(f"{name} must be from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
         return value if whole else float(value)
     if type(value) is not type(parameter.value):
-        raise ParameterError(f"{name} must be a {kind.value}, got {value!r:.60}", code=Refusal.WRONG_TYPE)
+        raise ParameterError(f"{name} takes a {kind.value}, not {value!r:.60}", code=Refusal.WRONG_TYPE)
     if parameter.choices and value not in parameter.choices:
         names = [str(choice) for choice in parameter.choices]
         raise ParameterError(str(UnknownNameError(name, str(value), names)), code=Refusal.OUT_OF_RANGE)

@@ -79,7 +79,7 @@ def test_connections_that_say_nothing_keep_nobody_out(
     client = dial("alpha")(pilot)
     wait_until(lambda: len(place.log.joined) == known + 1, "the pilot is in")
     assert place.server.admit(place.log.joined[-1], pilot=True) == ""
-    assert "its place at local:alpha was given to a newer connection" in word(silent[0])
+    assert "its place at local:alpha went to a newer connection" in word(silent[0])
     for _ in range(8):  # whatever goes on, who has said who it is stays
         place.raw(*first)
     wait_until(lambda: len(place.server._connections) <= 4, "the others gave way to one another")
@@ -145,7 +145,7 @@ def test_observers_leave_places_for_pilots(place: Place, monkeypatch: pytest.Mon
     monkeypatch.setattr(f"{SERVER}.MAX_CLIENTS", 6)
     monkeypatch.setattr(f"{SERVER}.PILOT_PLACES", 2)
     assert [place.admitted(pilot=False) for _ in range(4)] == [""] * 4
-    assert "4 observers; the other 2 places are kept for pilots" in place.admitted(pilot=False)
+    assert "4 observers; the other 2 are reserved for pilots" in place.admitted(pilot=False)
     assert place.admitted(pilot=True) == ""
     assert place.admitted(pilot=True) == ""
 

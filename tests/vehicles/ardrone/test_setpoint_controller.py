@@ -426,7 +426,7 @@ def test_nobody_resets_by_himself() -> None:
         (None, Takeoff(), "no data from"),
         (EMERGENCY, Takeoff(), "reset it first"),
         (None, ResetEmergency(), "no data from"),
-        (AIR, Velocity(), "takes no velocity"),
+        (AIR, Velocity(), "does not support velocity"),
     ],
 )
 def test_what_cannot_be_done(condition: Condition | None, action: AnyAction, says: str) -> None:

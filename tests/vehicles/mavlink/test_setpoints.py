@@ -1030,7 +1030,7 @@ def test_a_stop_that_the_vehicle_never_shows_is_given_up_and_it_can_be_landed(au
     bench.go_on(9.0, silent=True)
     assert len(bench.commands()) > 80
     bench.go_on(3.0, silent=True)
-    assert any("given up" in text and "land it" in text for text in bench.texts)
+    assert any("stop has ended" in text and "land it" in text for text in bench.texts)
     bench.commands()
     bench.go_on(1.0)
     assert bench.state() in (FlightState.HOVERING, FlightState.FLYING)

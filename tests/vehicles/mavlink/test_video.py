@@ -172,7 +172,7 @@ def test_a_server_that_goes_silent_is_told_and_found_again() -> None:
     ):
         shows(sink, 3)
         projector.paused.set()
-        is_told(sink, "nothing came for 1.5 s")
+        is_told(sink, "nothing received for 1.5 s")
         projector.paused.clear()
         shows(sink, 3)
 

@@ -237,7 +237,7 @@ def test_without_its_radio_it_hears_and_tells_nothing() -> None:
 
 def test_one_that_takes_attitudes_only_holds_its_place_without_its_radio_too() -> None:
     with opened(f"sim://?world=empty&cameras=none&native=attitude&speed=4&{CALM}") as (driver, sink):
-        with pytest.raises(UsageError, match="sim takes no hover"):
+        with pytest.raises(UsageError, match="sim does not support hover"):
             driver.apply(Hover())
         driver.apply(Attitude(climb=0.5))
         assert sink.wait(lambda: sink.newest is not None and (sink.newest.altitude_m or 0.0) > 0.6, 10.0)
@@ -270,8 +270,8 @@ def test_what_is_written_before_it_is_opened_holds() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("limits.tilt", 9.0, "is from 0.02 to 0.6"),
-        ("limits.tilt", math.nan, "is from 0.02 to 0.6"),
+        ("limits.tilt", 9.0, "must be from 0.02 to 0.6"),
+        ("limits.tilt", math.nan, "must be from 0.02 to 0.6"),
         ("limits.tilt", "much", "is made of numbers"),
         ("limits.tilt", True, "is made of numbers"),
         ("sim.wind", 3.0, "is three numbers"),

@@ -184,7 +184,7 @@ def test_the_capabilities_tell_the_size_before_it_is_opened(clip: Path) -> None:
 
 def test_it_takes_no_command_and_is_always_safe(clip: Path) -> None:
     with playing(f"video://{clip}", RecordingSink()) as driver:
-        with pytest.raises(UsageError, match="video takes no hover"):
+        with pytest.raises(UsageError, match="video does not support hover"):
             driver.apply(Hover())
         assert driver.failsafe(Hover())
 
@@ -246,7 +246,7 @@ def test_numbered_pictures_play_as_well(tmp_path: Path) -> None:
         ("sped=2", "no option of video:// named 'sped'; did you mean 'speed'"),
         ("speed=0", "option speed is '0' and must be a number from 0.01"),
         ("width=320", "only a device or a stream has width"),
-        ("cx=3", "option cx needs fx as well"),
+        ("cx=3", "option cx also needs fx"),
         ("fx=0", "option fx is '0'"),
         ("fx=9&fy=0", "option fy is '0'"),
         ("fx=9&distortion=1,2", "must be 4, 5 or 8 numbers"),
