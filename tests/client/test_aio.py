@@ -288,7 +288,7 @@ def test_results(proxy: ScriptedProxy) -> None:
             assert newest is not None
             assert newest.seq == 2
             listener.cancel()
-            with pytest.raises(NoAnswerError, match="no result of processor detector came"):
+            with pytest.raises(NoAnswerError, match="no result of processor detector arrived"):
                 await anext(drone.results("detector", timeout_s=0.02))
             await coming.aclose()  # type: ignore[attr-defined]
 

@@ -368,7 +368,7 @@ def test_a_take_off_that_the_application_itself_ends_raises_at_once(
 
     changing = background(change_of_mind)
     begun_s = time.monotonic()
-    with pytest.raises(RefusedError, match="takeoff was ended on the way: another command took its place") as raised:
+    with pytest.raises(RefusedError, match="takeoff was ended by another command") as raised:
         drone.takeoff(timeout_s=3 * WAIT_S)
     changing.join(WAIT_S)
     assert raised.value.code == "replaced"
@@ -498,7 +498,7 @@ def test_a_take_off_that_a_failsafe_or_a_new_lease_ended_raises_at_once_and_is_n
     if state is FlightState.HOVERING:
         drone.takeoff(timeout_s=100.0)  # what rose by then ends in a hover, which is what was asked for
     else:
-        with pytest.raises(RefusedError, match=f"takeoff was ended on the way, as .*{why}: take off again") as raised:
+        with pytest.raises(RefusedError, match=f"takeoff was ended because .*{why}: take off again") as raised:
             drone.takeoff(timeout_s=100.0)
         assert raised.value.code == "not_fresh"
     taking_off.join(WAIT_S)
@@ -810,13 +810,13 @@ def test_a_place_that_is_refused(
 def test_a_failsafe_and_another_command_end_the_way(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.state = FlightState.FLYING
     failing = background(lambda: failsafe(proxy, proxy.until_commanded(PLACE)))
-    with pytest.raises(RefusedError, match="position was ended on the way, by a failsafe or a lost link"):
+    with pytest.raises(RefusedError, match="position was ended by a failsafe or a lost link"):
         go_to(drone)
     failing.join(WAIT_S)
     proxy.more["failsafe"] = Failsafe.NONE
     before = len(proxy.commands)
     hovering = background(lambda: proxy.until_commanded(PLACE, before), drone.hover)
-    with pytest.raises(RefusedError, match="another command took its place"):
+    with pytest.raises(RefusedError, match="ended by another command"):
         go_to(drone)
     hovering.join(WAIT_S)
 

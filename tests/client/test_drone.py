@@ -72,7 +72,7 @@ def test_feedback_newest_next_and_aged(proxy: ScriptedProxy, drone: Drone) -> No
     assert drone.feedback(max_age_s=60.0) == sample
     with pytest.raises(NoAnswerError, match=r"s old, 0\.5 s were allowed"):
         drone.feedback(max_age_s=0.5)
-    with pytest.raises(NoAnswerError, match="no feedback came within"):
+    with pytest.raises(NoAnswerError, match="no feedback arrived within"):
         drone.next_feedback(timeout_s=0.02)
 
 
@@ -128,7 +128,7 @@ def test_frames_as_an_iterator(proxy: ScriptedProxy, drone: Drone) -> None:
 
 
 def test_an_iterator_that_gets_nothing_says_so(drone: Drone) -> None:
-    with pytest.raises(NoAnswerError, match=r"no frame of front came within 0\.02 s"):
+    with pytest.raises(NoAnswerError, match=r"no frame of front arrived within 0\.02 s"):
         next(iter(drone.frames(timeout_s=0.02)))
 
 
@@ -162,7 +162,9 @@ def test_in_a_fork_a_drone_neither_lands_nor_releases_what_its_parent_flies(prox
         drone.wait("hovering", WAIT_S)
         drone._piloting.forked()
         asked, commanded = list(proxy.requests), proxy.actions()
-        with pytest.raises(ClosedError, match=r"belongs to process \d+, of which this one is a fork: connect here"):
+        with pytest.raises(
+            ClosedError, match=r"belongs to process \d+, of which this one is a fork: connect again here"
+        ):
             drone.velocity(forward=1.0)
         drone._piloting.end_flight()
         drone.close()
@@ -357,7 +359,7 @@ def test_inline_listeners_must_not_wait(proxy: ScriptedProxy, drone: Drone) -> N
 
     with drone.on_feedback(waiting, inline=True):
         drone.wait(lambda _: len(problems) >= 6, WAIT_S)
-    assert all("inline listener can't wait" in problem for problem in problems)
+    assert all("inline callback can't wait" in problem for problem in problems)
     assert Takeoff() not in proxy.actions()
 
 

@@ -337,17 +337,17 @@ def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
     down = background(lambda: proxy.until(lambda: bool(steps)), lambda: setattr(proxy, "state", LANDED))
     assert drone._piloting.end_flight(report) is None
     down.join(WAIT_S)
-    assert steps == ["it returns to its start and lands"]
+    assert steps == ["it is returning to its start to land"]
     assert {action.name for action in proxy.actions()} <= {"idle"}
 
 
 @pytest.mark.parametrize(
     ("take", "told"),
     [
-        (lambda proxy: proxy.take_over("boss"), "boss took over: the drone is left to it"),
+        (lambda proxy: proxy.take_over("boss"), "boss took over: leaving the drone to it"),
         (
             lambda proxy: proxy.more.update(others="the vehicle is in RTL"),
-            "the vehicle is in RTL: the drone is left to it",
+            "the vehicle is in RTL: leaving the drone to it",
         ),
     ],
 )
@@ -363,7 +363,7 @@ def test_what_others_fly_is_left_to_them_at_the_end(
     steps: list[str] = []
     assert drone._piloting.end_flight(steps.append) is None
     assert steps == [told]
-    assert ("nobody lands it" in caplog.text) == ("RTL" in told)
+    assert ("not landed from here" in caplog.text) == ("RTL" in told)
     assert {action.name for action in proxy.actions()} <= {"idle"}
 
 
@@ -503,4 +503,4 @@ def test_who_took_it_a_moment_ago_keeps_it_too(proxy: ScriptedProxy, drone: Dron
     taking = background(take)
     assert drone._piloting.end_flight(steps.append) is None
     taking.join(WAIT_S)
-    assert steps == ["landing", "the vehicle is in RTL: the drone is left to it"]
+    assert steps == ["landing", "the vehicle is in RTL: leaving the drone to it"]

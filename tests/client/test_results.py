@@ -87,7 +87,9 @@ def test_leaving_the_loop_ends_the_subscription(proxy: ScriptedProxy, drone: Dro
 
 
 def test_who_gets_nothing_is_told_why(proxy: ScriptedProxy, drone: Drone) -> None:
-    with pytest.raises(NoAnswerError, match=r"no result of processor detector came within 0\.02 s: does skyloop proc"):
+    with pytest.raises(
+        NoAnswerError, match=r"no result of processor detector arrived within 0\.02 s: does skyloop proc"
+    ):
         next(iter(drone.results("detector", timeout_s=0.02)))
     raised: list[str] = []
 
@@ -101,13 +103,13 @@ def test_who_gets_nothing_is_told_why(proxy: ScriptedProxy, drone: Drone) -> Non
     until_subscribed(proxy, drone, "results/detector")
     Sender(proxy).send(1, age_s=2.0)
     thread.join(WAIT_S)
-    assert raised == ["no result of detector came within 0.5 s that was new enough; 1 were too old"]
+    assert raised == ["no sufficiently new result of detector arrived within 0.5 s; 1 were too old"]
     assert drone.stats["results/detector"].dropped == 1
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "x" * 65, "ä", 7])
 def test_a_name_that_cannot_be(drone: Drone, name: Any) -> None:
-    with pytest.raises(UsageError, match="the name of a processor has 1 to 64 letters"):
+    with pytest.raises(UsageError, match="a processor's name must have 1 to 64 letters"):
         drone.result(name)
 
 

@@ -47,7 +47,7 @@ class Config:
     def __init__(self, sync: client.Config) -> None:
         """Wrap parameters of a connected drone."""
     async def get(self, name: str) -> Value:
-        """Return the present value.
+        """Return the current value.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -63,8 +63,8 @@ class Config:
             ParameterError: If the proxy refuses it, with its reason.
             AuthorityError: If the authority is not held.
             UnknownNameError: If there is no such parameter; carries suggestions.
-            UsageError: If the value is of no type that a parameter can have.
-            LinkError: If the link broke before the answer and the parameter is momentary: once may have been enough.
+            UsageError: If the value's type is not one of a parameter.
+            LinkError: If the link broke before the answer and the parameter is momentary: it may have been executed.
         """
     async def items(self) -> list[tuple[str, Value]]:
         """Return (name, value) of all parameters, sorted by name.
@@ -82,7 +82,7 @@ class Config:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def describe(self, name: str) -> Parameter:
-        """Return all that is known of a parameter: type, unit, range, default, value, description.
+        """Return a parameter's type, unit, range, default, value and description.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -114,7 +114,7 @@ class Drone:
     def frames(
         self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> AsyncIterator[client.Frame]:
-        """Yield each newest frame until the drone is closed; a slow loop skips frames.
+        """Yield the newest frame repeatedly until the drone is closed; a slow loop skips frames.
 
         A JPEG is decoded on another thread, while :meth:`frame` decodes on the event loop.
 
@@ -123,45 +123,45 @@ class Drone:
         Args:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait for each frame [s].
-            **how: ``max_fps``: at most so many frames a second. ``scale``: factor for width and height, above 0 and up
-                to 1. ``part``: (k, n), only every n-th frame, for n workers with k from 0 that share them.
-                ``encoding``: how frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80),
-                ``"h264"`` (of ``kbit_s`` kilobits a second; by default as much as the path carries, with smaller and
-                fewer pictures where that is little) or ``"raw"``; on one host all travel raw. ``max_age_s``: what is
-                older since its capture when its turn comes is left out, and counted as dropped.
+            **how: ``max_fps``: maximum frames per second. ``scale``: factor for width and height, above 0 and up to 1.
+                ``part``: (k, n), only every n-th frame, for n workers with k from 0 that share them. ``encoding``: how
+                frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80), ``"h264"`` (of
+                ``kbit_s`` kilobits a second; by default as much as the path carries, with smaller and fewer pictures
+                where that is little) or ``"raw"``; on one host all travel raw. ``max_age_s``: frames older than this
+                when their turn comes are skipped and counted as dropped.
 
         Raises:
-            NoAnswerError: If no frame comes within ``timeout_s``.
+            NoAnswerError: If no frame arrives within ``timeout_s``.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             UsageError: If an option is out of range, or from an inline callback.
-            ClosedError: If the drone was closed before.
+            ClosedError: If the drone was already closed.
         """
     def results(
         self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0
     ) -> AsyncIterator[client.Result]:
-        """Yield each newest result of a processor until the drone is closed.
+        """Yield a processor's newest result repeatedly until the drone is closed.
 
         A slow loop skips results; these and those that are too old are counted in :attr:`stats`. Errors are raised by
         the first iteration, not by the call.
 
         Args:
             processor: Name of the processor.
-            max_age_s: Oldest age since the frame's capture that is accepted [s]; None: any.
+            max_age_s: Maximum age since the frame's capture [s]; None: any.
             timeout_s: How long to wait for each result [s].
 
         Raises:
-            NoAnswerError: If no result that is new enough comes in time.
-            UsageError: If ``processor`` can't be a name, ``max_age_s`` is negative, or from an inline callback.
-            ClosedError: If the drone was closed before.
+            NoAnswerError: If no sufficiently new result arrives in time.
+            UsageError: If ``processor`` is not a valid name, ``max_age_s`` is negative, or from an inline callback.
+            ClosedError: If the drone was already closed.
         """
     async def close(self) -> None:
         """Release the authority, then end the connection, all threads and a private proxy.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Does not land, except that a private proxy lands what flies before it ends. Idempotent. Threads that wait for
-        this drone get :class:`ClosedError`.
+        Does not land, but a private proxy lands a flying vehicle before it ends. Idempotent. Threads that wait for this
+        drone get :class:`ClosedError`.
         """
     async def stats(self) -> dict[str, ChannelStats]:
         """Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.
@@ -169,19 +169,19 @@ class Drone:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
-        callback. Otherwise the proxy is asked for the delay over all pilots, which waits up to 0.2 s.
+        callback. Otherwise it is the delay over all pilots, for which this asks the proxy and waits up to 0.2 s.
         """
     async def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
-        """Return the checklist before a flight: what is as it should be, what is not, why it matters, what to do.
+        """Run the checklist before a flight: what is good, what is not, why it matters, and what to do.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Asks the proxy for its parameters and, of each camera, for a picture. Nothing is flown, and no authority is
-        needed.
+        It asks the proxy for its parameters and, for each camera, for a picture. It flies nothing and needs no
+        authority.
 
         Args:
-            video_s: How long to wait for pictures, in all [s]; 0: cameras are not checked.
-            folder: Where recordings are to go: whether there is room for them; None: not checked.
+            video_s: Total time to wait for pictures [s]; 0: don't check cameras.
+            folder: Folder for recordings, to check its free space; None: don't check.
 
         Raises:
             ClosedError: If the drone is closed.
@@ -192,46 +192,46 @@ class Drone:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        While this waits, a take-off for which the vehicle is not ready yet is commanded again, twice a second. A call
-        that fails, a time-out and Ctrl-C included, ends the take-off: the vehicle hovers if it is in the air, else it
-        stays on the ground. Without ``wait`` a take-off that is refused is over.
+        While this waits, a take-off for which the vehicle is not ready yet is retried twice a second. A failed call,
+        including a time-out and Ctrl-C, cancels the take-off: the vehicle hovers if it is in the air, otherwise it
+        stays on the ground. Without ``wait``, a refused take-off is not retried.
 
         Args:
-            wait: Wait until the vehicle hovers or flies; else only send the command.
+            wait: Wait until the vehicle hovers or flies; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle does not hover in time; names its state and, if known, the reason.
-            RefusedError: If the proxy refuses to take off in the present state; a failsafe, a lost link, a new lease or
-                another command of this application ends it before it shows; the application lands the vehicle or stops
-                its motors meanwhile; or it lands or disarms before it hovers, whoever made it.
+            NoAnswerError: If the vehicle does not hover in time; the text has its state and, if known, the reason.
+            RefusedError: If the proxy refuses the take-off in the present state; if a failsafe, a lost link, a new
+                lease or another command of this application ends it before it shows; if the application lands the
+                vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever reason.
             UnsupportedError: If the vehicle can't take off.
-            LinkError: Without ``wait``, if the link is down; the vehicle does not take off later either.
-            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            LinkError: Without ``wait``, if the link is down; then the vehicle does not take off later, either.
+            AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; nothing is sent.
+            UsageError: If called with ``wait`` from an inline callback; then nothing is sent.
         """
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
-        """Land at the present position.
+        """Land at the current position.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        While this waits, a landing that was ended by a failsafe, a lost link or a lost lease is commanded again. Where
-        the vehicle's own link breaks the proxy goes on with the landing by itself, also if nobody waits.
+        While this waits, a landing ended by a failsafe, a lost link or a lost lease is commanded again. If the
+        vehicle's own link breaks, the proxy continues the landing, even if no one waits for it.
 
         Args:
-            wait: Wait until the vehicle has landed; else only send the command.
+            wait: Wait until the vehicle has landed; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle has not landed in time; names its state and, if known, the reason.
+            NoAnswerError: If the vehicle has not landed in time; the text has its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
-            LinkError: Without ``wait``, if the link is down; the landing is sent all the same if it is back within half
+            LinkError: Without ``wait``, if the link is down; the landing is still sent if the link is back within half
                 a second.
-            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; the landing is commanded all the same.
+            UsageError: If called with ``wait`` from an inline callback; the landing is still commanded.
         """
     async def go_to(
         self,
@@ -249,42 +249,44 @@ class Drone:
         tolerance_m: float = 0.2,
         tolerance_rad: float = 0.15,
     ) -> None:
-        """Fly straight to a place, and stay there.
+        """Fly straight to a position and hold it.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        World axes are those of ``Feedback.position_m``. Where the vehicle knows its place on the earth
-        (``Feedback.origin``), latitude and longitude may be given instead; they are converted when this is called.
-        ArduPilot and PX4 fly there natively, elsewhere the proxy does it by velocity. Unlike a velocity it does not
-        decay when the application falls silent: the vehicle stops there. The place is held until the next command, also
-        after a time-out; after Ctrl-C, or a cancelled task, the vehicle hovers. Nothing keeps it away from obstacles.
+        World axes are those of ``Feedback.position_m``. If the vehicle knows its place on the earth
+        (``Feedback.origin``), latitude and longitude may be given instead; they are converted during this call.
+        ArduPilot and PX4 fly there natively; for other vehicles the proxy sends velocities. Unlike a velocity, a
+        position does not decay when the application falls
+        silent: the vehicle stops there. It is held until the next command, even after a time-out; after Ctrl-C or a
+            cancelled task, the vehicle hovers. The flight does not avoid obstacles.
 
         Args:
             x: East [m].
             y: North [m].
             z: Up [m].
-            latitude_deg: [°], north positive; in place of x, y and z.
+            latitude_deg: [°], north positive; instead of x, y and z.
             longitude_deg: [°], east positive.
-            altitude_m: Above mean sea level [m]; None: the present height.
-            yaw: Counter-clockwise from x, turned to on the way [rad]; None: keep the present one.
-            speed: Greatest speed on the way [m/s]; None: as fast as ``limits.speed`` and ``limits.climb`` allow, which
-                hold in any case.
-            wait: Wait until the vehicle is there and nearly at rest; else only send the command.
+            altitude_m: Above mean sea level [m]; None: the current height.
+            yaw: Counter-clockwise from x, reached on the way [rad]; None: keep the current one.
+            speed: Maximum speed on the way [m/s]; None: as fast as ``limits.speed`` and ``limits.climb`` allow, which
+                always apply.
+            wait: Wait until the vehicle is there and nearly at rest; otherwise only send the command.
             timeout_s: How long to wait [s].
-            tolerance_m: How far from the place is near enough [m].
-            tolerance_rad: The same of ``yaw`` [rad].
+            tolerance_m: Distance from the position that counts as there [m].
+            tolerance_rad: The same for ``yaw`` [rad].
 
         Raises:
-            NoAnswerError: If the vehicle is not there in time; names its state and, if known, the reason.
-            RefusedError: If the proxy refuses it, as where the position is not known, the place is outside of the
-                safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command ends it.
-                Also if latitude and longitude are given and the vehicle does not report its place on the earth.
-            UnsupportedError: If neither the vehicle nor its proxy can fly to a place.
-            LinkError: Without ``wait``, if the link is down; the vehicle does not fly there later either.
-            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            NoAnswerError: If the vehicle is not there in time; the text has its state and, if known, the reason.
+            RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
+                outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
+                ends it. Also if latitude and longitude are given and the vehicle does not report its place on the
+                earth.
+            UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
+            LinkError: Without ``wait``, if the link is down; then the vehicle does not fly there later, either.
+            AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
-                nothing is sent.
+                then nothing is sent.
         """
     async def return_to_start(
         self, height_m: float | None = None, *, land: bool | None = None, wait: bool = True, timeout_s: float = 180.0
@@ -293,27 +295,27 @@ class Drone:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        It climbs straight up to a safe height if it is lower, kept below ``limits.altitude``, the ceiling of the room
-        and the upper wall of the safety box, flies straight over its start (:attr:`start_position`) as :meth:`go_to`
-        does, and lands. Any other command ends it, as do another pilot and a failsafe. Nothing keeps it away from
+        The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
+        room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
+        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. The flight does not avoid
         obstacles.
 
         Args:
-            height_m: Above the start, at least, on the way [m]; None: as the parameter ``return.height`` says.
-            land: Land there, else hover above it; None: as the parameter ``return.land`` says.
-            wait: Wait until it has landed, or hovers above its start; else only send the command.
+            height_m: Minimum height above the start on the way [m]; None: the parameter ``return.height``.
+            land: Land there, otherwise hover above it; None: the parameter ``return.land``.
+            wait: Wait until it has landed, or hovers above its start; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If it is not over in time; names the vehicle's state and, if known, the reason.
-            RefusedError: If the proxy refuses it, as where position or start are not known, the vehicle does not fly,
-                or a no-fly zone is in the way; or if a failsafe or another command ends it.
-            UnsupportedError: If neither the vehicle nor its proxy can fly to a place.
-            LinkError: Without ``wait``, if the link is down; the vehicle does not return later either.
-            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            NoAnswerError: If it has not ended in time; the text has the vehicle's state and, if known, the reason.
+            RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
+                flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
+            UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
+            LinkError: Without ``wait``, if the link is down; then the vehicle does not return later, either.
+            AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If an argument makes no sense, or if called with ``wait`` from an inline callback; nothing is
-                sent.
+            UsageError: If an argument makes no sense, or if called with ``wait`` from an inline callback; then nothing
+                is sent.
         """
     async def request_authority(
         self,
@@ -324,107 +326,106 @@ class Drone:
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> AuthorityStatus:
-        """Ask for the authority and wait for it.
+        """Request the authority and wait for it.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        A holder of lower priority is pre-empted at once, or with ``takeover="ask"`` asked first, and pre-empted when it
-        agrees or after the proxy's ``authority.ask_s``. With ``"ask"`` a holder of the same or higher priority is asked
-        too, and may decline. Once held the authority is kept: after a lost link it is requested again, and after a
-        pre-emption it comes back when the other application releases it.
+        A holder of lower priority is pre-empted at once. With ``takeover="ask"`` it is asked first, and pre-empted when
+        it agrees or after the proxy's ``authority.ask_s``; a holder of the same or higher priority is also asked, and
+        may decline. Once granted, the authority is kept: after a lost link it is requested again, and after a
+        pre-emption it returns when the other application releases it.
 
         Args:
             priority: 0 (highest) to 31 (lowest); None: as in the last request.
             wait_s: How long to wait in the queue [s].
-            for_s: How long the authority is wanted [s], up to a day; then others can get it. None: open.
-            takeover: ``"now"`` pre-empts a lower holder at once, ``"ask"`` asks the holder first.
+            for_s: How long to hold the authority [s], up to a day; then others can get it. None: unlimited.
+            takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
             stay: Stay in the queue after ``wait_s`` instead of raising.
 
         Returns:
-            The status: held, or with ``stay`` also queued, with the position and the expected wait.
+            The status: held or, with ``stay``, possibly queued, with the position and the expected wait.
 
         Raises:
-            AuthorityError: If it is not held after ``wait_s`` (the message names the holder), if the proxy refuses it,
-                or if this application only observes.
+            AuthorityError: If it is not granted within ``wait_s`` (the message names the holder), if the proxy refuses
+                it, or if this application only observes.
             NoAnswerError: If the proxy does not answer the request.
             UsageError: If ``priority``, ``for_s`` or ``takeover`` is out of range.
             ClosedError: If the drone was closed.
         """
     async def release_authority(self) -> None:
-        """Release the authority, or leave the queue, and wait until the proxy has confirmed it.
+        """Release the authority, or leave the queue, and wait for the proxy's confirmation.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Does nothing if the authority is neither held nor wanted.
+        Does nothing if the authority is neither held nor requested.
 
         Raises:
             NoAnswerError: If the proxy does not answer.
             ClosedError: If the drone was closed.
         """
     async def next_feedback(self, timeout_s: float = 1.0, *, max_hz: float | None = None) -> Feedback:
-        """Wait for feedback that was not read before, and return the newest.
+        """Wait for unread feedback, and return the newest.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             timeout_s: How long to wait [s].
-            max_hz: As for :meth:`feedback`; samples that other consumers ask for are returned, too.
+            max_hz: As for :meth:`feedback`; samples for other consumers are returned, too.
 
         Raises:
-            NoAnswerError: If none comes in time.
+            NoAnswerError: If none arrives in time.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback, or an option is out of range.
         """
     async def next_frame(self, camera: str | None = None, *, timeout_s: float = 1.0) -> Frame:
-        """Wait for a frame that this method has not returned before, and return the newest.
+        """Wait for a frame that this method has not returned yet, and return the newest.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        The first call subscribes to the camera, for good.
+        The first call subscribes to the camera permanently.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If none comes in time.
+            NoAnswerError: If none arrives in time.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
     async def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
-        """Wait until the newest feedback is as wanted.
+        """Wait until the newest feedback meets a condition.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
-            state: A flight state or its name, several of them, or a predicate on feedback, which is called on this
-                thread.
+            state: A flight state or its name, several of them, or a predicate on feedback, which runs on this thread.
             timeout_s: How long to wait [s].
 
         Returns:
-            The feedback that met it.
+            The feedback that met the condition.
 
         Raises:
-            NoAnswerError: If it is not met in time; names the present state.
-            UnknownNameError: If there is no flight state of that name.
+            NoAnswerError: If it is not met in time; the text has the current state.
+            UnknownNameError: If there is no flight state of this name.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
     async def overview(self, timeout_s: float = 2.0) -> Overview:
-        """Return the newest overview of all vehicles that the proxy's process serves, a row each.
+        """Return the newest overview of all vehicles in the proxy's process, with one row each.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        It is sent once a second, and much smaller than feedback: for who watches many vehicles. The first call
-        subscribes to it, for good, and waits for one.
+        It is sent once a second and is much smaller than feedback, for applications that watch many vehicles. The first
+        call subscribes permanently and waits for one.
 
         Args:
             timeout_s: How long to wait for the first one [s].
 
         Raises:
-            NoAnswerError: If none comes in time, as from a proxy of an earlier version.
+            NoAnswerError: If none arrives in time, for example from an older proxy.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback before there is one.
         """
@@ -436,7 +437,7 @@ class Drone:
         """Address of the vehicle; empty before the first connection."""
     @property
     def app_id(self) -> int:
-        """Number of this application in this run of the proxy."""
+        """Number of this application in the proxy's current run."""
     @property
     def capabilities(self) -> Capabilities:
         """Actions and cameras of the vehicle; ``vehicle`` is ``unknown`` before the first connection."""
@@ -447,33 +448,33 @@ class Drone:
     def link(self) -> LinkStatus:
         """State of both hops, application to proxy and proxy to vehicle.
 
-        ``reason`` is that of the last change or, while the proxy is lost, why the last attempt to reconnect failed.
+        ``reason`` belongs to the last change or, while the proxy is lost, to the last failed attempt to reconnect.
         """
     @property
     def closed(self) -> bool:
         """Whether :meth:`close` was called."""
     @property
     def now_ns(self) -> int:
-        """Estimate of the time on the proxy's clock [ns]; in a stepped replay, the time of the recorded flight."""
+        """Estimate of the time on the proxy's clock [ns]; in a stepped replay, the time in the recorded flight."""
     @property
     def clock_offset_ns(self) -> int:
         """Estimate of the proxy's clock minus this process's clock [ns]."""
     @property
     def clock_uncertainty_ns(self) -> int:
-        """Largest error of :attr:`clock_offset_ns` [ns], and so of each age and delay; 0 where both share one clock."""
+        """Maximum error of :attr:`clock_offset_ns` [ns], and thus of ages and delays; 0 with a shared clock."""
     @property
     def start_position(self) -> Vector | None:
-        """Where the vehicle took off last, east, north, up in world axes [m]; None where that is not known."""
+        """Where the vehicle last took off, east, north, up in world axes [m]; None if unknown."""
     def age_s(self, sample: Feedback | Frame) -> float:
         """Return the time since the sample's capture [s], within ``clock_uncertainty_ns``."""
     def recent_events(self) -> list[Event]:
         """Return the last 256 events, oldest first."""
     def hover(self) -> bool:
-        """Stop and hold the position. Returns and raises as every command; see :class:`Drone`."""
+        """Stop and hold the position. Returns and raises as all commands do; see :class:`Drone`."""
     def idle(self) -> bool:
-        """Ask for nothing: keep the authority and leave the vehicle as it is."""
+        """Keep the authority and leave the vehicle as it is."""
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
-        """Fly with a velocity in the levelled body axes, which turn with the yaw but not with roll and pitch.
+        """Fly at a velocity in the levelled body axes, which turn with the yaw but not with roll and pitch.
 
         Args:
             forward: Along x, forward [m/s].
@@ -482,7 +483,7 @@ class Drone:
             yaw_rate: Counter-clockwise seen from above [rad/s].
 
         Returns:
-            Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
+            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
         """
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Hold an attitude with a climb rate.
@@ -494,35 +495,35 @@ class Drone:
             yaw_rate: Counter-clockwise seen from above [rad/s].
 
         Returns:
-            Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
+            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
         """
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
 
-        Needs no authority, only ``access="pilot"``. It is sent at once and repeated until the vehicle shows it
-        (``FlightState.EMERGENCY``), or for 8 s: then it is given up, with an event (``vehicle_message``, reason
-        ``stop_given_up``). Nothing else of this connection is sent meanwhile: :meth:`velocity`, :meth:`hover` and the
-        like return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over
-        several connections has to silence the others itself. A stop that could not be sent for 2 s is not sent later.
+        Needs no authority, only ``access="pilot"``. The stop is sent at once and repeated until the vehicle shows it
+        (``FlightState.EMERGENCY``), or for 8 s; then it is abandoned with an event (``vehicle_message``, reason
+        ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
+        return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
+        connections must silence the others itself. A stop that could not be sent for 2 s is not sent later.
 
         Returns:
-            False if it can't be sent now, because the link is down.
+            False if the link is down, so that it can't be sent now.
 
         Raises:
             AuthorityError: If this application only observes.
-            UnsupportedError: If the vehicle can't stop its motors, or takes no commands.
+            UnsupportedError: If the vehicle can't stop its motors, or has no commands.
             ClosedError: If the drone was closed.
         """
     def reset_emergency(self) -> bool:
-        """Leave the emergency state, on the ground.
+        """Leave the emergency state while on the ground.
 
-        One that is asked for while a stop of this application has not shown is sent once it has, within 2 s.
+        If a stop of this application has not shown yet, the reset is sent once it has, within 2 s.
         """
     def command(self, action: AnyAction) -> bool:
         """Make ``action`` the newest set-point.
 
         Returns:
-            Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
+            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
         """
     def send_external_pose(
         self,
@@ -535,18 +536,18 @@ class Drone:
     ) -> bool:
         """Send the vehicle its own pose as measured from outside, for an autopilot that flies by it instead of GPS.
 
-        May be called from any thread, does not wait, and needs no authority. A vehicle that takes no poses answers with
-        an event (``command_refused``).
+        Thread-safe, does not wait, and needs no authority. A vehicle that does not accept poses answers with an event
+        (``command_refused``).
 
         Args:
             position: x east, y north, z up [m].
             quaternion: x, y, z, w of the rotation from body axes (x forward, y left, z up) to world axes.
-            at_ns: When it was measured, on the proxy's clock [ns]; None: now.
+            at_ns: Time of the measurement, on the proxy's clock [ns]; None: now.
             position_std_m: Standard deviation of the position [m], if known.
             attitude_std_rad: Standard deviation of the attitude [rad], if known.
 
         Returns:
-            Whether it was handed to the transport.
+            True if it was handed to the transport.
 
         Raises:
             AuthorityError: If this application only observes.
@@ -554,56 +555,56 @@ class Drone:
                 differs from 1 by more than 0.001, or ``at_ns`` is out of range.
         """
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
-        """Emit an event of this application's own (number 0), which only its own callbacks get.
+        """Emit an event (number 0) to this application's own callbacks only.
 
         Args:
             kind: Kind of the event.
-            text: What happened, for people.
-            severity: How serious it is.
+            text: Text for people.
+            severity: Severity of the event.
             **data: Details, by name.
         """
     def annotate(self, frame: Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         """Publish shapes drawn over a frame, for the cockpit and for recordings.
 
         Args:
-            frame: The frame that they belong to.
+            frame: The frame that the shapes belong to.
             shapes: Shapes in this frame's pixels; coordinates may be NumPy's.
-            source: Name of what drew them; None: this application. The newest drawing of each source in each camera
-                counts.
+            source: Name of the part that drew them; None: this application. Only the newest drawing of each source in
+                each camera counts.
 
         Returns:
-            Whether it was handed to the transport.
+            True if they were handed to the transport.
 
         Raises:
-            UsageError: If something is no shape, there are too many, coordinates are not finite, or colours are not
+            UsageError: If something is not a shape, there are too many, coordinates are not finite, or colours are not
                 within 0 to 255.
         """
     def feedback(self, *, max_age_s: float | None = None, max_hz: float | None = None) -> Feedback:
         """Return the newest feedback.
 
-        An observer is sent the least that gives each of its consumers what it asks for, and every sample whole while
-        nobody asks for less; the first call of this method counts as a consumer, for good. A pilot is always sent all.
+        An observer gets the least data that satisfy all its consumers, and complete samples while no consumer limits
+        its request; the first call of this method adds a permanent consumer. A pilot always gets everything.
 
         Args:
-            max_age_s: Oldest age since capture that is accepted [s]; None: any.
-            max_hz: So many new samples a second are enough, 0.001 to 1000; None: all are wanted.
+            max_age_s: Maximum age since capture [s]; None: any.
+            max_hz: Sufficient rate of new samples, 0.001 to 1000 Hz; None: all.
 
         Raises:
-            NoAnswerError: If no feedback has come yet, or the newest is older than ``max_age_s``.
+            NoAnswerError: If there is no feedback yet, or the newest is older than ``max_age_s``.
             ClosedError: If the drone was closed.
             UsageError: If ``max_hz`` is out of range.
         """
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> Frame | None:
         """Return the newest frame without waiting.
 
-        The first call subscribes to the camera, for good.
+        The first call subscribes to the camera permanently.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
-            max_age_s: Oldest age since capture that is accepted [s]; None: any.
+            max_age_s: Maximum age since capture [s]; None: any.
 
         Returns:
-            The frame; None if none has come yet, it is too old, or it can't be decoded.
+            The frame; None if none has arrived yet, it is too old, or it can't be decoded.
 
         Raises:
             UnknownNameError: If the vehicle has no camera of this name.
@@ -613,17 +614,17 @@ class Drone:
     def result(self, processor: str, *, max_age_s: float | None = None) -> Result | None:
         """Return a processor's newest result without waiting.
 
-        The first call subscribes to the processor, for good.
+        The first call subscribes to the processor permanently.
 
         Args:
             processor: Name of the processor.
-            max_age_s: Oldest age since the frame's capture that is accepted [s]; None: any.
+            max_age_s: Maximum age since the frame's capture [s]; None: any.
 
         Returns:
-            The result; None if none has come yet or it is too old.
+            The result; None if none has arrived yet or it is too old.
 
         Raises:
-            UsageError: If ``processor`` can't be a name or ``max_age_s`` is negative.
+            UsageError: If ``processor`` is not a valid name or ``max_age_s`` is negative.
             ClosedError: If the drone was closed.
         """
     def on_frame(
@@ -638,8 +639,8 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called on a thread of its own with the newest ``depth`` frames that it has not seen.
-            camera: Name of the camera; None: the vehicle's first, also once its proxy is started again with others.
+            function: Called in its own thread with the newest ``depth`` unseen frames.
+            camera: Name of the camera; None: the vehicle's first, even if the proxy restarts with other cameras.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
             **how: As for :meth:`frames`.
@@ -664,20 +665,20 @@ class Drone:
         depth: int = 30,
         inline: bool = False,
     ) -> client.Listener[EncodedFrame]:
-        """Call ``function`` with a camera's pictures as they are encoded, to store them or to send them on.
+        """Call ``function`` with a camera's encoded pictures, to store or forward them.
 
         Each is an access unit of H.264 in Annex B form that can be decoded after those before it; the first one is a
-        key picture. After a missing one nothing is given up to the next key picture, which the proxy is asked for.
-        Where ``kbit_s``, ``max_fps`` and ``scale`` are left out, pictures come as the vehicle encoded them; from a
-        vehicle that sends no H.264, encoded by the proxy at the rate that the path carries.
+        key picture. After a missing picture, the next one is a key picture, which the proxy is asked for. Without
+        ``kbit_s``, ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it sends no H.264,
+        encoded by the proxy at the rate that the path carries.
 
         Args:
-            function: Called on a thread of its own.
+            function: Called in its own thread.
             camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Encoded by the proxy at this rate, once for all who ask for the same [kbit/s].
-            max_fps: Most pictures a second; None: all.
+            kbit_s: Rate of an encoding by the proxy, shared by all who request the same [kbit/s].
+            max_fps: Maximum pictures per second; None: all.
             scale: Factor for width and height, above 0 and up to 1.
-            depth: How many pictures may wait, at least 1; if more come, some are missing.
+            depth: How many pictures may wait, at least 1; beyond that, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Returns:
@@ -692,14 +693,14 @@ class Drone:
     def on_takeover(
         self, function: Callable[[TakeoverRequest], TakeoverAnswer | Awaitable[TakeoverAnswer]]
     ) -> Listener:
-        """Call ``function`` when another application asks for the authority that this one holds.
+        """Call ``function`` when another application requests the authority that this one holds.
 
         ``function``, plain or a coroutine function, runs on the event loop.
 
         Args:
-            function: Called on the event loop. It returns True to hand the authority over, False or a reason (a
-                text) to decline, and None to leave the decision to the proxy. In any case a strictly higher priority
-                wins after the proxy's ``authority.ask_s``.
+            function: Called on the event loop. It returns True to hand the authority over, False or a reason (a text)
+                to decline, and None to leave the decision to the proxy. In any case, a strictly higher priority wins
+                after the proxy's ``authority.ask_s``.
 
         Returns:
             The listener; ``cancel()`` ends it.
@@ -711,7 +712,7 @@ class Drone:
     def on_overview(
         self, function: Callable[[Overview], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with each overview of all vehicles that the proxy's process serves; see :meth:`overview`.
+        """Call ``function`` with each overview of all vehicles in the proxy's process; see :meth:`overview`.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
@@ -730,14 +731,14 @@ class Drone:
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        Like every ``on_...`` method it returns a :class:`Listener`, whose ``cancel()`` ends it, and raises
-        :class:`UsageError` if ``function`` can't be called and :class:`ClosedError` if the drone was closed.
+        Like every ``on_...`` method it returns a :class:`Listener`, whose ``cancel()`` ends the calls. It raises
+        :class:`UsageError` if ``function`` is not callable and :class:`ClosedError` if the drone was closed.
 
         Args:
-            function: Called on the event loop; feedback that newer feedback overtakes is dropped and counted.
+            function: Called on the event loop; feedback overtaken by newer feedback is dropped and counted.
             inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
-            max_hz: At most so many samples a second, 0.001 to 1000; None: all. An observer is sent no more, unless
-                another consumer asks for it.
+            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer gets no more, unless
+                another consumer requests more.
         """
     def on_event(self, function: Callable[[Event], object | Awaitable[object]], *, inline: bool = False) -> Listener:
         """Call ``function`` with each event, including the client's own (number 0).
@@ -746,7 +747,7 @@ class Drone:
 
         Args:
             function: Called on the event loop; up to 256 events wait for it.
-            inline: Call it on the receiving thread instead, or for the client's own events on the thread that emits
+            inline: Call it on the receiving thread instead or, for the client's own events, on the thread that emits
                 them.
         """
     def on_link(self, function: Callable[[LinkStatus], object | Awaitable[object]]) -> Listener:
@@ -757,27 +758,27 @@ class Drone:
     def on_command(
         self, function: Callable[[Applied], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with what the proxy made of each command of any application.
+        """Call ``function`` with the proxy's echo of each command of any application.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         Args:
-            function: Called on the event loop; up to 256 wait for it.
+            function: Called on the event loop; up to 256 echoes wait for it.
             inline: Call it on the receiving thread instead.
         """
     def on_annotation(
         self, function: Callable[[Annotation], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with what any application draws on a frame.
+        """Call ``function`` with each application's drawings on frames.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         Args:
-            function: Called on the event loop; up to 256 wait for it.
+            function: Called on the event loop; up to 256 drawings wait for it.
             inline: Call it on the receiving thread instead.
         """
     def on_log(self, function: Callable[[LogEntry], object | Awaitable[object]], *, inline: bool = False) -> Listener:
-        """Call ``function`` with what any application logs, this one included (see ``drone.log``).
+        """Call ``function`` with each application's log entries, this one's included (see ``drone.log``).
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
@@ -801,8 +802,8 @@ class Drone:
         Args:
             function: Called on the event loop.
             processor: Name of the processor; None: all processors.
-            max_age_s: Results older than this when their turn comes are left out, and counted in ``expired`` of the
-                listener [s]; None: none are.
+            max_age_s: Results older than this when their turn comes are skipped, and counted in the listener's
+                ``expired`` [s]; None: none are.
             depth: How many results may wait, at least 1; None: 1 for one processor, 256 for all.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
@@ -827,10 +828,10 @@ class Listener:
         """Number of calls that raised."""
     @property
     def delivered(self) -> int:
-        """How often the function was called."""
+        """Number of calls of the function."""
     @property
     def dropped(self) -> int:
-        """Samples that newer ones pushed out before the function was ready for them."""
+        """Samples replaced by newer ones before the function was ready for them."""
 
 class Swarm:
     """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
@@ -869,13 +870,13 @@ class Swarm:
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
 
-        Ends with the swarm. After an iteration that takes longer than a period the deadlines restart from there. When
-        the loop ends, by its time, a ``break``, an exception or Ctrl-C, drones that fly by a velocity or an attitude of
-        it hover at once: nobody gives them a newer one.
+        Ends with the swarm. After an iteration longer than a period, the deadlines restart from there. When the loop
+        ends, by its time, a ``break``, an exception or Ctrl-C, drones that fly by its velocities or attitudes hover at
+        once, because nothing would give them newer ones.
 
         Args:
-            rate_hz: Ticks a second, 0.1 to 200.
-            seconds: For how long [s]; None: until the loop is left.
+            rate_hz: Ticks per second, 0.1 to 200.
+            seconds: Duration [s]; None: until the loop ends.
 
         Raises:
             UsageError: If ``rate_hz`` is out of range, at the first iteration.
@@ -899,7 +900,7 @@ class Swarm:
             ClosedError: If the swarm was closed.
         """
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
-        """Land all active drones at their present positions, at the same time; see :meth:`Drone.land`.
+        """Land all active drones at their current positions, at the same time; see :meth:`Drone.land`.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -920,23 +921,23 @@ class Swarm:
         timeout_s: float = 60.0,
         tolerance_m: float = 0.2,
     ) -> None:
-        """Fly each drone straight to its own place, all at the same time; see :meth:`Drone.go_to`.
+        """Fly each drone straight to its own position, all at the same time; see :meth:`Drone.go_to`.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Nothing keeps the drones apart on the way: :class:`skyloop.control.formation_flight.Formation` plans ways that
-        do. Drones that are set aside are left out.
+        Nothing keeps the drones apart on the way: use :class:`skyloop.control.formation_flight.Formation` to plan safe
+        paths. Drones that are set aside are left out.
 
         Args:
-            places: By name of the drone: x, y, z in its world axes [m], and if wanted the yaw [rad].
-            speed: Greatest speed on the way [m/s]; None: as fast as the limits allow.
-            wait: Wait until each is there; else only send the commands.
+            places: By name of the drone: x, y, z in its world axes [m], and optionally the yaw [rad].
+            speed: Maximum speed on the way [m/s]; None: as fast as the limits allow.
+            wait: Wait until each is there; otherwise only send the commands.
             timeout_s: How long to wait [s].
-            tolerance_m: How far from its place is near enough [m].
+            tolerance_m: Distance from the position that counts as there [m].
 
         Raises:
-            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent then.
-            UsageError: If a place can't be flown to; nothing is sent then.
+            UnknownNameError: If no drone of the swarm has one of the names; then nothing is sent.
+            UsageError: If a position is invalid; then nothing is sent.
             SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -950,13 +951,13 @@ class Swarm:
         Nothing keeps the drones apart on the way.
 
         Args:
-            height_m: Above the start, at least, on the way [m]; None: as each drone's ``return.height`` says.
-            land: Land there, else hover above it; None: as each drone's ``return.land`` says.
-            wait: Wait until each has landed, or hovers above its start; else only send the commands.
+            height_m: Minimum height above the start on the way [m]; None: each drone's ``return.height``.
+            land: Land there, otherwise hover above it; None: each drone's ``return.land``.
+            wait: Wait until each has landed, or hovers above its start; otherwise only send the commands.
             timeout_s: How long to wait [s].
 
         Raises:
-            UsageError: If an argument makes no sense; nothing is sent then.
+            UsageError: If an argument makes no sense; then nothing is sent.
             SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -965,17 +966,17 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        One that others fly is left to them: only its own ``drones[name].hover()`` takes it back.
+        Drones that others fly are left to them: only a drone's own ``drones[name].hover()`` takes it back.
         """
     async def idle(self) -> dict[str, bool]:
-        """Ask for nothing: keep the authority and leave the vehicles as they are.
+        """Keep the authority and leave the vehicles as they are.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def velocity(
         self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
-        """Fly with the same velocity, each drone in its own levelled body axes.
+        """Fly all active drones at the same velocity, each in its own levelled body axes.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -999,7 +1000,7 @@ class Swarm:
             yaw_rate: Counter-clockwise seen from above [rad/s].
         """
     async def reset_emergency(self) -> dict[str, bool]:
-        """Leave the emergency state, on the ground, with all active drones.
+        """Leave the emergency state while on the ground, with all active drones.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
@@ -1009,22 +1010,22 @@ class Swarm:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone of its name, all sent together.
+        """Make each action the newest set-point of the drone with its name, all sent together.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Drones that are set aside are left out. A hover takes no drone from others, see :meth:`hover`. :attr:`spread` is
-        how far apart the first and the last command left.
+        the time between the first and the last command.
 
         Args:
-            actions: By name of the drone.
+            actions: Actions by name of the drone.
 
         Returns:
-            By name, whether the command was handed to the transport now.
+            By name, True if the command was handed to the transport.
 
         Raises:
-            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent then.
-            UsageError: If an action can't be commanded or has numbers that are not finite; nothing is sent then.
+            UnknownNameError: If no drone of the swarm has one of the names; then nothing is sent.
+            UsageError: If an action can't be commanded or has numbers that are not finite; then nothing is sent.
             SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -1037,7 +1038,7 @@ class Swarm:
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> dict[str, AuthorityStatus]:
-        """Ask for the authority over all active drones.
+        """Request the authority over all active drones.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -1062,29 +1063,29 @@ class Swarm:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
-            max_age_s: Oldest age since capture that is accepted [s]; a drone whose feedback is older has failed.
+            max_age_s: Maximum age since capture [s]; a drone with older feedback has failed.
 
         Raises:
             SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
     async def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
-        """Wait until all active drones are as wanted *at the same time*.
+        """Wait until all active drones meet a condition *at the same time*.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        A drone whose link is lost is not as wanted, whatever its last feedback. Drones that are not as wanted in time
-        have failed.
+        A drone with a lost link does not meet it, whatever its last feedback. Drones that do not meet it in time have
+        failed.
 
         Args:
             wanted: A flight state or its name, several of them, or a predicate on feedback.
             timeout_s: How long to wait [s].
 
         Returns:
-            The feedback of those that are as wanted, by name.
+            The feedback of the drones that meet it, by name.
 
         Raises:
-            UnknownNameError: If there is no flight state of that name.
+            UnknownNameError: If there is no flight state of this name.
             SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -1093,12 +1094,12 @@ class Swarm:
         """Names of all drones, including those set aside."""
     @property
     def errors(self) -> dict[str, Exception]:
-        """Why drones do not take part, by name: those set aside, and those that were never connected."""
+        """Reasons of drones that do not take part, by name: those set aside, and those never connected."""
     def readmit(self, *names: str) -> None:
-        """Make drones that were set aside active again.
+        """Reactivate drones that were set aside.
 
         Args:
-            *names: Which; none: all.
+            *names: Names of the drones; none: all.
 
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names.
@@ -1111,7 +1112,7 @@ class Swarm:
         """
     @property
     def spread(self) -> Distribution | None:
-        """How far apart the first and the last command of one :meth:`send` left this process [s]; None before any."""
+        """Time between the first and the last command of a :meth:`send` [s]; None before the first."""
     def __len__(self) -> int: ...
     def __contains__(self, name: object) -> bool: ...
 
@@ -1131,34 +1132,34 @@ def connect(
 
     The result connects when it is awaited, or entered with ``async with``. ``speed=max`` is refused.
 
-    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. A vehicle that was
-    started just now is waited for until it can take off, and the log (``skyloop``) says so; after ``timeout_s`` the
-    call returns all the same, and :meth:`Drone.takeoff` goes on waiting.
+    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. For a vehicle that
+    has just started, it waits until it can take off and says so in the log (``skyloop``); after ``timeout_s`` it
+    returns anyway, and :meth:`Drone.takeoff` continues the wait.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
-            For an address a private proxy is started, which ends with the drone and with this process. A name is
-            looked up on this host first and then, if ``network`` allows, on the network.
+            For an address, a private proxy starts, which ends with the drone and with this process. A name is looked
+            up on this host first and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
         timeout_s: Time for the proxy to answer [s]; None or 0: 5 s for a name, 20 s for an address.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
-        on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. One that
-            others fly stays as it is; a warning in the log says so.
-        authority: How a pilot asks for the authority: priority, waiting, asking its holder first. None:
+        on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that
+            others fly is left alone, with a warning in the log.
+        authority: How a pilot requests the authority: priority, waiting, asking its holder first. None:
             ``Authority()``.
-        network: True, an address, or a :class:`Network` with keys; False stays on this host. None: as the variable
-            ``SKYLOOP_NETWORK`` says, without which nothing leaves this host.
+        network: True, an address, or a :class:`Network` with keys; False stays on this host. None: the value of the
+            variable ``SKYLOOP_NETWORK``; without one, this host only.
 
     Raises:
-        UnknownNameError: If no proxy of this name runs; carries suggestions.
+        UnknownNameError: If no proxy of this name is running; carries suggestions.
         NoAnswerError: If the proxy does not answer in time, or sends no feedback.
-        AuthorityError: If the authority can't be had; names its holder.
+        AuthorityError: If the authority is not granted; the text names its holder.
         RefusedError: If the proxy refuses the connection.
         LinkError: If the proxy or the private proxy can't be reached, or ends.
         UsageError: If an argument is out of range, or the address makes no sense.
-        MissingExtraError: If the network is asked for and the extra ``network`` is not installed.
+        MissingExtraError: If the network is requested and the extra ``network`` is not installed.
     """
 
 def swarm(
@@ -1169,11 +1170,11 @@ def swarm(
     The result connects when it is awaited, or entered with ``async with``. ``speed=max`` is refused.
 
     Args:
-        *targets: Names of running proxies, patterns such as ``"drone*"`` for all that run now, addresses of vehicles
+        *targets: Names of running proxies, patterns such as ``"drone*"`` for running proxies, addresses of vehicles
             such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
             either, ``{"left": "sim://?seed=1"}``.
         on_error: What happens to the others when one fails; see :class:`Swarm`.
-        missing: A drone that can't be connected to fails the call (``"raise"``) or is left out (``"skip"``), as long
+        missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``), as long
             as one is left.
         **options: As for :func:`skyloop.connect`, for each drone.
 
@@ -1181,7 +1182,7 @@ def swarm(
         The swarm, a context manager.
 
     Raises:
-        SwarmError: With the reason of each drone that can't be connected to, after leaving the others.
+        SwarmError: If drones can't be connected, with the reason for each; the others are closed.
         UnknownNameError: If a pattern matches no running proxy.
         UsageError: If a drone is named twice, none is named, or ``on_error`` or ``missing`` is unknown.
     """

@@ -1,4 +1,4 @@
-"""Bring samples from the receiving thread to consumers: channels, callbacks, mailboxes in which the newest win."""
+"""Deliver samples from the receiving thread to consumers: channels, callbacks, and newest-wins mailboxes."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ T = TypeVar("T")
 C = TypeVar("C", bound="Channel[Any]")
 T_contra = TypeVar("T_contra", contravariant=True)
 
-#: Called with the name of a listener and the exception that its function raised.
+#: Called with a listener's name and the exception that its function raised.
 Report = Callable[[str, Exception | SystemExit], None]
 
 
 class Emit(Protocol):
-    """Emits an event of the client's own; ``data`` are its details."""
+    """Emits one of the client's own events; ``data`` are its details."""
 
     def __call__(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None: ...
 
 
-JOIN_S: Final = 2.0  #: how long cancelling waits for a call that is under way
+JOIN_S: Final = 2.0  #: how long cancelling waits for a running call
 _REPORT_EVERY_S: Final = 1.0
 _log = logging.getLogger("skyloop")
 
@@ -42,27 +42,27 @@ class Channel(Generic[T]):
     """One kind of sample, delivered to every consumer on the thread on which it arrives."""
 
     def __init__(self, subscribe: Callable[[bool], None] | None = None) -> None:
-        """Make a channel without consumers.
+        """Create a channel without consumers.
 
-        ``subscribe`` is told whether samples are wanted, whenever that changes, under the channel's lock.
+        ``subscribe`` is called with whether samples are needed, whenever that changes, under the channel's lock.
         """
-        self.subscribed = False  #: whether samples are wanted now: there is a consumer, or it is kept
-        self.kept = False  #: subscribed for good, by :meth:`keep`
+        self.subscribed = False  #: whether samples are needed: there is a consumer, or the channel is kept
+        self.kept = False  #: subscribed permanently, by :meth:`keep`
         self._consumers: tuple[Callable[[T], None], ...] = ()
         self._drops: dict[Callable[[T], None], Callable[[], int]] = {}
-        self._dropped_before = 0  # by consumers that were removed
+        self._dropped_before = 0  # by removed consumers
         self._lock = threading.Lock()
         self._subscribe = subscribe
 
     def add(self, consumer: Callable[[T], None], dropped: Callable[[], int]) -> None:
-        """Deliver to ``consumer`` too, quickly, on the publishing thread; ``dropped`` returns how many it missed."""
+        """Add a consumer, called on the publishing thread; ``dropped`` returns how many samples it missed."""
         with self._lock:
             self._drops[consumer] = dropped
             self._consumers = (*self._consumers, consumer)
             self._update()
 
     def remove(self, consumer: Callable[[T], None]) -> None:
-        """Stop delivering to ``consumer``. Does nothing if it is not there."""
+        """Remove a consumer. Does nothing if it is unknown."""
         with self._lock:
             if consumer not in self._drops:
                 return
@@ -72,7 +72,7 @@ class Channel(Generic[T]):
 
     @contextmanager
     def into(self, mailbox: Holder[T]) -> Iterator[None]:
-        """Deliver into ``mailbox`` within the block."""
+        """Deliver into ``mailbox`` during the block."""
         put = mailbox.put
         self.add(put, lambda: mailbox.dropped)
         try:
@@ -81,7 +81,7 @@ class Channel(Generic[T]):
             self.remove(put)
 
     def keep(self) -> None:
-        """Stay subscribed whether or not there is a consumer."""
+        """Stay subscribed even without consumers."""
         if not self.kept:
             with self._lock:
                 self.kept = True
@@ -94,12 +94,12 @@ class Channel(Generic[T]):
 
     @property
     def dropped(self) -> int:
-        """Samples that consumers have missed, including consumers that were removed."""
+        """Samples that consumers missed, including removed ones."""
         with self._lock:
             return self._dropped_before + sum(dropped() for dropped in self._drops.values())
 
     def publish(self, sample: T) -> None:
-        """Deliver ``sample`` to every consumer on this thread. No lock is held meanwhile."""
+        """Deliver ``sample`` to every consumer on this thread. No lock is held during the calls."""
         for consumer in self._consumers:
             consumer(sample)
 
@@ -113,14 +113,14 @@ class Channel(Generic[T]):
 
 
 class FollowingChannel(Channel[T], Generic[T, C]):
-    """The channel that is found now, and another one once the proxy was started again with other cameras.
+    """A channel that changes with the proxy's cameras: after a restart with other cameras, it finds another one.
 
-    Who asked for no camera by name follows the vehicle's first. Consumers are added to the channel that is found, which
-    delivers to them as to any others.
+    Callers that name no camera follow the vehicle's first. Consumers are added to the channel found, which delivers to
+    them like to any others.
     """
 
     def __init__(self, find: Callable[[], C], changes: Channel[Any]) -> None:
-        """Begin with what ``find`` returns, and find again with each sample of ``changes``, unless it raises."""
+        """Start with the result of ``find``; call it again with each sample of ``changes``, unless it raises."""
         super().__init__()
         self.current = find()
         self._find = find
@@ -128,7 +128,7 @@ class FollowingChannel(Channel[T], Generic[T, C]):
         self._looks = self._look
 
     def add(self, consumer: Callable[[T], None], dropped: Callable[[], int]) -> None:
-        """Deliver to ``consumer`` too; see :meth:`Channel.add`."""
+        """Add a consumer; see :meth:`Channel.add`."""
         with self._lock:
             if not self._drops:
                 self._changes.add(self._looks, lambda: 0)
@@ -136,7 +136,7 @@ class FollowingChannel(Channel[T], Generic[T, C]):
             self.current.add(consumer, dropped)
 
     def remove(self, consumer: Callable[[T], None]) -> None:
-        """Stop delivering to ``consumer``. Does nothing if it is not there."""
+        """Remove a consumer. Does nothing if it is unknown."""
         with self._lock:
             if self._drops.pop(consumer, None) is not None:
                 self.current.remove(consumer)
@@ -156,12 +156,12 @@ def _since(dropped: Callable[[], int], before: int) -> int:
 
 
 class Listener(Generic[T]):
-    """A callback of an application, called with samples until :meth:`cancel` or the end of its block.
+    """An application's callback, called with samples until :meth:`cancel` or the end of its block.
 
-    The function has a thread of its own and a mailbox of the newest ``depth`` samples: however slow it is, it gets new
-    samples and delays nobody else. With ``inline=True`` it is called on the receiving thread, before the next sample is
-    received, which is fastest; it must be quick and must not wait. An exception that it raises is counted and, at most
-    once a second, logged and emitted as an event; the function is called again with the next sample.
+    The function has its own thread and a mailbox of the newest ``depth`` samples: however slow it is, it gets new
+    samples and delays no one else. With ``inline=True`` it is called on the receiving thread, before the next sample is
+    received, which is fastest; it must be quick and must not wait. Its exceptions are counted and, at most once a
+    second, logged and emitted as an event; the function is called again with the next sample.
     """
 
     def __init__(
@@ -179,15 +179,15 @@ class Listener(Generic[T]):
 
         Args:
             function: Called with each sample.
-            channel: Where the samples come from.
-            report: Called with this listener's name and an exception that ``function`` raised.
-            name: For the thread and for error messages.
+            channel: The source of the samples.
+            report: Called with this listener's name and each exception of ``function``.
+            name: Name for the thread and for error messages.
             depth: How many samples may wait.
             inline: Call on the publishing thread instead of an own one.
             on_cancel: Called with this listener when it is cancelled.
         """
         self.name = name
-        self.errors = 0  #: calls that raised
+        self.errors = 0  #: number of calls that raised
         self._function = function
         self._channel = channel
         self._report = report
@@ -203,19 +203,19 @@ class Listener(Generic[T]):
 
     @property
     def delivered(self) -> int:
-        """How often the function was called."""
+        """Number of calls of the function."""
         return self._calls
 
     @property
     def dropped(self) -> int:
-        """Samples that newer ones pushed out before the function was ready for them."""
+        """Samples replaced by newer ones before the function was ready for them."""
         return self._mailbox.dropped
 
     def cancel(self, *, wait: bool = True) -> None:
         """Stop calling the function. Idempotent.
 
         Args:
-            wait: Wait for a call that is under way, at most 2 s; not if called from the function itself.
+            wait: Wait for a running call, at most 2 s; not if called from the function itself.
         """
         self._channel.remove(self._consumer)
         self._mailbox.close()
@@ -225,7 +225,7 @@ class Listener(Generic[T]):
             self.join(JOIN_S)
 
     def join(self, within_s: float) -> None:
-        """Wait for a call that is under way; not if called from the function itself."""
+        """Wait for a running call; not if called from the function itself."""
         thread = self._thread
         if thread is not None and thread is not threading.current_thread():
             thread.join(within_s)
@@ -249,9 +249,9 @@ class Listener(Generic[T]):
         self._calls += 1
         try:
             self._function(sample)
-        except ClosedError:  # its drone was closed, or the flight is at its end: nothing is wrong with the function
+        except ClosedError:  # the drone was closed, or its flight ended: not an error of the function
             self.errors += 1
-        except SystemExit as error:  # would end this thread, and nobody else would hear of it
+        except SystemExit as error:  # would end only this thread, unnoticed
             self._report(self.name, error)
         except Exception as error:  # noqa: BLE001  (an application's function may raise anything)
             self.errors += 1
@@ -267,18 +267,18 @@ class Listener(Generic[T]):
 
 
 class Holder(Protocol[T_contra]):
-    """Whatever samples can be put into: a mailbox, or several that are emptied together."""
+    """A target for samples: a mailbox, or several that are emptied together."""
 
     def put(self, item: T_contra, /) -> None:
         """Add the newest item and wake the consumer."""
 
     @property
     def dropped(self) -> int:
-        """Items that newer ones pushed out before they were taken."""
+        """Items replaced by newer ones before they were taken."""
 
 
 class Mailbox(Generic[T]):
-    """Keeps the newest ``depth`` items that its consumer has not taken yet, and counts those that it had to drop.
+    """Keeps the newest ``depth`` items until its consumer takes them, and counts the dropped ones.
 
     Any number of threads put, one takes.
     """
@@ -286,18 +286,18 @@ class Mailbox(Generic[T]):
     __slots__ = ("_items", "_lock", "_offered", "closed", "delivered", "depth", "notifier")
 
     def __init__(self, depth: int = 1, notifier: Notifier | None = None) -> None:
-        """Make an empty mailbox; a ``notifier`` that is shared lets a thread wait for several."""
+        """Create an empty mailbox; with a shared ``notifier``, a thread can wait for several."""
         self.depth = depth
         self.notifier = notifier or Notifier()
         self.closed = False
-        self.delivered = 0  #: how many were taken
+        self.delivered = 0  #: number of items taken
         self._offered = 0
         self._items: deque[T] = deque(maxlen=depth)
         self._lock = threading.Lock()
 
     @property
     def dropped(self) -> int:
-        """Items that newer ones pushed out before they were taken."""
+        """Items replaced by newer ones before they were taken."""
         with self._lock:
             return self._offered - self.delivered - len(self._items)
 
@@ -314,7 +314,7 @@ class Mailbox(Generic[T]):
         self.notifier.notify()
 
     def take(self) -> T | None:
-        """Take the oldest of the items kept; None if there is none. Does not wait."""
+        """Remove and return the oldest item; None if there is none. Does not wait."""
         with self._lock:
             if not self._items:
                 return None
@@ -322,29 +322,29 @@ class Mailbox(Generic[T]):
             return self._items.popleft()
 
     def peek(self) -> T | None:
-        """Return what :meth:`take` would, without taking it."""
+        """Return the oldest item without removing it."""
         with self._lock:
             return self._items[0] if self._items else None
 
     def wait(self, timeout_s: float | None = None) -> T | None:
-        """Take an item like :meth:`take`, but wait for one, for ever with None. None: none came, or it was closed."""
+        """Take an item, waiting for one (without limit for None); None after the time-out, or once closed."""
         self.notifier.wait_for(lambda: bool(self._items) or self.closed, timeout_s)
         return None if self.closed else self.take()
 
     def close(self) -> None:
-        """Discard what is kept, and wake the consumer, which gets None from now on."""
+        """Discard all items, and wake the consumer, which gets None from now on."""
         self.closed = True
         with self._lock:
-            self._offered -= len(self._items)  # discarded items count neither as delivered nor as dropped
+            self._offered -= len(self._items)  # discarded items count as neither delivered nor dropped
             self._items.clear()
         self.notifier.notify()
 
 
 class Notifier:
-    """Wakes all threads that wait for a condition. Notifying costs one test when nobody waits.
+    """Wakes all threads that wait for a condition. Notifying costs a single test when no thread waits.
 
-    Every waiting thread brings its own lock and checks its condition once more after adding it, so that no notification
-    is missed and the notifying thread, which receives for everybody, never acquires a lock.
+    Each waiting thread brings its own lock, and checks its condition once more after adding it. So no notification is
+    missed, and the notifying thread, which receives for all consumers, never acquires a lock.
     """
 
     __slots__ = ("_waiting",)
@@ -353,7 +353,7 @@ class Notifier:
         self._waiting: list[LockType] = []
 
     def notify(self) -> None:
-        """Wake every thread that waits now."""
+        """Wake every waiting thread."""
         waiting = self._waiting
         while waiting:
             try:
@@ -363,9 +363,9 @@ class Notifier:
             lock.release()
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until ``ready()`` is true, for ever with None; return whether it became true in time.
+        """Wait until ``ready()`` is true (without limit for None); return whether it became true in time.
 
-        It is checked on this thread, at first and after each notification.
+        It is checked on this thread, first and after each notification.
         """
         if ready():
             return True
@@ -391,14 +391,14 @@ class Notifier:
 
 
 def checked_name(processor: str) -> str:
-    """Return ``processor`` if it can be the name of a processor, else raise :class:`UsageError`."""
+    """Return ``processor`` if it is a valid name of a processor; raise :class:`UsageError` otherwise."""
     if not isinstance(processor, str) or not re.fullmatch(PROCESSOR_NAME, processor):
-        raise UsageError(f"the name of a processor has 1 to 64 letters, digits and any of _ . -, not {processor!r:.80}")
+        raise UsageError(f"a processor's name must have 1 to 64 letters, digits or any of _ . -, got {processor!r:.80}")
     return processor
 
 
 def checked_age(max_age_s: float | None) -> float | None:
-    """Return ``max_age_s`` if it can be a limit of age [s], or None, else raise :class:`UsageError`."""
+    """Return ``max_age_s`` if it is a valid age limit [s] or None; raise :class:`UsageError` otherwise."""
     if max_age_s is not None and (not isinstance(max_age_s, int | float) or math.isnan(max_age_s) or max_age_s < 0):
         raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds")
     return max_age_s

@@ -1,4 +1,4 @@
-"""Connect to a proxy by name, or to a vehicle by address through a private proxy: a child process that ends with us."""
+"""Connect to a proxy by name, or to a vehicle by address through a private proxy in a child process."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from skyloop.files import wait_readable
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 
 NAME_TIMEOUT_S: Final = 5.0
-START_TIMEOUT_S: Final = 20.0  #: for a private proxy and its vehicle
-#: Entry points by the scheme of an address: functions that take the address and return a :class:`Connector`, or None.
+START_TIMEOUT_S: Final = 20.0  #: time limit for a private proxy and its vehicle
+#: Entry points named by address schemes: functions from an address to a :class:`Connector`, or None.
 CONNECTORS: Final = "skyloop.connectors"
-#: Entry points of what reaches proxies beyond this host: a module as :class:`NetworkTransport`.
+#: Entry points for transports that reach proxies on other hosts: a module as :class:`NetworkTransport`.
 NETWORKS: Final = "skyloop.networks"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
-_USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address; it prints why in one line
+_USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address after printing a one-line reason
 _LOOK_S: Final = 0.05
-ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: as long as the child waits for its vehicle to land
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long the child waits for its vehicle to land
 _numbers = itertools.count(1)
 
 P = ParamSpec("P")
 R = TypeVar("R")
-#: Where options of earlier versions are now.
+#: New places of options of earlier versions.
 _MOVED: Final = dict.fromkeys(("priority", "wait_s", "for_s", "takeover", "stay"), "authority=skyloop.Authority") | {
     "keys": "network=skyloop.Network"
 }
@@ -47,12 +47,12 @@ _MOVED: Final = dict.fromkeys(("priority", "wait_s", "for_s", "takeover", "stay"
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """How a program joins the network: ``connect("alpha", network=Network("10.0.0.5:7447", keys=folder))``.
+    """A program's access to the network: ``connect("alpha", network=Network("10.0.0.5:7447", keys=folder))``.
 
     Attributes:
-        address: ``"10.0.0.5:7447"`` connects to an address (several with commas, with ``multicast`` among them to
-            search as well); True searches by multicast; False stays on this host. None: as the variable
-            ``SKYLOOP_NETWORK`` says, without which it searches by multicast.
+        address: ``"10.0.0.5:7447"`` connects to an address (several with commas, ``multicast`` among them to search as
+            well); True searches by multicast; False stays on this host. None: the value of the variable
+            ``SKYLOOP_NETWORK`` or, without one, a search by multicast.
         keys: Folder of an identity; None: from the variable ``SKYLOOP_KEYS``.
     """
 
@@ -61,31 +61,31 @@ class Network:
 
 
 class NetworkSettings(Protocol):
-    """How the network is reached: made, and understood, by the :class:`NetworkTransport` alone."""
+    """Settings of a :class:`NetworkTransport`, which alone creates and interprets them."""
 
     @property
     def reach(self) -> str:
-        """Where proxies are searched for, for people."""
+        """Where to search for proxies, for people."""
 
 
 class NetworkTransport(Protocol):
-    """What a package brings that carries connections beyond this host; :mod:`skyloop.network` is one."""
+    """A package's transport to other hosts; :mod:`skyloop.network` is one."""
 
     def choose(self, network: bool | str | NetworkSettings | None, keys: Path | str | None) -> NetworkSettings | None:
-        """Return how the network is reached; None to stay on this host. Raises :class:`UsageError`."""
+        """Return the network's settings; None to stay on this host. Raises :class:`UsageError`."""
 
     def dial(self, name: str, settings: NetworkSettings) -> Dialer:
-        """Return a dialer of the proxy with this name."""
+        """Return a dialer for the proxy with this name."""
 
     def list_proxies(self, settings: NetworkSettings) -> Iterable[Any]:
-        """Return what runs now: each has a ``name``."""
+        """Return the running proxies, each with a ``name``."""
 
 
 NetworkChoice: TypeAlias = "Network | NetworkSettings | bool | str | None"
 
 
 class ConnectOptions(TypedDict, total=False):
-    """Options of :func:`connect`, as it documents them."""
+    """Options of :func:`connect`, documented there."""
 
     access: Access
     name: str | None
@@ -98,13 +98,13 @@ class ConnectOptions(TypedDict, total=False):
 
 
 def explains_moved_options(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function of :class:`ConnectOptions` so that options of old names raise a :class:`UsageError`."""
+    """Decorate a function of :class:`ConnectOptions` so that old options raise :class:`UsageError`."""
 
     @wraps(function)
     def call(*args: P.args, **options: P.kwargs) -> R:
         for name, value in options.items():
             if name in _MOVED:
-                raise UsageError(f"{name}={value!r:.40} is written {_MOVED[name]}({name}={value!r:.40}) now")
+                raise UsageError(f"{name}={value!r:.40} is now written {_MOVED[name]}({name}={value!r:.40})")
         return function(*args, **options)
 
     return call
@@ -125,37 +125,37 @@ def connect(
 ) -> Drone:
     """Connect to a drone.
 
-    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. A vehicle that was
-    started just now is waited for until it can take off, and the log (``skyloop``) says so; after ``timeout_s`` the
-    call returns all the same, and :meth:`Drone.takeoff` goes on waiting.
+    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. For a vehicle that
+    has just started, it waits until it can take off and says so in the log (``skyloop``); after ``timeout_s`` it
+    returns anyway, and :meth:`Drone.takeoff` continues the wait.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
-            For an address a private proxy is started, which ends with the drone and with this process. A name is
-            looked up on this host first and then, if ``network`` allows, on the network.
+            For an address, a private proxy starts, which ends with the drone and with this process. A name is looked
+            up on this host first and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
         timeout_s: Time for the proxy to answer [s]; None or 0: 5 s for a name, 20 s for an address.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
-        on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. One that
-            others fly stays as it is; a warning in the log says so.
-        authority: How a pilot asks for the authority: priority, waiting, asking its holder first. None:
+        on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that
+            others fly is left alone, with a warning in the log.
+        authority: How a pilot requests the authority: priority, waiting, asking its holder first. None:
             ``Authority()``.
-        network: True, an address, or a :class:`Network` with keys; False stays on this host. None: as the variable
-            ``SKYLOOP_NETWORK`` says, without which nothing leaves this host.
+        network: True, an address, or a :class:`Network` with keys; False stays on this host. None: the value of the
+            variable ``SKYLOOP_NETWORK``; without one, this host only.
 
     Raises:
-        UnknownNameError: If no proxy of this name runs; carries suggestions.
+        UnknownNameError: If no proxy of this name is running; carries suggestions.
         NoAnswerError: If the proxy does not answer in time, or sends no feedback.
-        AuthorityError: If the authority can't be had; names its holder.
+        AuthorityError: If the authority is not granted; the text names its holder.
         RefusedError: If the proxy refuses the connection.
         LinkError: If the proxy or the private proxy can't be reached, or ends.
         UsageError: If an argument is out of range, or the address makes no sense.
-        MissingExtraError: If the network is asked for and the extra ``network`` is not installed.
+        MissingExtraError: If the network is requested and the extra ``network`` is not installed.
     """
     if not isinstance(authority, Authority | None):
-        raise UsageError(f"authority is {authority!r:.80} and must be a skyloop.Authority, as Authority(priority=4)")
+        raise UsageError(f"authority is {authority!r:.80} and must be a skyloop.Authority, e.g. Authority(priority=4)")
     drone, deadline = prepare(
         target, name, timeout_s, network, access=access, rate_hz=rate_hz, stall_s=stall_s, on_exit=on_exit
     )
@@ -170,9 +170,9 @@ def prepare(
     network: NetworkChoice = None,
     **options: Unpack[DroneOptions],
 ) -> tuple[Drone, float]:
-    """Return a drone that is not connected yet, and until when that may take, on ``time.monotonic``.
+    """Return an unconnected drone, and the deadline for its connection, on ``time.monotonic``.
 
-    A private proxy is started. Arguments and errors are those of :func:`connect`.
+    Starts a private proxy if needed. Arguments and errors are those of :func:`connect`.
     """
     if not isinstance(target, str) or not target:
         raise UsageError(f"{target!r} is neither the name of a proxy nor a vehicle's address such as sim://")
@@ -181,7 +181,7 @@ def prepare(
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" not in target:
-        # Another process can use the name alone only if it finds the proxy without network settings.
+        # The name alone is enough for another process only if it finds the proxy without network settings.
         options["reach"] = target if network is None or network is False else None
         return Drone(dial_by_name(target, network), app=app, **options), deadline
     way = _connector(target)
@@ -194,7 +194,7 @@ def prepare(
 
 
 def _connector(uri: str) -> Connector:
-    """The connector that an installed package has for this scheme, else a private proxy."""
+    """Return an installed package's connector for this scheme, or a private proxy."""
     for entry in entry_points(group=CONNECTORS, name=uri.partition("://")[0]):
         own: Connector | None = entry.load()(uri)
         if own is not None:
@@ -203,37 +203,37 @@ def _connector(uri: str) -> Connector:
 
 
 def _script_name() -> str:
-    """The running script's name, for people."""
+    """Return the running script's name, for people."""
     script = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python")
     stem = script.parent.name if script.stem == "__main__" else script.stem
     return (stem.strip("-") or "python")[:64]
 
 
 class Connector(Protocol):
-    """How a vehicle's address is reached: by a private proxy, or within this process."""
+    """Access to a vehicle by address: through a private proxy, or within this process."""
 
     scheduler: Scheduler
 
     @property
     def reach(self) -> str | None:
-        """What another process connects to for the same vehicle; None if it can't."""
+        """The target for other processes to reach the same vehicle; None if they can't."""
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer that at first waits until the proxy serves, until ``deadline_s`` on ``time.monotonic``."""
+        """Return a dialer whose first call waits for the proxy, until ``deadline_s`` on ``time.monotonic``."""
 
     def close(self) -> None:
-        """End whatever was started. Idempotent."""
+        """Stop everything started. Idempotent."""
 
 
 class PrivateProxy:
     """Runs ``python -m skyloop proxy URI`` as a child process.
 
-    The child ends with :meth:`close`, and with this process, however that ends; a vehicle that still flies then on a
-    flight of ours it lands first. Ctrl-C reaches only the application, which can then land.
+    The child ends with :meth:`close`, and with this process, however that ends. It first lands a vehicle that is still
+    on a flight of ours. Ctrl-C reaches only the application, which can then land.
     """
 
     def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
-        """Start the child; ``command`` is its command line before the address."""
+        """Start the child; ``command`` is its command line without the address."""
         scheme = re.sub(r"[^a-z0-9]", "", uri.partition("://")[0].lower()) or "vehicle"
         self.name = f"{scheme[:16]}-{os.getpid()}-{next(_numbers)}"
         self.reach = self.name
@@ -244,10 +244,10 @@ class PrivateProxy:
         self.pid = self._process.pid  #: process id of the child
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer that at first waits until the proxy serves, until ``deadline_s`` on ``time.monotonic``.
+        """Return a dialer whose first call waits for the proxy, until ``deadline_s`` on ``time.monotonic``.
 
-        It raises :class:`NoAnswerError` if that takes too long, :class:`UsageError` if the address makes no sense, and
-        :class:`LinkError` if the child has ended, with the end of what it wrote to standard error.
+        The dialer raises :class:`NoAnswerError` if that takes too long, :class:`UsageError` if the address makes no
+        sense, and :class:`LinkError`, with the end of the child's standard error, if the child has ended.
         """
         inner = _local(self.name)
 
@@ -271,9 +271,9 @@ class PrivateProxy:
         return dial
 
     def close(self) -> None:
-        """End the child and wait for it, 4 s at most while it lands what flies. Idempotent.
+        """End the child and wait for it, for at most 4 s while it lands a flying vehicle. Idempotent.
 
-        One that never served is terminated after 4 s, and killed after another 4 s.
+        A child that never served is terminated after 4 s, and killed after another 4 s.
         """
         self._process.part()
         if not self._served or self._process.wait(GRACE_S) is not None:
@@ -291,17 +291,17 @@ class PrivateProxy:
         raise LinkError(f"the proxy for {self.uri} {child.ending}{child.quoted_output}")
 
     def _wait_for_output(self) -> None:
-        """Sleep until the child prints something (that it is ready), ends, or a moment has passed."""
+        """Sleep until the child prints something (such as its readiness), ends, or a moment has passed."""
         stdout = self._process.stdout
         if wait_readable(stdout, _LOOK_S) and not os.read(stdout.fileno(), 4096):
-            time.sleep(0.005)  # it closed its output and is about to end
+            time.sleep(0.005)  # it has closed its output and is about to end
 
 
 def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> NetworkSettings | None:
-    """Return how to search the network; None if it is not to be searched. ``keys`` are the command line's.
+    """Return the settings for searching the network; None for this host only. ``keys``: from the command line.
 
     Raises:
-        UsageError: If an address or the folder is not valid.
+        UsageError: If an address or the folder is invalid.
     """
     if isinstance(network, Network):
         address, keys = network.address, network.keys or keys
@@ -317,15 +317,15 @@ def _network() -> NetworkTransport:
     for entry in entry_points(group=NETWORKS):
         transport: NetworkTransport = entry.load()
         return transport
-    raise MissingExtraError("the network", "network", cause="no package brings a transport for it")
+    raise MissingExtraError("the network", "network", cause="no package provides a transport for it")
 
 
 def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
-    """Return the dialer of the proxy with this name.
+    """Return a dialer for the proxy with this name.
 
-    Each time it prefers a proxy on this host, where Linux' local transport is available. It raises
-    :class:`UnknownNameError`, which says where it searched, and :class:`LinkError`. Raises :class:`UsageError` if
-    ``name`` can't be a name.
+    Each call prefers a proxy on this host, if Linux' local transport is available. The dialer raises
+    :class:`UnknownNameError`, which says where it searched, and :class:`LinkError`. This function raises
+    :class:`UsageError` if ``name`` is not a valid name.
     """
     check_name(name)
     settings = network_settings(network)
@@ -340,7 +340,7 @@ def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
         try:
             return near(handler)
         except LinkError:
-            return far(handler)  # a killed proxy has left its socket, or it belongs to another user
+            return far(handler)  # the name is a killed proxy's leftover socket, or belongs to another user
         except UnknownNameError as here:
             known = here.known
         try:
@@ -369,7 +369,7 @@ def _hinting(near: Dialer) -> Dialer:
 
 
 def running_names(network: NetworkChoice = None) -> list[str]:
-    """Return the names of running proxies, sorted: on this host, and on the network if it is asked for."""
+    """Return the sorted names of running proxies on this host and, if requested, on the network."""
     from skyloop.transport.local import list_names
 
     near = {proxy.name for proxy in list_names()}

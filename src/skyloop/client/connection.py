@@ -1,4 +1,4 @@
-"""The connection to a proxy: one session after the other, supervised, and made again whenever it is lost."""
+"""The connection to a proxy: a series of supervised sessions, re-established after every loss."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from skyloop.messages import (
 from skyloop.transport.base import Dialer
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is judged
-_AGAIN_S: Final = 1.0  #: how often a thread that waits for samples tries again to receive them itself
+_AGAIN_S: Final = 1.0  #: how often a thread that waits for samples retries to receive them itself
 _log = logging.getLogger("skyloop")
 
 
 @dataclass(frozen=True, slots=True)
 class RedialPolicy:
-    """How a lost proxy is reconnected to: for as long as it takes, with growing pauses [s]."""
+    """Policy for reconnecting to a lost proxy: without limit, with growing pauses [s]."""
 
     first_s: float = 0.02
     factor: float = 2.0
     cap_s: float = 0.3
-    hello_s: float = 1.0  #: time for a reached proxy to answer Hello
+    hello_s: float = 1.0  #: time limit for a reached proxy to answer Hello
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def pause_s(self, failures: int) -> float:
@@ -48,22 +48,22 @@ class RedialPolicy:
 
 
 class _EndedError(LinkError):
-    """The proxy ended the connection before it sent Welcome."""
+    """Raised when the proxy ends the connection before sending Welcome."""
 
 
 class ProxyConnection:
-    """What an application sends and asks through, whichever session with the proxy there is. Any thread.
+    """An application's sends and requests, through whichever session exists with the proxy. Thread-safe.
 
-    It is made before everything that uses it; a :class:`ConnectionSupervisor` makes the sessions.
+    It is created before all its users; a :class:`ConnectionSupervisor` creates the sessions.
     """
 
     def __init__(self, clock: Clock = time.monotonic_ns) -> None:
-        #: Hands a packet to the transport of the present session; False if it could not be handed over.
+        #: Hands a packet to the current session's transport; returns False on failure.
         self.transmit: Callable[[bytes], bool] = _nowhere
         self.state = LinkState.CONNECTING
         self.reason = ""
-        self.why_closed = ""  #: why nothing can be asked for any more; empty while something can
-        self.poked = False  #: the supervisor is to attend to it now
+        self.why_closed = ""  #: why no requests are possible; empty while they are
+        self.poked = False  #: the supervisor must run now
         self.closing = False
         self.woken = Notifier()  #: wakes the supervisor
         self._clock = clock
@@ -74,31 +74,31 @@ class ProxyConnection:
 
     @property
     def connected(self) -> bool:
-        """Whether, as far as is known, a proxy that has answered Hello is at the other end now."""
+        """Whether, as far as is known, the other end is a proxy that has answered Hello."""
         session = self._session
         return session is not None and session.open
 
     @property
     def malformed(self) -> int:
-        """Packets and frames that could not be decoded, in all sessions."""
+        """Undecodable packets and frames, in all sessions."""
         session = self._session
         return self._malformed_before + (0 if session is None else session.monitor.malformed_count)
 
     @property
     def missing(self) -> int:
-        """Samples of feedback that are missing by the gaps in their numbers, in all sessions."""
+        """Missing samples of feedback, judged by gaps in their numbers, in all sessions."""
         session = self._session
         return self._missing_before + (0 if session is None else session.monitor.missing)
 
     @property
     def receiving(self) -> bool:
-        """Whether the calling thread is the receiving one, which must not wait for what it would itself receive."""
+        """Whether the calling thread is the receiving one, which must not wait for packets."""
         session = self._session
         return session is not None and session.receiving
 
     @property
     def variants(self) -> bool:
-        """Whether frames come in the form that was asked for; on one host they come as they are."""
+        """Whether frames arrive in the requested form; on one host they arrive unchanged."""
         session = self._session
         return session is not None and session.variants
 
@@ -115,22 +115,22 @@ class ProxyConnection:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Largest error of :attr:`offset_ns` [ns]; 0 where both ends read one clock."""
+        """Maximum error of :attr:`offset_ns` [ns]; 0 if both ends read the same clock."""
         session = self._session
         return 0 if session is None else session.uncertainty_ns
 
     def check_open(self) -> None:
-        """Raise :class:`ClosedError` once the drone was closed, or belongs to the parent process."""
+        """Raise :class:`ClosedError` if the drone was closed, or belongs to the parent process."""
         if self.why_closed:
             raise ClosedError(self.why_closed)
 
     def check_may_wait(self) -> None:
         """Raise :class:`UsageError` on the receiving thread."""
         if self.receiving:
-            raise UsageError("an inline listener can't wait for what it would itself have to receive")
+            raise UsageError("an inline callback can't wait for packets that it would itself have to receive")
 
     def poke(self) -> None:
-        """Wake the supervisor, so that it attends to the connection now."""
+        """Wake the supervisor to attend to the connection now."""
         self.poked = True
         self.woken.notify()
 
@@ -140,7 +140,7 @@ class ProxyConnection:
         return session is not None and session.lead(ready, wake, timeout_s)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
-        """Subscribe to a topic or unsubscribe, in this session and all that follow."""
+        """Subscribe to a topic or unsubscribe, in this session and all later ones."""
         with self._lock:
             if on == (topic in self._topics):
                 return
@@ -152,7 +152,7 @@ class ProxyConnection:
                 self._session.subscribe(topic, on)
 
     def resubscribe(self, topic: str) -> None:
-        """Subscribe again to a topic that seems to have stopped."""
+        """Resubscribe to a topic that seems to have stopped."""
         with self._lock:
             if topic in self._topics and self._session is not None:
                 self._session.subscribe(topic, False)
@@ -161,7 +161,7 @@ class ProxyConnection:
     def ask(self, body: AnyRequest, done: Callable[[AnyReply | LinkError], None], timeout_s: float = 2.0) -> None:
         """Send a request without waiting.
 
-        ``done`` is called once with the answer, or an error after ``timeout_s``, on any thread; it must be quick.
+        ``done`` is called once, on any thread, with the answer or, after ``timeout_s``, an error; it must be quick.
         """
         session = self._session
         if session is None:
@@ -176,20 +176,21 @@ class ProxyConnection:
         *,
         may_repeat: Callable[[], bool] = lambda: True,
     ) -> AnyReply:
-        """Send a request and wait for the answer. While the link is lost, wait for it to come back.
+        """Send a request and wait for the answer. While the link is lost, wait for it to return.
 
         Args:
-            body: Makes the request, for each attempt again.
-            timeout_s: For all of it [s].
-            may_repeat: Whether to ask once more, when the link broke before the answer to a request that was sent.
+            body: Makes the request, again for each attempt.
+            timeout_s: Total time [s].
+            may_repeat: Whether to repeat the request if the link broke after it was sent and before the answer.
 
         Raises:
             NoAnswerError: If there is no answer in time.
             ClosedError: If the drone is closed.
-            LinkError: If called from an inline callback, or what was asked may have been done and must not be repeated.
+            LinkError: If called from an inline callback, or the request may have been executed and must not be
+                repeated.
         """
         if self.receiving:
-            raise LinkError("an inline listener can't wait for an answer, which it would itself have to receive")
+            raise LinkError("an inline callback can't wait for an answer that it would itself have to receive")
         notifier = Notifier()
         answers: list[AnyReply | LinkError] = []
 
@@ -206,16 +207,16 @@ class ProxyConnection:
             if not isinstance(answer, LinkError):
                 return answer
             if isinstance(answer, NoAnswerError) or left_s <= 0.02:
-                raise NoAnswerError(f"{answer} ({timeout_s:g} s were given)") from answer
+                raise NoAnswerError(f"{answer} (time-out {timeout_s:g} s)") from answer
             if sent and not may_repeat():
                 raise LinkError(f"{answer}, after the request was sent: it may have been carried out") from answer
             notifier.wait_for(lambda: self.closing, 0.02)
         raise ClosedError("this drone was closed")
 
     def forked(self) -> None:
-        """Send nothing, wait for nothing: the session belongs to the parent process."""
+        """Stop sending and waiting: the session belongs to the parent process."""
         self.why_closed = (
-            f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect here as well"
+            f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect again here"
         )
         self.closing = True
         self._session, self.transmit = None, _nowhere
@@ -225,11 +226,11 @@ class ProxyConnection:
 
     @property
     def session(self) -> ProxySession | None:
-        """The present session; None while there is none."""
+        """The current session; None while there is none."""
         return self._session
 
     def attach(self, session: ProxySession) -> None:
-        """Send through ``session`` from now on, and subscribe in it to all topics that are wanted."""
+        """Send through ``session`` from now on, and subscribe to all active topics in it."""
         with self._lock:
             for topic in self._topics:
                 session.subscribe(topic, True)
@@ -238,7 +239,7 @@ class ProxyConnection:
         self.poke()
 
     def detach(self) -> ProxySession | None:
-        """Send nowhere until there is another session; return the previous one."""
+        """Stop sending until there is another session; return the previous one."""
         with self._lock:
             session, self._session = self._session, None
             self.transmit = _nowhere
@@ -249,7 +250,7 @@ class ProxyConnection:
 
 
 class ConnectionSupervisor:
-    """Makes one session with the proxy after the other, judges each, and drops those that are lost."""
+    """Creates sessions with the proxy, judges their links, and replaces lost ones."""
 
     def __init__(
         self,
@@ -264,7 +265,7 @@ class ConnectionSupervisor:
     ) -> None:
         """Prepare to connect; :meth:`start` does it.
 
-        ``begin`` sees to it that :meth:`attend` is called from the first session on; None: a thread does.
+        ``begin`` arranges for calls of :meth:`attend` from the first session on; None: a thread makes them.
         """
         self.connection = connection
         self._handler = handler
@@ -277,12 +278,12 @@ class ConnectionSupervisor:
         self._thread = threading.Thread(target=self._run, name="skyloop-link", daemon=True)
 
     def start(self, timeout_s: float = 5.0) -> None:
-        """Connect for the first time, within ``timeout_s``, and keep connected from then on.
+        """Connect for the first time, within ``timeout_s``, and stay connected from then on.
 
         Raises:
             NoAnswerError: If the proxy does not answer Hello.
             RefusedError: If the proxy refuses the connection.
-            SkyloopError: Whatever else the dialer raises.
+            SkyloopError: Any other error of the dialer.
         """
         deadline = time.monotonic() + timeout_s
         ended = False
@@ -293,7 +294,7 @@ class ConnectionSupervisor:
             except NoAnswerError:  # Hello may have been lost, or the proxy starts slowly
                 if time.monotonic() > deadline:
                     raise
-            except _EndedError:  # the proxy has just failed to start: dialing again raises why
+            except _EndedError:  # the proxy has just failed to start: dialing again raises the reason
                 if ended:
                     raise
                 ended = True
@@ -310,15 +311,15 @@ class ConnectionSupervisor:
         self._set_state(LinkState.CLOSED, "closed by the application")
 
     def attend_for_ever(self) -> None:
-        """Attend to the connection on a thread of its own until :meth:`close`."""
+        """Attend to the connection in a separate thread until :meth:`close`."""
         self._thread.start()
 
     def attend(self) -> float:
-        """Do what is due now; return for how long there is nothing to do [s], unless the connection is poked."""
+        """Do all due work; return the time until the next work [s], unless the connection is poked earlier."""
         self.connection.poked = False
         try:
             return self._step()
-        except Exception:  # noqa: BLE001  (whatever goes wrong, the link has to come back)
+        except Exception:  # noqa: BLE001  (whatever goes wrong, the link must come back)
             _log.exception("the connection's thread failed; reconnecting")
             self._drop(LinkError("an error in the link"), "an error in the link")
             return self._policy.cap_s
@@ -331,7 +332,7 @@ class ConnectionSupervisor:
             self.connection.woken.wait_for(lambda: self.connection.poked, pause_s)
 
     def _step(self) -> float:
-        """Do what is due; return for how long there is nothing to do [s]."""
+        """Do all due work; return the time until the next work [s]."""
         session = self.connection.session
         if session is None:
             return self._redial()
@@ -344,7 +345,7 @@ class ConnectionSupervisor:
         return max(0.0, (due_ns - self._clock()) / 1e9)
 
     def _judge(self, session: ProxySession, now_ns: int) -> bool:
-        """Update the state of the link; return False if the session was dropped."""
+        """Update the link's state; return False if the session was dropped."""
         session.tick(now_ns)
         verdict = session.monitor.verdict(now_ns)
         reason = session.closed_reason or (verdict.reason if verdict.restart else None)
@@ -368,7 +369,7 @@ class ConnectionSupervisor:
         return 0.0
 
     def _connect(self) -> None:
-        """Dial and say Hello. Counts as a failure until feedback comes, so that pauses grow if it never does."""
+        """Dial and send Hello. Counts as a failure until feedback arrives, so that pauses grow if it never does."""
         self._failures += 1
         session = ProxySession(self._handler, self.connection.poke, self._policy.thresholds, self._clock)
         session.dial(self._dial)
@@ -377,7 +378,7 @@ class ConnectionSupervisor:
             self._handler.connected(welcome)
             self.connection.attach(session)
         except BaseException:
-            session.close(LinkError("the connection was given up"))
+            session.close(LinkError("the connection was abandoned"))
             raise
 
     def _welcome(self, session: ProxySession) -> Welcome:
@@ -400,7 +401,7 @@ class ConnectionSupervisor:
             raise RefusedError(f"the proxy refused the connection: {answer.message}", code=answer.code.value)
         if session.closed_reason is not None:
             raise _EndedError(f"the proxy ended the connection: {session.closed_reason}")
-        raise NoAnswerError(f"the proxy at {session.address} was reached but did not answer: is it stopped?")
+        raise NoAnswerError(f"the proxy at {session.address} was reached but did not answer: has it been stopped?")
 
     def _drop(self, error: LinkError, reason: str) -> None:
         session = self.connection.detach()
@@ -423,7 +424,7 @@ def _nowhere(packet: bytes) -> bool:  # noqa: ARG001  (there is no connection to
 
 
 class ReceivingNotifier(Notifier):
-    """A notifier for a thread that waits for samples: it receives meanwhile, so that a sample wakes it directly."""
+    """A notifier for a thread that waits for samples: it receives them itself, so that a sample wakes it directly."""
 
     __slots__ = ("_connection",)
 
@@ -453,28 +454,28 @@ def _either(ready: Callable[[], bool], offered: list[bool]) -> bool:
 
 
 class Scheduler:
-    """Where the time of a drone comes from, here real time: waiting is sleeping, and a slow application misses samples.
+    """The source of a drone's time: here real time, where waiting sleeps, and a slow application misses samples.
 
-    A replay that is stepped by its application has another one, in which waiting advances the time.
+    A replay stepped by its application has a different one, in which waiting advances the time.
     """
 
-    #: Whether callbacks are always called on the receiving thread, so that each gets all samples.
+    #: Whether callbacks always run on the receiving thread, so that each gets all samples.
     in_step = False
 
     def __init__(self, clock: Clock = time.monotonic_ns) -> None:
         self.clock = clock
 
     def notifier(self) -> Notifier:
-        """Return a notifier for an application to wait for."""
+        """Return a notifier for an application's waits."""
         return Notifier()
 
     def sample_notifier(self, connection: ProxyConnection) -> Notifier:
-        """Return a notifier for a thread that waits for nothing but samples of this connection."""
+        """Return a notifier for a thread that waits only for samples of this connection."""
         return ReceivingNotifier(connection)
 
     def begin(self, supervisor: ConnectionSupervisor) -> None:
-        """Attend to the connection from now on; called with the first session."""
+        """Start attending to the connection; called with the first session."""
         supervisor.attend_for_ever()
 
     def opened(self) -> None:
-        """Called when the drone is connected, its state is known, and it may be commanded if that was asked for."""
+        """Called when the drone is connected, its state is known, and a pilot may command it."""

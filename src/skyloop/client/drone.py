@@ -1,4 +1,4 @@
-"""A drone as an application sees it: commands, readings, callbacks, and the end of a flight."""
+"""An application's drone: commands, readings, callbacks, and the end of a flight."""
 
 from __future__ import annotations
 
@@ -100,11 +100,11 @@ R = TypeVar("R")
 T = TypeVar("T")
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 DOWN: Final = frozenset({FlightState.LANDED})
-EVENT_DEPTH: Final = 256  #: how many events, log entries and the like wait for a slow callback
-WHOLE_S: Final = 1.0  #: for every field of feedback to come, where less had been asked for
-_LOOK_S: Final = 0.5  #: how often who waits for a frame looks whether its camera is still there
-_SOON_S: Final = 1.0  #: a vehicle that still wakes up then is waited for audibly
-_ENDED: Final = EndedSessions()  #: of all drones of this process
+EVENT_DEPTH: Final = 256  #: how many events, log entries and the like may wait for a slow callback
+WHOLE_S: Final = 1.0  #: time for every field of feedback to arrive after a reduced request
+_LOOK_S: Final = 0.5  #: how often a thread that waits for a frame checks that its camera still exists
+_SOON_S: Final = 1.0  #: a vehicle that still wakes up after this time is reported in the log
+_ENDED: Final = EndedSessions()  #: shared by all drones of this process
 _log = logging.getLogger("skyloop")
 
 
@@ -115,14 +115,14 @@ class DroneOptions(TypedDict, total=False):
     rate_hz: float  #: rate at which commands are repeated, 1 to 200 Hz
     stall_s: float  #: time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never
     on_exit: OnExit  #: what an airborne vehicle does at the end of the block
-    policy: RedialPolicy | None  #: when to reconnect and when a link counts as lost
-    scheduler: Scheduler | None  #: source of the time and of waiting; None: real time
+    policy: RedialPolicy | None  #: when to reconnect, and when a link counts as lost
+    scheduler: Scheduler | None  #: source of time and waiting; None: real time
     on_close: Callable[[], None] | None  #: called at the end of :meth:`Drone.close`, on the closing thread
-    reach: str | None  #: name or address under which another process reaches the same vehicle; None if none can
+    reach: str | None  #: name or address of the vehicle for other processes; None if they can't reach it
 
 
 def by_name(function: Callable[P, R]) -> Callable[P, R]:
-    """Let a call of a function with keyword-only numbers that it does not take say what was meant."""
+    """Make wrong calls of a function with keyword-only numbers raise an error that says what was meant."""
     known = list(function.__kwdefaults__ or {})
 
     @wraps(function)
@@ -131,7 +131,7 @@ def by_name(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **given)
         except TypeError as error:
             if error.__traceback__ is None or error.__traceback__.tb_next is not None:
-                raise  # not by the call itself
+                raise  # not raised by the call itself
             for unknown in given.keys() - known:
                 raise UnknownNameError(f"argument of {function.__name__}", unknown, known) from None
             first = f"{function.__name__}({known[0]}={args[1]!r:.20})" if len(args) > 1 else "its own"
@@ -141,39 +141,39 @@ def by_name(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _all_finite(a: object, b: object, c: object, d: object) -> bool:
-    """Return whether four values are floats that can be commanded as they are: :func:`number` need not look at each.
+    """Return whether four values are floats that can be commanded unchanged, without calling :func:`number` for each.
 
-    False is no judgement: an int, or four huge floats whose sum is none, may be fine.
+    False does not mean invalid: ints, or four huge floats whose sum overflows, may be fine.
     """
     floats = type(a) is float and type(b) is float and type(c) is float and type(d) is float
     return floats and math.isfinite(a + b + c + d)  # type: ignore[operator]
 
 
 class Drone:
-    """A connected vehicle, made by :func:`skyloop.connect`.
+    """A connected vehicle, returned by :func:`skyloop.connect`.
 
-    It is a context manager, and every method may be called from any thread. At the end of its block a drone that is in
-    the air and whose authority this application holds is landed, and the authority released; from the beginning of that
-    end on, commands of other threads raise :class:`ClosedError`, but an emergency stop passes. One that others fly is
-    left to them, and one that returns for its battery to its return. ``sys.exit()`` in a callback ends the flight in
-    the same way. Ctrl-C, or a notebook's *Stop*, in a call that waits makes the vehicle hover; in :meth:`land` it lands
-    on. A call with ``wait=False`` has nothing to interrupt. A lost proxy is reconnected to for as long as it takes;
-    then everything is restored except old set-points.
+    It is a context manager, and every method is thread-safe. At the end of its block, a drone that is in the air under
+    this application's authority lands, and the authority is released. From the start of that end on, commands from
+    other threads raise :class:`ClosedError`, except for an emergency stop. A drone flown by others is left to them, and
+    one that returns because of its battery keeps returning. ``sys.exit()`` in a callback ends the flight in the same
+    way. Ctrl-C, or a notebook's *Stop*, during a call that waits makes the vehicle hover; during :meth:`land` the
+    landing continues. A call with ``wait=False`` has nothing to interrupt. A lost connection to the proxy is
+    re-established, however long it takes; then everything is restored except old set-points.
 
     Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
-    it is sent at once and repeated at ``rate_hz`` until the next one. Each command but :meth:`takeoff` and :meth:`land`
-    returns True if it was handed to the transport now, and False if it could not be because the link is down or the
-    authority is still awaited; it is then sent when both are there, if it is less than half a second old. Set-points
-    (velocity, attitude, place) also return False while the proxy is known to refuse them, as on the ground or when
-    somebody else flies the vehicle; the events say why. Every command raises:
+    it is sent at once and repeated at ``rate_hz`` until the next one. All commands except :meth:`takeoff` and
+    :meth:`land` return True if the command was handed to the transport. They return False while the link is down or the
+    authority is still awaited; the command is then sent once both are there, unless it is more than half a second old.
+    Set-points (velocity, attitude, position) also return False while the proxy is known to refuse them, for example on
+    the ground or while others fly the vehicle; events give the reason. Every command raises:
 
     - :class:`AuthorityError` while another application holds the authority or none was requested,
     - :class:`UsageError` for numbers that are not finite,
-    - :class:`UnsupportedError` for a vehicle that takes no commands,
-    - :class:`ClosedError` after :meth:`close`, and once the end of the block has begun.
+    - :class:`UnsupportedError` for a vehicle without commands,
+    - :class:`ClosedError` after :meth:`close`, and from the end of the block on.
 
-    The names of the reading methods say what they give: the newest sample (:meth:`feedback`, :meth:`frame`), the next
-    unread one (:meth:`next_feedback`, :meth:`next_frame`), or all that come (:meth:`frames`, :meth:`on_feedback`).
+    The names of the reading methods tell what they return: the newest sample (:meth:`feedback`, :meth:`frame`), the
+    next unread one (:meth:`next_feedback`, :meth:`next_frame`), or all of them (:meth:`frames`, :meth:`on_feedback`).
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class Drone:
         on_close: Callable[[], None] | None = None,
         reach: str | None = None,
     ) -> None:
-        """Prepare a drone that is not connected yet; :func:`skyloop.connect` does it. See :class:`DroneOptions`.
+        """Prepare an unconnected drone; use :func:`skyloop.connect` instead. See :class:`DroneOptions`.
 
         Raises:
             UsageError: If ``access``, ``on_exit``, ``app``, ``rate_hz`` or ``stall_s`` is out of range.
@@ -200,13 +200,13 @@ class Drone:
         if on_exit not in ("land", "hover"):
             raise UsageError(f'on_exit is {on_exit!r} and must be "land" or "hover"')
         if not 1 <= len(app) <= 64:
-            raise UsageError(f"an application's name has 1 to 64 characters, not {len(app)}: {app!r:.80}")
+            raise UsageError(f"an application's name must have 1 to 64 characters, got {len(app)}: {app!r:.80}")
         role = Role.PILOT if access == "pilot" else Role.OBSERVER
         scheduler = scheduler or Scheduler()
         self._reach = reach
         self._on_close = on_close
-        self._read: Feedback | None = None  # the last sample that feedback() or next_feedback() returned
-        # Each part uses those before it; the receiver handles what arrives in every session.
+        self._read: Feedback | None = None  # the last sample returned by feedback() or next_feedback()
+        # Each part uses those above it; the receiver handles the samples of every session.
         connection = self._connection = ProxyConnection(scheduler.clock)
         authority = AuthorityTracker(app, _ENDED)
         state = self._state = ClientState(app, connection, scheduler, whole_feedback=access == "pilot")
@@ -233,19 +233,19 @@ class Drone:
         acquire: bool = True,
         wait_for_state: bool = True,
     ) -> None:
-        """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone if anything fails.
+        """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone on failure.
 
         Args:
             timeout_s: Time for the proxy to answer, to send its first feedback and, as a pilot, for the vehicle to
                 wake up [s].
-            authority: How a pilot asks for the authority; None: ``Authority()``.
-            acquire: Whether a pilot asks for the authority now; if False it does so when it wants.
+            authority: How a pilot requests the authority; None: ``Authority()``.
+            acquire: Whether to request the authority now; if False, the pilot does so later.
             wait_for_state: Whether to wait for feedback.
 
         Raises:
-            NoAnswerError: If no answer or no feedback comes in time.
+            NoAnswerError: If no answer or no feedback arrives in time.
             RefusedError: If the proxy refuses the connection.
-            AuthorityError: If the authority can't be had.
+            AuthorityError: If the authority is not granted.
             LinkError: If the proxy can't be reached.
         """
         state = self._state
@@ -257,7 +257,7 @@ class Drone:
             deadline = time.monotonic() + timeout_s
             self._supervisor.start(timeout_s)
             if wait_for_state and not state.notifier.wait_for(known, max(0.1, deadline - time.monotonic())):
-                raise NoAnswerError(f"{self.name} answered, but reported no vehicle state within {timeout_s:g} s")
+                raise NoAnswerError(f"{self.name} answered but reported no vehicle state within {timeout_s:g} s")
             if acquire and self._commands.role is Role.PILOT:
                 self._connection.check_open()
                 asked = authority or Authority()
@@ -271,7 +271,7 @@ class Drone:
             raise
 
     def _wait_until_awake(self, deadline_s: float) -> None:
-        """Wait while the vehicle wakes up, as long as there is time; what it waits for goes to the log."""
+        """Wait while the vehicle wakes up, until the deadline; log what it waits for."""
 
         def why_asleep() -> str:
             newest = self._state.newest
@@ -309,31 +309,31 @@ class Drone:
 
     @property
     def now_ns(self) -> int:
-        """Estimate of the time on the proxy's clock [ns]; in a stepped replay, the time of the recorded flight."""
+        """Estimate of the time on the proxy's clock [ns]; in a stepped replay, the time in the recorded flight."""
         return self._connection.now_ns
 
     @property
     def clock_uncertainty_ns(self) -> int:
-        """Largest error of :attr:`clock_offset_ns` [ns], and so of each age and delay; 0 where both share one clock."""
+        """Maximum error of :attr:`clock_offset_ns` [ns], and thus of ages and delays; 0 with a shared clock."""
         return self._connection.uncertainty_ns
 
     @property
     def app_id(self) -> int:
-        """Number of this application in this run of the proxy."""
+        """Number of this application in the proxy's current run."""
         return self._commands.app_id
 
     @property
     def link(self) -> LinkStatus:
         """State of both hops, application to proxy and proxy to vehicle.
 
-        ``reason`` is that of the last change or, while the proxy is lost, why the last attempt to reconnect failed.
+        ``reason`` belongs to the last change or, while the proxy is lost, to the last failed attempt to reconnect.
         """
         status = self._state.status
         return replace(status, reason=self._connection.reason) if status.application is LinkState.LOST else status
 
     @property
     def start_position(self) -> Vector | None:
-        """Where the vehicle took off last, east, north, up in world axes [m]; None where that is not known."""
+        """Where the vehicle last took off, east, north, up in world axes [m]; None if unknown."""
         newest = self._state.newest
         return None if newest is None else newest.start_position_m
 
@@ -347,7 +347,7 @@ class Drone:
         """Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.
 
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
-        callback. Otherwise the proxy is asked for the delay over all pilots, which waits up to 0.2 s.
+        callback. Otherwise it is the delay over all pilots, for which this asks the proxy and waits up to 0.2 s.
         """
         found = self._state.stats(self._commands.sends)
         uncertainty_s = self.clock_uncertainty_ns / 1e9
@@ -361,12 +361,12 @@ class Drone:
         return list(self._state.recent)
 
     def on_takeover(self, function: Callable[[TakeoverRequest], TakeoverAnswer]) -> Listener[Event]:
-        """Call ``function`` when another application asks for the authority that this one holds.
+        """Call ``function`` when another application requests the authority that this one holds.
 
         Args:
-            function: Called on a thread of its own. It returns True to hand the authority over, False or a reason (a
-                text) to decline, and None to leave the decision to the proxy. In any case a strictly higher priority
-                wins after the proxy's ``authority.ask_s``.
+            function: Called in its own thread. It returns True to hand the authority over, False or a reason (a text)
+                to decline, and None to leave the decision to the proxy. In any case, a strictly higher priority wins
+                after the proxy's ``authority.ask_s``.
 
         Returns:
             The listener; ``cancel()`` ends it.
@@ -393,26 +393,26 @@ class Drone:
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> AuthorityStatus:
-        """Ask for the authority and wait for it.
+        """Request the authority and wait for it.
 
-        A holder of lower priority is pre-empted at once, or with ``takeover="ask"`` asked first, and pre-empted when it
-        agrees or after the proxy's ``authority.ask_s``. With ``"ask"`` a holder of the same or higher priority is asked
-        too, and may decline. Once held the authority is kept: after a lost link it is requested again, and after a
-        pre-emption it comes back when the other application releases it.
+        A holder of lower priority is pre-empted at once. With ``takeover="ask"`` it is asked first, and pre-empted when
+        it agrees or after the proxy's ``authority.ask_s``; a holder of the same or higher priority is also asked, and
+        may decline. Once granted, the authority is kept: after a lost link it is requested again, and after a
+        pre-emption it returns when the other application releases it.
 
         Args:
             priority: 0 (highest) to 31 (lowest); None: as in the last request.
             wait_s: How long to wait in the queue [s].
-            for_s: How long the authority is wanted [s], up to a day; then others can get it. None: open.
-            takeover: ``"now"`` pre-empts a lower holder at once, ``"ask"`` asks the holder first.
+            for_s: How long to hold the authority [s], up to a day; then others can get it. None: unlimited.
+            takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
             stay: Stay in the queue after ``wait_s`` instead of raising.
 
         Returns:
-            The status: held, or with ``stay`` also queued, with the position and the expected wait.
+            The status: held or, with ``stay``, possibly queued, with the position and the expected wait.
 
         Raises:
-            AuthorityError: If it is not held after ``wait_s`` (the message names the holder), if the proxy refuses it,
-                or if this application only observes.
+            AuthorityError: If it is not granted within ``wait_s`` (the message names the holder), if the proxy refuses
+                it, or if this application only observes.
             NoAnswerError: If the proxy does not answer the request.
             UsageError: If ``priority``, ``for_s`` or ``takeover`` is out of range.
             ClosedError: If the drone was closed.
@@ -422,9 +422,9 @@ class Drone:
         return self._commands.request(request, wait_s, stay=stay)
 
     def release_authority(self) -> None:
-        """Release the authority, or leave the queue, and wait until the proxy has confirmed it.
+        """Release the authority, or leave the queue, and wait for the proxy's confirmation.
 
-        Does nothing if the authority is neither held nor wanted.
+        Does nothing if the authority is neither held nor requested.
 
         Raises:
             NoAnswerError: If the proxy does not answer.
@@ -437,67 +437,67 @@ class Drone:
         """Make ``action`` the newest set-point.
 
         Returns:
-            Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
+            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
         """
         return self._commands.command(checked(action))
 
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover.
 
-        While this waits, a take-off for which the vehicle is not ready yet is commanded again, twice a second. A call
-        that fails, a time-out and Ctrl-C included, ends the take-off: the vehicle hovers if it is in the air, else it
-        stays on the ground. Without ``wait`` a take-off that is refused is over.
+        While this waits, a take-off for which the vehicle is not ready yet is retried twice a second. A failed call,
+        including a time-out and Ctrl-C, cancels the take-off: the vehicle hovers if it is in the air, otherwise it
+        stays on the ground. Without ``wait``, a refused take-off is not retried.
 
         Args:
-            wait: Wait until the vehicle hovers or flies; else only send the command.
+            wait: Wait until the vehicle hovers or flies; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle does not hover in time; names its state and, if known, the reason.
-            RefusedError: If the proxy refuses to take off in the present state; a failsafe, a lost link, a new lease or
-                another command of this application ends it before it shows; the application lands the vehicle or stops
-                its motors meanwhile; or it lands or disarms before it hovers, whoever made it.
+            NoAnswerError: If the vehicle does not hover in time; the text has its state and, if known, the reason.
+            RefusedError: If the proxy refuses the take-off in the present state; if a failsafe, a lost link, a new
+                lease or another command of this application ends it before it shows; if the application lands the
+                vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever reason.
             UnsupportedError: If the vehicle can't take off.
-            LinkError: Without ``wait``, if the link is down; the vehicle does not take off later either.
-            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            LinkError: Without ``wait``, if the link is down; then the vehicle does not take off later, either.
+            AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; nothing is sent.
+            UsageError: If called with ``wait`` from an inline callback; then nothing is sent.
         """
         self._piloting.complete(Takeoff(), lambda feedback: feedback.state in UP, wait, timeout_s)
 
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
-        """Land at the present position.
+        """Land at the current position.
 
-        While this waits, a landing that was ended by a failsafe, a lost link or a lost lease is commanded again. Where
-        the vehicle's own link breaks the proxy goes on with the landing by itself, also if nobody waits.
+        While this waits, a landing ended by a failsafe, a lost link or a lost lease is commanded again. If the
+        vehicle's own link breaks, the proxy continues the landing, even if no one waits for it.
 
         Args:
-            wait: Wait until the vehicle has landed; else only send the command.
+            wait: Wait until the vehicle has landed; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle has not landed in time; names its state and, if known, the reason.
+            NoAnswerError: If the vehicle has not landed in time; the text has its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
-            LinkError: Without ``wait``, if the link is down; the landing is sent all the same if it is back within half
+            LinkError: Without ``wait``, if the link is down; the landing is still sent if the link is back within half
                 a second.
-            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; the landing is commanded all the same.
+            UsageError: If called with ``wait`` from an inline callback; the landing is still commanded.
         """
         self._piloting.complete(Land(), lambda feedback: feedback.state in DOWN, wait, timeout_s)
 
     def hover(self) -> bool:
-        """Stop and hold the position. Returns and raises as every command; see :class:`Drone`."""
+        """Stop and hold the position. Returns and raises as all commands do; see :class:`Drone`."""
         return self._commands.command(Hover())
 
     def idle(self) -> bool:
-        """Ask for nothing: keep the authority and leave the vehicle as it is."""
+        """Keep the authority and leave the vehicle as it is."""
         return self._commands.command(Idle())
 
     @by_name
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
-        """Fly with a velocity in the levelled body axes, which turn with the yaw but not with roll and pitch.
+        """Fly at a velocity in the levelled body axes, which turn with the yaw but not with roll and pitch.
 
         Args:
             forward: Along x, forward [m/s].
@@ -506,7 +506,7 @@ class Drone:
             yaw_rate: Counter-clockwise seen from above [rad/s].
 
         Returns:
-            Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
+            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
         """
         if not _all_finite(forward, left, up, yaw_rate):
             forward, left = number("forward", forward), number("left", left)
@@ -524,7 +524,7 @@ class Drone:
             yaw_rate: Counter-clockwise seen from above [rad/s].
 
         Returns:
-            Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
+            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
         """
         if not _all_finite(roll, pitch, climb, yaw_rate):
             roll, pitch = number("roll", roll), number("pitch", pitch)
@@ -548,40 +548,42 @@ class Drone:
         tolerance_m: float = 0.2,
         tolerance_rad: float = 0.15,
     ) -> None:
-        """Fly straight to a place, and stay there.
+        """Fly straight to a position and hold it.
 
-        World axes are those of ``Feedback.position_m``. Where the vehicle knows its place on the earth
-        (``Feedback.origin``), latitude and longitude may be given instead; they are converted when this is called.
-        ArduPilot and PX4 fly there natively, elsewhere the proxy does it by velocity. Unlike a velocity it does not
-        decay when the application falls silent: the vehicle stops there. The place is held until the next command, also
-        after a time-out; after Ctrl-C, or a cancelled task, the vehicle hovers. Nothing keeps it away from obstacles.
+        World axes are those of ``Feedback.position_m``. If the vehicle knows its place on the earth
+        (``Feedback.origin``), latitude and longitude may be given instead; they are converted during this call.
+        ArduPilot and PX4 fly there natively; for other vehicles the proxy sends velocities. Unlike a velocity, a
+        position does not decay when the application falls
+        silent: the vehicle stops there. It is held until the next command, even after a time-out; after Ctrl-C or a
+            cancelled task, the vehicle hovers. The flight does not avoid obstacles.
 
         Args:
             x: East [m].
             y: North [m].
             z: Up [m].
-            latitude_deg: [°], north positive; in place of x, y and z.
+            latitude_deg: [°], north positive; instead of x, y and z.
             longitude_deg: [°], east positive.
-            altitude_m: Above mean sea level [m]; None: the present height.
-            yaw: Counter-clockwise from x, turned to on the way [rad]; None: keep the present one.
-            speed: Greatest speed on the way [m/s]; None: as fast as ``limits.speed`` and ``limits.climb`` allow, which
-                hold in any case.
-            wait: Wait until the vehicle is there and nearly at rest; else only send the command.
+            altitude_m: Above mean sea level [m]; None: the current height.
+            yaw: Counter-clockwise from x, reached on the way [rad]; None: keep the current one.
+            speed: Maximum speed on the way [m/s]; None: as fast as ``limits.speed`` and ``limits.climb`` allow, which
+                always apply.
+            wait: Wait until the vehicle is there and nearly at rest; otherwise only send the command.
             timeout_s: How long to wait [s].
-            tolerance_m: How far from the place is near enough [m].
-            tolerance_rad: The same of ``yaw`` [rad].
+            tolerance_m: Distance from the position that counts as there [m].
+            tolerance_rad: The same for ``yaw`` [rad].
 
         Raises:
-            NoAnswerError: If the vehicle is not there in time; names its state and, if known, the reason.
-            RefusedError: If the proxy refuses it, as where the position is not known, the place is outside of the
-                safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command ends it.
-                Also if latitude and longitude are given and the vehicle does not report its place on the earth.
-            UnsupportedError: If neither the vehicle nor its proxy can fly to a place.
-            LinkError: Without ``wait``, if the link is down; the vehicle does not fly there later either.
-            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            NoAnswerError: If the vehicle is not there in time; the text has its state and, if known, the reason.
+            RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
+                outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
+                ends it. Also if latitude and longitude are given and the vehicle does not report its place on the
+                earth.
+            UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
+            LinkError: Without ``wait``, if the link is down; then the vehicle does not fly there later, either.
+            AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
-                nothing is sent.
+                then nothing is sent.
         """
         newest = self._state.newest
         age_s = math.inf if newest is None else self.age_s(newest)
@@ -600,53 +602,53 @@ class Drone:
     ) -> None:
         """Fly back to where the vehicle took off, and land there or hover.
 
-        It climbs straight up to a safe height if it is lower, kept below ``limits.altitude``, the ceiling of the room
-        and the upper wall of the safety box, flies straight over its start (:attr:`start_position`) as :meth:`go_to`
-        does, and lands. Any other command ends it, as do another pilot and a failsafe. Nothing keeps it away from
+        The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
+        room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
+        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. The flight does not avoid
         obstacles.
 
         Args:
-            height_m: Above the start, at least, on the way [m]; None: as the parameter ``return.height`` says.
-            land: Land there, else hover above it; None: as the parameter ``return.land`` says.
-            wait: Wait until it has landed, or hovers above its start; else only send the command.
+            height_m: Minimum height above the start on the way [m]; None: the parameter ``return.height``.
+            land: Land there, otherwise hover above it; None: the parameter ``return.land``.
+            wait: Wait until it has landed, or hovers above its start; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If it is not over in time; names the vehicle's state and, if known, the reason.
-            RefusedError: If the proxy refuses it, as where position or start are not known, the vehicle does not fly,
-                or a no-fly zone is in the way; or if a failsafe or another command ends it.
-            UnsupportedError: If neither the vehicle nor its proxy can fly to a place.
-            LinkError: Without ``wait``, if the link is down; the vehicle does not return later either.
-            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            NoAnswerError: If it has not ended in time; the text has the vehicle's state and, if known, the reason.
+            RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
+                flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
+            UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
+            LinkError: Without ``wait``, if the link is down; then the vehicle does not return later, either.
+            AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If an argument makes no sense, or if called with ``wait`` from an inline callback; nothing is
-                sent.
+            UsageError: If an argument makes no sense, or if called with ``wait`` from an inline callback; then nothing
+                is sent.
         """
         self._piloting.complete(return_action(height_m, land), ReturnWatch(), wait, timeout_s)
 
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
 
-        Needs no authority, only ``access="pilot"``. It is sent at once and repeated until the vehicle shows it
-        (``FlightState.EMERGENCY``), or for 8 s: then it is given up, with an event (``vehicle_message``, reason
-        ``stop_given_up``). Nothing else of this connection is sent meanwhile: :meth:`velocity`, :meth:`hover` and the
-        like return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over
-        several connections has to silence the others itself. A stop that could not be sent for 2 s is not sent later.
+        Needs no authority, only ``access="pilot"``. The stop is sent at once and repeated until the vehicle shows it
+        (``FlightState.EMERGENCY``), or for 8 s; then it is abandoned with an event (``vehicle_message``, reason
+        ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
+        return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
+        connections must silence the others itself. A stop that could not be sent for 2 s is not sent later.
 
         Returns:
-            False if it can't be sent now, because the link is down.
+            False if the link is down, so that it can't be sent now.
 
         Raises:
             AuthorityError: If this application only observes.
-            UnsupportedError: If the vehicle can't stop its motors, or takes no commands.
+            UnsupportedError: If the vehicle can't stop its motors, or has no commands.
             ClosedError: If the drone was closed.
         """
         return self._commands.command(EmergencyStop())
 
     def reset_emergency(self) -> bool:
-        """Leave the emergency state, on the ground.
+        """Leave the emergency state while on the ground.
 
-        One that is asked for while a stop of this application has not shown is sent once it has, within 2 s.
+        If a stop of this application has not shown yet, the reset is sent once it has, within 2 s.
         """
         return self._commands.command(ResetEmergency())
 
@@ -661,18 +663,18 @@ class Drone:
     ) -> bool:
         """Send the vehicle its own pose as measured from outside, for an autopilot that flies by it instead of GPS.
 
-        May be called from any thread, does not wait, and needs no authority. A vehicle that takes no poses answers with
-        an event (``command_refused``).
+        Thread-safe, does not wait, and needs no authority. A vehicle that does not accept poses answers with an event
+        (``command_refused``).
 
         Args:
             position: x east, y north, z up [m].
             quaternion: x, y, z, w of the rotation from body axes (x forward, y left, z up) to world axes.
-            at_ns: When it was measured, on the proxy's clock [ns]; None: now.
+            at_ns: Time of the measurement, on the proxy's clock [ns]; None: now.
             position_std_m: Standard deviation of the position [m], if known.
             attitude_std_rad: Standard deviation of the attitude [rad], if known.
 
         Returns:
-            Whether it was handed to the transport.
+            True if it was handed to the transport.
 
         Raises:
             AuthorityError: If this application only observes.
@@ -680,7 +682,7 @@ class Drone:
                 differs from 1 by more than 0.001, or ``at_ns`` is out of range.
         """
         if self._commands.role is not Role.PILOT:
-            text = 'send_external_pose: this application observes; connect with access="pilot"'
+            text = 'send_external_pose: this application only observes; connect with access="pilot"'
             raise AuthorityError(text, code="observer")
         check_pose(position, quaternion, position_std_m, attitude_std_rad)
         known_ns = self.now_ns if at_ns is None else checked_time(at_ns)
@@ -697,15 +699,15 @@ class Drone:
     ) -> Feedback:
         """Return the newest feedback.
 
-        An observer is sent the least that gives each of its consumers what it asks for, and every sample whole while
-        nobody asks for less; the first call of this method counts as a consumer, for good. A pilot is always sent all.
+        An observer gets the least data that satisfy all its consumers, and complete samples while no consumer limits
+        its request; the first call of this method adds a permanent consumer. A pilot always gets everything.
 
         Args:
-            max_age_s: Oldest age since capture that is accepted [s]; None: any.
-            max_hz: So many new samples a second are enough, 0.001 to 1000; None: all are wanted.
+            max_age_s: Maximum age since capture [s]; None: any.
+            max_hz: Sufficient rate of new samples, 0.001 to 1000 Hz; None: all.
 
         Raises:
-            NoAnswerError: If no feedback has come yet, or the newest is older than ``max_age_s``.
+            NoAnswerError: If there is no feedback yet, or the newest is older than ``max_age_s``.
             ClosedError: If the drone was closed.
             UsageError: If ``max_hz`` is out of range.
         """
@@ -713,7 +715,7 @@ class Drone:
         self._state.demand.keep(_feedback_request(max_hz))
         newest = self._state.newest
         if newest is None:
-            raise NoAnswerError("no feedback has come yet")
+            raise NoAnswerError("no feedback has arrived yet")
         if max_age_s is not None:
             age_s = self.age_s(newest)
             if age_s > max_age_s:
@@ -722,16 +724,16 @@ class Drone:
         return newest
 
     def overview(self, timeout_s: float = 2.0) -> Overview:
-        """Return the newest overview of all vehicles that the proxy's process serves, a row each.
+        """Return the newest overview of all vehicles in the proxy's process, with one row each.
 
-        It is sent once a second, and much smaller than feedback: for who watches many vehicles. The first call
-        subscribes to it, for good, and waits for one.
+        It is sent once a second and is much smaller than feedback, for applications that watch many vehicles. The first
+        call subscribes permanently and waits for one.
 
         Args:
             timeout_s: How long to wait for the first one [s].
 
         Raises:
-            NoAnswerError: If none comes in time, as from a proxy of an earlier version.
+            NoAnswerError: If none arrives in time, for example from an older proxy.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback before there is one.
         """
@@ -744,7 +746,7 @@ class Drone:
             self._connection.check_open()
         state.on_overview.keep()
         if state.overview is None:
-            raise NoAnswerError(f"no overview came within {timeout_s:g} s: a proxy of an earlier version sends none")
+            raise NoAnswerError(f"no overview arrived within {timeout_s:g} s: older proxies send none")
         return state.overview
 
     def age_s(self, sample: Feedback | Frame) -> float:
@@ -752,14 +754,14 @@ class Drone:
         return (self.now_ns - sample.captured_ns) / 1e9
 
     def next_feedback(self, timeout_s: float = 1.0, *, max_hz: float | None = None) -> Feedback:
-        """Wait for feedback that was not read before, and return the newest.
+        """Wait for unread feedback, and return the newest.
 
         Args:
             timeout_s: How long to wait [s].
-            max_hz: As for :meth:`feedback`; samples that other consumers ask for are returned, too.
+            max_hz: As for :meth:`feedback`; samples for other consumers are returned, too.
 
         Raises:
-            NoAnswerError: If none comes in time.
+            NoAnswerError: If none arrives in time.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback, or an option is out of range.
         """
@@ -769,20 +771,20 @@ class Drone:
         state.demand.keep(_feedback_request(max_hz))
         if not state.notifier.wait_for(lambda: state.newest is not self._read or self.closed, timeout_s):
             link = self._connection.state.value
-            raise NoAnswerError(f"no feedback came within {timeout_s:g} s: the link is {link}")
+            raise NoAnswerError(f"no feedback arrived within {timeout_s:g} s: the link is {link}")
         return self.feedback(max_hz=max_hz)
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> Frame | None:
         """Return the newest frame without waiting.
 
-        The first call subscribes to the camera, for good.
+        The first call subscribes to the camera permanently.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
-            max_age_s: Oldest age since capture that is accepted [s]; None: any.
+            max_age_s: Maximum age since capture [s]; None: any.
 
         Returns:
-            The frame; None if none has come yet, it is too old, or it can't be decoded.
+            The frame; None if none has arrived yet, it is too old, or it can't be decoded.
 
         Raises:
             UnknownNameError: If the vehicle has no camera of this name.
@@ -797,16 +799,16 @@ class Drone:
         return channel.picture(arrival)
 
     def next_frame(self, camera: str | None = None, *, timeout_s: float = 1.0) -> Frame:
-        """Wait for a frame that this method has not returned before, and return the newest.
+        """Wait for a frame that this method has not returned yet, and return the newest.
 
-        The first call subscribes to the camera, for good.
+        The first call subscribes to the camera permanently.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If none comes in time.
+            NoAnswerError: If none arrives in time.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone is closed.
@@ -814,7 +816,7 @@ class Drone:
         """
         deadline = time.monotonic() + timeout_s
         while True:
-            # Anew: the proxy may have been started again with another camera.
+            # Each time, because the proxy may have restarted with another camera.
             channel = self._state.video.channel(camera)
             channel.keep()
             self._connection.check_may_wait()
@@ -834,26 +836,26 @@ class Drone:
         timeout_s: float = 5.0,
         **how: Unpack[VideoOptions],
     ) -> Iterator[Frame]:
-        """Yield each newest frame until the drone is closed; a slow loop skips frames.
+        """Yield the newest frame repeatedly until the drone is closed; a slow loop skips frames.
 
         Errors are raised by the first iteration, not by the call.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait for each frame [s].
-            **how: ``max_fps``: at most so many frames a second. ``scale``: factor for width and height, above 0 and up
-                to 1. ``part``: (k, n), only every n-th frame, for n workers with k from 0 that share them.
-                ``encoding``: how frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80),
-                ``"h264"`` (of ``kbit_s`` kilobits a second; by default as much as the path carries, with smaller and
-                fewer pictures where that is little) or ``"raw"``; on one host all travel raw. ``max_age_s``: what is
-                older since its capture when its turn comes is left out, and counted as dropped.
+            **how: ``max_fps``: maximum frames per second. ``scale``: factor for width and height, above 0 and up to 1.
+                ``part``: (k, n), only every n-th frame, for n workers with k from 0 that share them. ``encoding``: how
+                frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80), ``"h264"`` (of
+                ``kbit_s`` kilobits a second; by default as much as the path carries, with smaller and fewer pictures
+                where that is little) or ``"raw"``; on one host all travel raw. ``max_age_s``: frames older than this
+                when their turn comes are skipped and counted as dropped.
 
         Raises:
-            NoAnswerError: If no frame comes within ``timeout_s``.
+            NoAnswerError: If no frame arrives within ``timeout_s``.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             UsageError: If an option is out of range, or from an inline callback.
-            ClosedError: If the drone was closed before.
+            ClosedError: If the drone was already closed.
         """
         channel = self._state.follow(lambda: self._state.video.channel(camera, **how))
         mailbox: Mailbox[Arrival] = Mailbox(notifier=self._state.sample_notifier())
@@ -871,19 +873,18 @@ class Drone:
                     raise self._state.no_frame(channel.current.camera.name, timeout_s)
 
     def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
-        """Wait until the newest feedback is as wanted.
+        """Wait until the newest feedback meets a condition.
 
         Args:
-            state: A flight state or its name, several of them, or a predicate on feedback, which is called on this
-                thread.
+            state: A flight state or its name, several of them, or a predicate on feedback, which runs on this thread.
             timeout_s: How long to wait [s].
 
         Returns:
-            The feedback that met it.
+            The feedback that met the condition.
 
         Raises:
-            NoAnswerError: If it is not met in time; names the present state.
-            UnknownNameError: If there is no flight state of that name.
+            NoAnswerError: If it is not met in time; the text has the current state.
+            UnknownNameError: If there is no flight state of this name.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
@@ -902,7 +903,7 @@ class Drone:
             in_time = self._state.notifier.wait_for(look, timeout_s)
         if not in_time:
             newest = self._state.newest
-            now = "nothing is known of it" if newest is None else f"it is {newest.state.value}"
+            now = "its state is unknown" if newest is None else f"it is {newest.state.value}"
             raise NoAnswerError(f"the vehicle was not {what} within {timeout_s:g} s: {now}")
         if not met:
             raise ClosedError("this drone was closed")
@@ -919,23 +920,23 @@ class Drone:
     ) -> Listener[Feedback]:
         """Call ``function`` with the newest feedback.
 
-        Like every ``on_...`` method it returns a :class:`Listener`, whose ``cancel()`` ends it, and raises
-        :class:`UsageError` if ``function`` can't be called and :class:`ClosedError` if the drone was closed.
+        Like every ``on_...`` method it returns a :class:`Listener`, whose ``cancel()`` ends the calls. It raises
+        :class:`UsageError` if ``function`` is not callable and :class:`ClosedError` if the drone was closed.
 
         Args:
-            function: Called on a thread of its own; feedback that newer feedback overtakes is dropped and counted.
+            function: Called in its own thread; feedback overtaken by newer feedback is dropped and counted.
             inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
-            max_hz: At most so many samples a second, 0.001 to 1000; None: all. An observer is sent no more, unless
-                another consumer asks for it.
+            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer gets no more, unless
+                another consumer requests more.
         """
         channel = self._state.feedback_channel(_feedback_request(max_hz))
         return self._listen(channel, function, "feedback", inline=inline)
 
     def on_overview(self, function: Callable[[Overview], object], *, inline: bool = False) -> Listener[Overview]:
-        """Call ``function`` with each overview of all vehicles that the proxy's process serves; see :meth:`overview`.
+        """Call ``function`` with each overview of all vehicles in the proxy's process; see :meth:`overview`.
 
         Args:
-            function: Called on a thread of its own, once a second.
+            function: Called in its own thread, once a second.
             inline: Call it on the receiving thread instead.
         """
         return self._listen(self._state.on_overview, function, "overview", inline=inline)
@@ -944,39 +945,39 @@ class Drone:
         """Call ``function`` with each event, including the client's own (number 0).
 
         Args:
-            function: Called on a thread of its own; up to 256 events wait for it.
-            inline: Call it on the receiving thread instead, or for the client's own events on the thread that emits
+            function: Called in its own thread; up to 256 events wait for it.
+            inline: Call it on the receiving thread instead or, for the client's own events, on the thread that emits
                 them.
         """
         return self._listen(self._state.on_event, function, "event", depth=EVENT_DEPTH, inline=inline)
 
     def on_link(self, function: Callable[[LinkStatus], object]) -> Listener[LinkStatus]:
-        """Call ``function``, on a thread of its own, whenever one of the two hops changes its state; up to 256 wait."""
+        """Call ``function``, in its own thread, whenever one of the two hops changes its state; up to 256 wait."""
         return self._listen(self._state.on_link, function, "link", depth=EVENT_DEPTH)
 
     def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
-        """Call ``function`` with what the proxy made of each command of any application.
+        """Call ``function`` with the proxy's echo of each command of any application.
 
         Args:
-            function: Called on a thread of its own; up to 256 wait for it.
+            function: Called in its own thread; up to 256 echoes wait for it.
             inline: Call it on the receiving thread instead.
         """
         return self._listen(self._state.on_command, function, "command", depth=EVENT_DEPTH, inline=inline)
 
     def on_annotation(self, function: Callable[[Annotation], object], *, inline: bool = False) -> Listener[Annotation]:
-        """Call ``function`` with what any application draws on a frame.
+        """Call ``function`` with each application's drawings on frames.
 
         Args:
-            function: Called on a thread of its own; up to 256 wait for it.
+            function: Called in its own thread; up to 256 drawings wait for it.
             inline: Call it on the receiving thread instead.
         """
         return self._listen(self._state.on_annotation, function, "annotation", depth=EVENT_DEPTH, inline=inline)
 
     def on_log(self, function: Callable[[LogEntry], object], *, inline: bool = False) -> Listener[LogEntry]:
-        """Call ``function`` with what any application logs, this one included (see ``drone.log``).
+        """Call ``function`` with each application's log entries, this one's included (see ``drone.log``).
 
         Args:
-            function: Called on a thread of its own; up to 256 entries wait for it.
+            function: Called in its own thread; up to 256 entries wait for it.
             inline: Call it on the receiving thread instead.
         """
         return self._listen(self._state.on_log, function, "log", depth=EVENT_DEPTH, inline=inline)
@@ -993,8 +994,8 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called on a thread of its own with the newest ``depth`` frames that it has not seen.
-            camera: Name of the camera; None: the vehicle's first, also once its proxy is started again with others.
+            function: Called in its own thread with the newest ``depth`` unseen frames.
+            camera: Name of the camera; None: the vehicle's first, even if the proxy restarts with other cameras.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
             **how: As for :meth:`frames`.
@@ -1032,20 +1033,20 @@ class Drone:
         depth: int = 30,
         inline: bool = False,
     ) -> Listener[EncodedFrame]:
-        """Call ``function`` with a camera's pictures as they are encoded, to store them or to send them on.
+        """Call ``function`` with a camera's encoded pictures, to store or forward them.
 
         Each is an access unit of H.264 in Annex B form that can be decoded after those before it; the first one is a
-        key picture. After a missing one nothing is given up to the next key picture, which the proxy is asked for.
-        Where ``kbit_s``, ``max_fps`` and ``scale`` are left out, pictures come as the vehicle encoded them; from a
-        vehicle that sends no H.264, encoded by the proxy at the rate that the path carries.
+        key picture. After a missing picture, the next one is a key picture, which the proxy is asked for. Without
+        ``kbit_s``, ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it sends no H.264,
+        encoded by the proxy at the rate that the path carries.
 
         Args:
-            function: Called on a thread of its own.
+            function: Called in its own thread.
             camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Encoded by the proxy at this rate, once for all who ask for the same [kbit/s].
-            max_fps: Most pictures a second; None: all.
+            kbit_s: Rate of an encoding by the proxy, shared by all who request the same [kbit/s].
+            max_fps: Maximum pictures per second; None: all.
             scale: Factor for width and height, above 0 and up to 1.
-            depth: How many pictures may wait, at least 1; if more come, some are missing.
+            depth: How many pictures may wait, at least 1; beyond that, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Returns:
@@ -1082,16 +1083,16 @@ class Drone:
         """Publish shapes drawn over a frame, for the cockpit and for recordings.
 
         Args:
-            frame: The frame that they belong to.
+            frame: The frame that the shapes belong to.
             shapes: Shapes in this frame's pixels; coordinates may be NumPy's.
-            source: Name of what drew them; None: this application. The newest drawing of each source in each camera
-                counts.
+            source: Name of the part that drew them; None: this application. Only the newest drawing of each source in
+                each camera counts.
 
         Returns:
-            Whether it was handed to the transport.
+            True if they were handed to the transport.
 
         Raises:
-            UsageError: If something is no shape, there are too many, coordinates are not finite, or colours are not
+            UsageError: If something is not a shape, there are too many, coordinates are not finite, or colours are not
                 within 0 to 255.
         """
         height, width = frame.shape[:2]
@@ -1104,12 +1105,12 @@ class Drone:
         return self._connection.transmit(packet)
 
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
-        """Emit an event of this application's own (number 0), which only its own callbacks get.
+        """Emit an event (number 0) to this application's own callbacks only.
 
         Args:
             kind: Kind of the event.
-            text: What happened, for people.
-            severity: How serious it is.
+            text: Text for people.
+            severity: Severity of the event.
             **data: Details, by name.
         """
         self._state.emit(kind, text, severity, **data)
@@ -1119,17 +1120,17 @@ class Drone:
     def result(self, processor: str, *, max_age_s: float | None = None) -> Result | None:
         """Return a processor's newest result without waiting.
 
-        The first call subscribes to the processor, for good.
+        The first call subscribes to the processor permanently.
 
         Args:
             processor: Name of the processor.
-            max_age_s: Oldest age since the frame's capture that is accepted [s]; None: any.
+            max_age_s: Maximum age since the frame's capture [s]; None: any.
 
         Returns:
-            The result; None if none has come yet or it is too old.
+            The result; None if none has arrived yet or it is too old.
 
         Raises:
-            UsageError: If ``processor`` can't be a name or ``max_age_s`` is negative.
+            UsageError: If ``processor`` is not a valid name or ``max_age_s`` is negative.
             ClosedError: If the drone was closed.
         """
         checked_age(max_age_s)
@@ -1139,20 +1140,20 @@ class Drone:
         return None if newest is None or is_old(newest, max_age_s) else newest
 
     def results(self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0) -> Iterator[Result]:
-        """Yield each newest result of a processor until the drone is closed.
+        """Yield a processor's newest result repeatedly until the drone is closed.
 
         A slow loop skips results; these and those that are too old are counted in :attr:`stats`. Errors are raised by
         the first iteration, not by the call.
 
         Args:
             processor: Name of the processor.
-            max_age_s: Oldest age since the frame's capture that is accepted [s]; None: any.
+            max_age_s: Maximum age since the frame's capture [s]; None: any.
             timeout_s: How long to wait for each result [s].
 
         Raises:
-            NoAnswerError: If no result that is new enough comes in time.
-            UsageError: If ``processor`` can't be a name, ``max_age_s`` is negative, or from an inline callback.
-            ClosedError: If the drone was closed before.
+            NoAnswerError: If no sufficiently new result arrives in time.
+            UsageError: If ``processor`` is not a valid name, ``max_age_s`` is negative, or from an inline callback.
+            ClosedError: If the drone was already closed.
         """
         mailbox = ResultMailbox(checked_age(max_age_s), self._state.scheduler.notifier())
         channel = self._state.results.channel(processor)
@@ -1177,10 +1178,10 @@ class Drone:
         """Call ``function`` with the results of one processor, or of all.
 
         Args:
-            function: Called on a thread of its own.
+            function: Called in its own thread.
             processor: Name of the processor; None: all processors.
-            max_age_s: Results older than this when their turn comes are left out, and counted in ``expired`` of the
-                listener [s]; None: none are.
+            max_age_s: Results older than this when their turn comes are skipped, and counted in the listener's
+                ``expired`` [s]; None: none are.
             depth: How many results may wait, at least 1; None: 1 for one processor, 256 for all.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
@@ -1205,14 +1206,14 @@ class Drone:
     # The end ---------------------------------------------------------------------------------------------------
 
     def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
-        """Return the checklist before a flight: what is as it should be, what is not, why it matters, what to do.
+        """Run the checklist before a flight: what is good, what is not, why it matters, and what to do.
 
-        Asks the proxy for its parameters and, of each camera, for a picture. Nothing is flown, and no authority is
-        needed.
+        It asks the proxy for its parameters and, for each camera, for a picture. It flies nothing and needs no
+        authority.
 
         Args:
-            video_s: How long to wait for pictures, in all [s]; 0: cameras are not checked.
-            folder: Where recordings are to go: whether there is room for them; None: not checked.
+            video_s: Total time to wait for pictures [s]; 0: don't check cameras.
+            folder: Folder for recordings, to check its free space; None: don't check.
 
         Raises:
             ClosedError: If the drone is closed.
@@ -1223,32 +1224,32 @@ class Drone:
         state = self._state
         before = None if state.demand.request.is_plain else state.newest
         with state.demand.wanted(PLAIN):
-            if before is not None:  # less was asked for: let a whole sample come
+            if before is not None:  # a reduced rate was requested: wait for a complete sample
                 state.notifier.wait_for(lambda: state.newest is not before, WHOLE_S)
             return inspect(self, state.newest, video_s, folder)
 
     def close(self) -> None:
         """Release the authority, then end the connection, all threads and a private proxy.
 
-        Does not land, except that a private proxy lands what flies before it ends. Idempotent. Threads that wait for
-        this drone get :class:`ClosedError`.
+        Does not land, but a private proxy lands a flying vehicle before it ends. Idempotent. Threads that wait for this
+        drone get :class:`ClosedError`.
         """
         if self.closed:
             return
         self._piloting.finish_stop()
         self._connection.why_closed = "this drone was closed: connect again"
-        self._commands.notifier.notify()  # nobody gets the authority any more
+        self._commands.notifier.notify()  # no thread gets the authority from here on
         try:
             if self._connection.connected:
                 self._commands.release(wait=not self._connection.receiving)
         except LinkError:
-            pass  # the link is lost already, and the authority with it
+            pass  # the link is already lost, and the authority with it
         finally:
             self._supervisor.close()
             listeners = list(self._state.listeners)
             for listener in listeners:
                 listener.cancel(wait=False)
-            deadline_s = time.monotonic() + JOIN_S  # for all of them
+            deadline_s = time.monotonic() + JOIN_S  # for all of them together
             for listener in listeners:
                 listener.join(max(0.0, deadline_s - time.monotonic()))
             for one in list(self._state.to_close):
@@ -1300,7 +1301,7 @@ class Drone:
     def _check_listener(self, function: Callable[[Any], object]) -> None:
         self._connection.check_open()
         if not callable(function):
-            raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
+            raise UsageError(f"{function!r:.80} is not callable: expected a function with one argument")
 
 
 def open_drone(
@@ -1311,17 +1312,17 @@ def open_drone(
     authority: Authority | None = None,
     **options: Unpack[DroneOptions],
 ) -> Drone:
-    """Connect by a dialer; applications call :func:`skyloop.connect`.
+    """Connect through a dialer; applications call :func:`skyloop.connect`.
 
     Args:
-        dial: Makes a connection to the proxy each time one is needed.
+        dial: Connects to the proxy, now and after each loss.
         app: Name of this application, 1 to 64 characters.
         timeout_s: Time for the proxy to answer, to send feedback and for the vehicle to wake up [s].
         authority: As for :func:`skyloop.connect`.
         **options: See :class:`DroneOptions`.
 
     Raises:
-        SkyloopError: As :func:`skyloop.connect`.
+        SkyloopError: The same as for :func:`skyloop.connect`.
     """
     drone = Drone(dial, app=app, **options)
     drone._connect(timeout_s=timeout_s, authority=authority)
@@ -1333,14 +1334,14 @@ def _feedback_request(max_hz: float | None) -> FeedbackRequest:
 
 
 def _from_numpy(value: Any) -> Any:
-    """NumPy's scalars and arrays as plain numbers and lists."""
+    """Convert NumPy's scalars and arrays to plain numbers and lists."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} is neither a shape nor a number")
 
 
 def _with_delay(stats: ChannelStats, statistics: Statistics | None) -> ChannelStats:
-    """The same statistics with the delay from sending to applying that the proxy has measured."""
+    """Return the statistics with the proxy's measured delay from sending to applying."""
     counters = {} if statistics is None else statistics.counters
     count = int(counters.get("commands.delay.count", 0))
     if not count:

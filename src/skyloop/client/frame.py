@@ -1,4 +1,4 @@
-"""Frames as an application sees them: NumPy arrays that know their camera, their times and the vehicle's state then."""
+"""Frames for applications: NumPy arrays with their camera, their times and the vehicle's state at capture."""
 
 from __future__ import annotations
 
@@ -32,29 +32,30 @@ else:
     _Base = np.ndarray
 
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
-HISTORY_DEPTH: Final = 256  #: samples of feedback kept: 8 s at 32 Hz
-_PNG_LEVEL: Final = 1  #: of compression: a notebook's pictures are shown at once, and rarely kept
+HISTORY_DEPTH: Final = 256  #: stored samples of feedback: 8 s at 32 Hz
+_PNG_LEVEL: Final = 1  #: compression level: a notebook shows pictures at once and rarely keeps them
 _ATTRIBUTES: Final = frozenset(
     {"camera", "seq", "captured_ns", "published_ns", "received_ns", "intrinsics", "header", "age_s"}
     | {"feedback", "feedback_reach_s"}
 )
-_THE_IMAGE: Final = frozenset({"image", "img", "pixels", "array"})  #: as other libraries call it
+_THE_IMAGE: Final = frozenset({"image", "img", "pixels", "array"})  #: names that other libraries use
 
 
 class Frame(_Base):
     """An image as a read-only BGR array of shape (height, width, 3) and dtype uint8; draw on ``frame.copy()``.
 
-    It is the array: NumPy and OpenCV take it as it is. Where a plain one is needed ``numpy.asarray(frame)`` gives the
-    same memory without the attributes below. Where possible it is the memory that the transport received, without a
-    copy. Slices, copies and results of arithmetic are plain arrays or lack the attributes below. Times are in ns:
-    ``captured_ns`` (middle of the exposure) and ``published_ns`` on the proxy's clock, ``received_ns`` on this host's.
+    It is a NumPy array, so NumPy and OpenCV accept it directly. Where a plain array is needed, ``numpy.asarray(frame)``
+    gives the same memory without the attributes below. If possible it is the memory that the transport received,
+    without a copy. Slices, copies and results of arithmetic are plain arrays or lack the attributes below. Times are in
+    ns: ``captured_ns`` (middle of the exposure) and ``published_ns`` on the proxy's clock, ``received_ns`` on this
+    host's.
     """
 
     _arrival: Arrival
 
     @property
     def header(self) -> FrameHeader:
-        """The header that came with the pixels."""
+        """The header of the pixels."""
         return self._arrival.header
 
     @property
@@ -64,7 +65,7 @@ class Frame(_Base):
 
     @property
     def seq(self) -> int:
-        """Number of the frame; grows by one with each that the camera captures, dropped ones included."""
+        """Number of the frame; grows by one with each frame of the camera, dropped ones included."""
         return self._arrival.header.seq
 
     @property
@@ -74,7 +75,7 @@ class Frame(_Base):
 
     @property
     def published_ns(self) -> int:
-        """When the proxy had the frame, on its clock [ns]."""
+        """When the proxy received the frame, on its clock [ns]."""
         return self._arrival.header.published_ns
 
     @property
@@ -94,16 +95,16 @@ class Frame(_Base):
 
     @property
     def feedback(self) -> Feedback | None:
-        """The vehicle's state at the capture, interpolated between the samples before and after it.
+        """The vehicle's state at the time of capture, interpolated between the samples before and after it.
 
-        While the later sample is still to come it is the earlier one unchanged; see :attr:`feedback_reach_s`. None if
-        nothing is known.
+        Until the later sample arrives, it is the earlier one unchanged; see :attr:`feedback_reach_s`. None if nothing
+        is known.
         """
         return self._arrival.state_at_capture()[0]
 
     @property
     def feedback_reach_s(self) -> float | None:
-        """Time from the capture to the farther sample used for :attr:`feedback` [s]; None if there is none."""
+        """Time between the capture and the more distant sample used for :attr:`feedback` [s]; None if there is none."""
         return self._arrival.state_at_capture()[1]
 
     def copy(self, order: Literal["K", "A", "C", "F"] | None = "C") -> NDArray[np.uint8]:  # type: ignore[override]
@@ -115,7 +116,7 @@ class Frame(_Base):
         return self.view(np.ndarray).copy(order)
 
     def _repr_png_(self) -> bytes | None:
-        """Return the picture as PNG, with which a notebook shows it; None for a part that is no picture."""
+        """Return the picture as PNG for display in a notebook; None for a slice that is not a picture."""
         return png(np.asarray(self))
 
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
@@ -126,20 +127,20 @@ class Frame(_Base):
     def __getattr__(self, name: str) -> NoReturn:
         if name in _ATTRIBUTES or name == "_arrival":
             raise AttributeError(
-                f"this array was derived from a frame and has no {name}: only the frame as it was delivered knows it"
+                f"this array was derived from a frame and has no {name}: only the delivered frame has it"
             )
-        if name in _THE_IMAGE:  # with a name but no object Python adds no guess of its own ("imag")
+        if name in _THE_IMAGE:  # for a name without an object, Python adds no guess of its own ("imag")
             raise AttributeError(f"a frame has no {name}: it is the image itself, a NumPy array", name=name)
         raise AttributeError(f"a frame has no attribute {name!r}")
 
 
 def png(image: NDArray[Any]) -> bytes | None:
-    """Encode an image as PNG: BGR of shape (height, width, 3), or grey of shape (height, width), uint8; else None."""
+    """Encode a uint8 image as PNG, BGR (height, width, 3) or grey (height, width); return None for any other."""
     grey = image.ndim == 2
     if image.dtype != np.uint8 or not image.size or not (grey or (image.ndim == 3 and image.shape[2] == 3)):
         return None
     height, width = image.shape[:2]
-    rows = np.zeros((height, 1 + width * (1 if grey else 3)), np.uint8)  # each begins with the kind of its filter: none
+    rows = np.zeros((height, 1 + width * (1 if grey else 3)), np.uint8)  # each starts with its filter type: none
     rows[:, 1:] = (image if grey else image[:, :, ::-1]).reshape(height, -1)
     head = struct.pack(">IIBBBBB", width, height, 8, 0 if grey else 2, 0, 0, 0)
     parts = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), _PNG_LEVEL)), (b"IEND", b""))
@@ -150,7 +151,7 @@ def png(image: NDArray[Any]) -> bytes | None:
 
 
 class Arrival:
-    """A received frame. The first consumer that asks for the image decodes it, in its own thread, for all."""
+    """A received frame. The first consumer that needs the image decodes it, in its own thread, for all."""
 
     __slots__ = (
         "_clock",
@@ -174,9 +175,9 @@ class Arrival:
         history: FeedbackHistory,
         clock: Clock = time.monotonic_ns,
     ) -> None:
-        """Keep what was received at ``received_ns``, on ``clock``, which is ``offset_ns`` behind the proxy's.
+        """Store a frame received at ``received_ns`` on ``clock``, which is ``offset_ns`` behind the proxy's.
 
-        ``history`` is looked up for the state at the capture.
+        ``history`` provides the state at the time of capture.
         """
         self.header = header
         self.received_ns = received_ns
@@ -195,7 +196,7 @@ class Arrival:
         return (self._clock() + self._offset_ns - self.header.captured_ns) / 1e9
 
     def as_came(self) -> Pixels | None:
-        """Return the bytes as the transport gave them, shape (size,); None once the image was decoded."""
+        """Return the bytes as received from the transport, shape (size,); None once the image is decoded."""
         with self._lock:
             return self._pixels
 
@@ -203,14 +204,14 @@ class Arrival:
         """Return the frame, decoded on the first call.
 
         Raises:
-            DecodeError: If the pixels are not as in the header.
+            DecodeError: If the pixels do not match the header.
             MissingExtraError: If it is a JPEG and OpenCV is not installed.
         """
         with self._lock:
             frame = self._frame() if self._frame is not None else None
             if frame is None:
                 frame = self._make()
-                self._frame = weakref.ref(frame)  # weak, as the frame refers to this: no reference cycle
+                self._frame = weakref.ref(frame)  # weak, because the frame refers to this object: no reference cycle
             return frame
 
     def _picture(self) -> NDArray[np.uint8]:
@@ -230,9 +231,9 @@ class Arrival:
         return frame
 
     def state_at_capture(self) -> tuple[Feedback | None, float | None]:
-        """Return the vehicle's state at the capture and its reach [s]; see :attr:`Frame.feedback_reach_s`.
+        """Return the vehicle's state at the time of capture and its reach [s]; see :attr:`Frame.feedback_reach_s`.
 
-        Looked up again until there is a sample on both sides of the capture.
+        The look-up is repeated until there is a sample on each side of the capture.
         """
         if self._state is not None:
             return self._state
@@ -243,7 +244,7 @@ class Arrival:
 
 
 class SmallArrival(Arrival):
-    """A frame that was received larger than this consumer wants, and is scaled down when it is decoded."""
+    """A frame received larger than its consumer requested, and scaled down during decoding."""
 
     __slots__ = ("_full",)
 
@@ -257,14 +258,14 @@ class SmallArrival(Arrival):
         clock: Clock,
         scale: float,
     ) -> None:
-        """Keep what was received; ``header`` describes it as received, ``scale`` is the factor for width and height."""
+        """Store a frame; ``header`` describes it as received, ``scale`` is the factor for width and height."""
         small = msgspec.structs.replace(scaled_header(header, scale), encoding=Encoding.BGR8)
         small = msgspec.structs.replace(small, size=small.width * small.height * 3)
         super().__init__(small, pixels, received_ns, offset_ns, history, clock)
         self._full = header
 
     def as_came(self) -> Pixels | None:
-        """Return None: the frame was not received in this size."""
+        """Return None, because the frame was not received in this size."""
         return None
 
     def _picture(self) -> NDArray[np.uint8]:
@@ -274,11 +275,11 @@ class SmallArrival(Arrival):
 
 
 def compressed(frame: Frame, quality: int = 95) -> Arrival:
-    """Return a frame as a JPEG, to keep many of them: :meth:`Arrival.frame` makes it a frame again.
+    """Return a frame as a JPEG, to store many of them; :meth:`Arrival.frame` decodes it.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
-        LinkError: OpenCV could not make a JPEG of it.
+        LinkError: OpenCV could not encode it as JPEG.
     """
     from_ = frame._arrival
     plain = msgspec.structs.replace(frame.header, encoding=Encoding.BGR8, size=frame.size)
@@ -289,7 +290,7 @@ def compressed(frame: Frame, quality: int = 95) -> Arrival:
 
 
 def size_error(header: FrameHeader, size: int) -> str:
-    """Return why ``size`` bytes can't be the frame that ``header`` announces; empty if they can."""
+    """Return why ``size`` bytes can't be the frame announced by ``header``; empty if they can."""
     channels = _CHANNELS.get(header.encoding)
     expected = header.size if channels is None else header.width * header.height * channels
     if size == expected:
@@ -298,10 +299,10 @@ def size_error(header: FrameHeader, size: int) -> str:
 
 
 def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
-    """Convert the bytes of a frame to BGR, shape (height, width, 3), uint8; the same memory if they are BGR already.
+    """Convert a frame's bytes to BGR, shape (height, width, 3), uint8, without a copy if they are BGR.
 
     Raises:
-        DecodeError: If the pixels are no JPEG of the size in the header.
+        DecodeError: If the pixels are not a JPEG of the size in the header.
         MissingExtraError: If they are a JPEG and OpenCV is not installed.
     """
     height, width = header.height, header.width
@@ -337,7 +338,7 @@ class FeedbackHistory:
         self._samples: deque[Feedback] = deque(maxlen=depth)
 
     def add(self, sample: Feedback) -> None:
-        """Add a sample; one captured before the newest (a restarted proxy's) restarts the history."""
+        """Add a sample; one captured before the newest, from a restarted proxy, restarts the history."""
         samples = self._samples
         if samples and sample.captured_ns < samples[-1].captured_ns:
             samples.clear()
@@ -350,9 +351,9 @@ class FeedbackHistory:
             captured_ns: The time.
 
         Returns:
-            The state, its reach [s], and whether there was a sample on both sides. The reach is the time to the farther
-            sample used. With samples on one side only the state is the nearest sample unchanged; with none, state and
-            reach are None.
+            The state, its reach [s], and whether there was a sample on each side. The reach is the time to the more
+            distant sample used. With samples on one side only, the state is the nearest sample unchanged; with none,
+            state and reach are None.
         """
         samples = list(self._samples)
         if not samples:
@@ -369,9 +370,9 @@ class FeedbackHistory:
 
 
 def interpolate(a: Feedback, b: Feedback, captured_ns: int) -> Feedback:
-    """Return the state between two samples, linear in time, angles along the shorter way.
+    """Return the state between two samples, linear in time, with angles along the shorter way.
 
-    What only one of them has, and what can't be interpolated (states, names), is taken from the nearer one.
+    Fields that only one of them has, or that can't be interpolated (states, names), come from the nearer one.
 
     Args:
         a: The earlier sample.

@@ -1,4 +1,4 @@
-"""Judgements from the times at which things arrive: state of the hop to the proxy, its clock, statistics. Pure."""
+"""Judge a connection by arrival times: the state of the hop to the proxy, its clock, statistics. Pure."""
 
 from __future__ import annotations
 
@@ -13,70 +13,69 @@ from numpy.typing import NDArray
 from skyloop.clock import nanoseconds
 from skyloop.messages import LinkState
 
-#: Largest relative drift: quartz is accurate to 50 ppm, and time services correct its rate by as much again; both
-#: clocks may do so in opposite directions.
+#: Maximum relative drift: quartz is accurate to 50 ppm, and time services correct its rate by as much again; both
+#: clocks may deviate in opposite directions.
 MAX_DRIFT: Final = 200e-6
-DEPTH: Final = 1024  #: samples kept of each channel, a power of two
+DEPTH: Final = 1024  #: stored samples of each channel, a power of two
 
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
     """When a link counts as degraded and as lost."""
 
-    late_s: float = 0.3  #: no feedback for this long: degraded
-    silent_s: float = 1.0  #: nothing at all for this long: lost, and reconnected
-    missing_share: float = 0.1  #: share of the last window's samples missing or malformed: degraded
+    late_s: float = 0.3  #: time without feedback before the link is degraded
+    silent_s: float = 1.0  #: time without any packet before the link is lost and reconnected
+    missing_share: float = 0.1  #: share of missing or malformed samples in the last window that makes the link degraded
     window_s: float = 1.0
-    malformed: int = 5  #: this many malformed packets within a window: lost, and reconnected
+    malformed: int = 5  #: malformed packets within a window that make the link lost and reconnected
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the monitor concludes from the arrivals so far."""
+    """The monitor's verdict on the arrivals so far."""
 
     state: LinkState
     reason: str
-    restart: bool = False  #: the connection should be closed and made again
+    restart: bool = False  #: the connection should be closed and re-established
 
 
 _Counts = tuple[int, int, int]  #: at_ns, received, missing: totals at some time
 
-#: Silence that a slow rate of feedback excuses, at most [s]: a link that is asked less often is checked by pings.
+#: Maximum silence that a low rate of feedback excuses [s]: a link with a lower rate is checked by pings.
 MAX_PATIENCE_S: Final = 2.0
-WINDOW_PERIODS: Final = 10.0  #: samples over which the share of missing ones is taken, at least
+WINDOW_PERIODS: Final = 10.0  #: minimum number of samples for the share of missing ones
 
 
 class LinkMonitor:
-    """Watches one connection. Its other methods cost a few attribute writes; :meth:`verdict` does the work.
+    """Watches one connection. :meth:`verdict` does the work; the other methods cost a few attribute writes.
 
-    Samples of a connection carry numbers that grow by one: a gap is what was lost, less what the proxy left out because
-    fewer samples were asked for.
+    Samples carry consecutive numbers: a gap, less the samples that the proxy left out for a lower rate, is a loss.
     """
 
     def __init__(self, thresholds: Thresholds, now_ns: int) -> None:
         self._limits = thresholds
-        self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: silence after which to ask
+        self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: silence after which to ping
         self._silent_ns = nanoseconds(thresholds.silent_s)
         self._window_ns = self._malformed_window_ns = nanoseconds(thresholds.window_s)
-        self._no_gaps_ns = 0  # until then a gap may come from a change of what was asked for
-        self.received_ns = now_ns  #: when anything valid came last
-        self.feedback_ns = 0  #: when feedback came last; 0 for never
+        self._no_gaps_ns = 0  # until then, gaps may come from a change of the request
+        self.received_ns = now_ns  #: when any valid packet last arrived
+        self.feedback_ns = 0  #: when feedback last arrived; 0 for never
         self.received = 0  #: samples of feedback
-        self.missing = 0  #: samples missing by the gaps in their numbers
+        self.missing = 0  #: samples missing, judged by gaps in their numbers
         self.malformed_count = 0
         self._last_seq: int | None = None
         self._past: deque[_Counts] = deque([(now_ns, 0, 0)])
         self._past_malformed: deque[tuple[int, int]] = deque([(now_ns, 0)])
 
     def excuse(self, silence_s: float) -> None:
-        """Take a link for lost only after so much longer a silence: of a network that is silent now and then [s]."""
+        """Tolerate this much more silence before the link counts as lost, for networks with pauses [s]."""
         self._limits = replace(self._limits, silent_s=self._limits.silent_s + silence_s)
         self._silent_ns += nanoseconds(silence_s)
 
     def expect(self, period_s: float, now_ns: int) -> None:
-        """Judge from now on by the time that may pass between two samples of feedback [s]; 0: all are sent."""
+        """Set the expected time between two samples of feedback [s]; 0: all are sent."""
         limits, patience_s = self._limits, min(period_s, MAX_PATIENCE_S)
-        # A switch loses no sample, but leaves a gap in the numbers, and time passes before the first one comes.
+        # A switch loses no samples, but leaves a gap in the numbers and takes time until the first new sample.
         self._no_gaps_ns = now_ns + nanoseconds(limits.window_s)
         self.received_ns = max(self.received_ns, now_ns)
         if self.feedback_ns:
@@ -87,9 +86,9 @@ class LinkMonitor:
         self._window_ns = nanoseconds(max(limits.window_s, WINDOW_PERIODS * patience_s))
 
     def feedback(self, seq: int, now_ns: int, skipped: int = 0) -> bool:
-        """Note a sample of feedback, before which the proxy left out ``skipped``.
+        """Note a sample of feedback; the proxy left out ``skipped`` samples before it.
 
-        Returns False if it is repeated or was overtaken by a newer one.
+        Returns False if it is a duplicate or was overtaken by a newer one.
         """
         self.received_ns = now_ns
         last = self._last_seq
@@ -104,7 +103,7 @@ class LinkMonitor:
         return True
 
     def _gap(self, gap: int, skipped: int, now_ns: int) -> None:
-        """Count the samples that are missing between two, where ``skipped`` are left out before each."""
+        """Count the samples missing between two, given that ``skipped`` were left out before each."""
         if gap > skipped and now_ns >= self._no_gaps_ns:
             self.missing += -((skipped - gap) // (skipped + 1))
 
@@ -113,7 +112,7 @@ class LinkMonitor:
         self.malformed_count += 1
 
     def verdict(self, now_ns: int) -> Verdict:
-        """Return the present state and why. To be called some twenty times a second."""
+        """Return the current state and its reason. Call it about twenty times a second."""
         received, missing, malformed = self._window(now_ns)
         silent_ns = now_ns - self.received_ns
         if silent_ns > self._silent_ns:
@@ -131,7 +130,7 @@ class LinkMonitor:
         return Verdict(LinkState.UP, "")
 
     def _window(self, now_ns: int) -> tuple[int, int, int]:
-        """How many samples were received, missing and malformed within the window."""
+        """Return how many samples were received, missing and malformed within the window."""
         past, past_malformed = self._past, self._past_malformed
         past.append((now_ns, self.received, self.missing))
         while len(past) > 2 and past[1][0] <= now_ns - self._window_ns:
@@ -144,20 +143,20 @@ class LinkMonitor:
 
 
 class StallWatch:
-    """Tells when one channel has stalled although the others flow, so that it is subscribed to again.
+    """Detects that one channel has stalled while others flow, so that it is resubscribed.
 
-    After a silence of all of them it has as much time as before, as it may come last.
+    After a silence of all channels, the time starts again, because this channel may be the last to return.
     """
 
     def __init__(self, patience_s: float, now_ns: int) -> None:
-        """Start watching a channel that counts as stalled after a silence of ``patience_s``."""
+        """Start to watch a channel, which counts as stalled after a silence of ``patience_s``."""
         self._patience_ns = nanoseconds(patience_s)
-        self.received_ns = now_ns  #: when something came on this channel last
+        self.received_ns = now_ns  #: when this channel last got something
         self._asked_ns = now_ns
-        self._flow_ns = now_ns  # since when the others do
+        self._flow_ns = now_ns  # since when the others flow
 
     def stalled(self, others_flow: bool, now_ns: int) -> bool:
-        """Return whether to subscribe again now; True at most once in ``patience_s``."""
+        """Return whether to resubscribe now; True at most once in ``patience_s``."""
         if not others_flow:
             self._flow_ns = now_ns
         if now_ns - max(self.received_ns, self._asked_ns, self._flow_ns) <= self._patience_ns:
@@ -168,7 +167,7 @@ class StallWatch:
 
 @dataclass(frozen=True, slots=True)
 class Offset:
-    """The proxy's clock minus this process's clock, and the largest error of that, both in ns."""
+    """The proxy's clock minus this process's clock, and its maximum error, both in ns."""
 
     ns: int = 0
     uncertainty_ns: int = 0
@@ -176,7 +175,7 @@ class Offset:
 
 @dataclass(frozen=True, slots=True)
 class _Trip:
-    sent_ns: int  # on our clock; since then the offset has changed by the drift at most
+    sent_ns: int  # on our clock; since then, the drift bounds the offset's change
     low_ns: int
     high_ns: int
 
@@ -184,14 +183,14 @@ class _Trip:
 class OffsetEstimator:
     """Estimates the offset between two monotonic clocks from round trips.
 
-    The answer was written between sending and receiving, which bounds the offset whatever each direction took
-    (Cristian, "Probabilistic clock synchronization", 1989). The bounds of a round trip grow apart with time by what the
-    clocks may drift, and the truth lies within the bounds of all round trips (Marzullo and Owicki, "Maintaining the
-    time in a distributed system", 1983).
+    The proxy wrote its answer between sending and receiving, which bounds the offset whatever the delay in each
+    direction (Cristian, "Probabilistic clock synchronization", 1989). The bounds of a round trip widen over time with
+    the possible drift of the clocks, and the truth lies within the bounds of all round trips (Marzullo and Owicki,
+    "Maintaining the time in a distributed system", 1983).
     """
 
     def __init__(self, depth: int = 16, max_drift: float = MAX_DRIFT) -> None:
-        """Start with an offset of 0; ``max_drift``: largest relative difference in rate between the clocks."""
+        """Start with an offset of 0; ``max_drift``: maximum relative difference of the clocks' rates."""
         self._trips: deque[_Trip] = deque(maxlen=depth)
         self._max_drift = max_drift
 
@@ -234,18 +233,18 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class ChannelStats:
-    """Statistics of one channel since the drone was connected. None where nothing is known.
+    """Statistics of one channel since the drone was connected. Unknown values are None.
 
     Attributes:
         count: Samples received; for commands, sent.
-        rate_hz: Samples a second, over the last two seconds.
-        lost: Samples missing by the gaps in their numbers; for video including those that the proxy left out.
-        dropped: Samples that newer ones pushed out before their consumer took them; for commands, those that could not
-            be handed to the transport.
-        malformed: Samples that could not be decoded.
-        delay_s: From publishing to receiving, of the last 1024 samples; for commands, from sending to applying.
-        age_s: From the newest sample's capture until now.
-        uncertainty_s: Largest error of ``delay_s`` and ``age_s`` from comparing two hosts' clocks; 0 on one host.
+        rate_hz: Samples per second, over the last two seconds.
+        lost: Samples missing, judged by gaps in their numbers; for video including those that the proxy left out.
+        dropped: Samples replaced by newer ones before their consumer took them; for commands, those that the transport
+            did not accept.
+        malformed: Undecodable samples.
+        delay_s: From publishing to receiving, for the last 1024 samples; for commands, from sending to applying.
+        age_s: Time since the newest sample's capture.
+        uncertainty_s: Maximum error of ``delay_s`` and ``age_s`` from comparing two hosts' clocks; 0 on one host.
     """
 
     count: int = 0
@@ -285,11 +284,11 @@ class ChannelCounter:
         self.lost = 0
         self.dropped = 0
         self.malformed = 0
-        self.captured_ns: int | None = None  #: of the newest, on our clock
+        self.captured_ns: int | None = None  #: of the newest sample, on our clock
         self.last_seq: int | None = None
 
     def add(self, delay_ns: int, captured_ns: int, now_ns: int) -> None:
-        """Count a sample that was captured and arrived at these times on this process's clock."""
+        """Count a sample with these times of capture and arrival on this process's clock."""
         place = self.count & (DEPTH - 1)
         self._arrivals[place] = now_ns
         self._delays[place] = delay_ns
@@ -306,7 +305,7 @@ class ChannelCounter:
     def stats(
         self, now_ns: int, *, lost: int = 0, dropped: int = 0, malformed: int = 0, ages: bool = True
     ) -> ChannelStats:
-        """Return the statistics at ``now_ns``; what is given is added to what was counted here.
+        """Return the statistics at ``now_ns``; the arguments are added to the counts here.
 
         ``ages``: whether ``age_s`` is meaningful for this channel.
         """
@@ -325,7 +324,7 @@ class ChannelCounter:
 
 
 def _rate(arrivals_ns: NDArray[np.int64], now_ns: int) -> float:
-    """Samples per second over the last two seconds, or over the time since the first if that is shorter."""
+    """Return samples per second over the last two seconds, or since the first sample if that is shorter."""
     recent = arrivals_ns[arrivals_ns > now_ns - 2_000_000_000]
     if recent.size < 2:
         return 0.0

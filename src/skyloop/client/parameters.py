@@ -36,11 +36,11 @@ _NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusa
 
 
 class Restorer:
-    """Writes parameters again after the proxy was restarted, and with that forgot what the application wrote.
+    """Rewrites parameters after the proxy restarted and so forgot the application's values.
 
-    Only values, never momentary parameters, and only if nobody else can have written since: a lost link alone changes
+    Only values, never momentary parameters, and only if no one else can have written since: a lost link alone changes
     nothing at the proxy, and other pilots' newer values stay. Leases are numbered from 1 in each run of the proxy, so a
-    gap between two of our own shows that another application held the authority, and may have written, in between.
+    gap between two of our own shows that another application held the authority in between, and may have written.
     """
 
     def __init__(self, connection: ProxyConnection, emit: Emit) -> None:
@@ -49,12 +49,12 @@ class Restorer:
         self._lock = threading.Lock()
         self._written: dict[str, Value] = {}
         self._run_id = 0
-        self._lease = 0  # the last of our own in this run
-        self._missed = False  # events were missed since that lease: the connection was lost
-        self._restore = False  # the proxy was restarted since the values were written
+        self._lease = 0  # our last one in this run
+        self._missed = False  # the connection was lost since that lease, so events may be missing
+        self._restore = False  # the proxy has restarted since the values were written
 
     def written(self, parameter: Parameter) -> None:
-        """Note what the application has written."""
+        """Note a value that the application has written."""
         if not parameter.momentary:
             with self._lock:
                 self._written[parameter.name] = parameter.value
@@ -73,7 +73,7 @@ class Restorer:
                 self._run_id, self._lease = run_id, 0
 
     def granted(self, lease: int) -> None:
-        """Write what a restarted proxy has forgotten, now that the authority is held. Does not wait."""
+        """Rewrite the values that a restarted proxy forgot, now that the authority is held. Does not wait."""
         with self._lock:
             others, self._lease = self._missed and lease != self._lease + 1, lease
             restore, written = self._restore, dict(self._written)
@@ -82,7 +82,7 @@ class Restorer:
                 self._written.clear()
         if restore and others and written:
             names = ", ".join(sorted(written))
-            text = f"the proxy was restarted and others have flown since: {names} not written again, set them if needed"
+            text = f"the proxy restarted and others have flown since: {names} were not restored, set them if needed"
             self._emit(EventKind.PARAMETER_CHANGED, text, Severity.WARNING, reason="others")
         elif restore:
             for name, value in written.items():
@@ -94,19 +94,19 @@ class Restorer:
                 with self._lock:
                     self._restore = True  # lost again: retried with the next grant
             elif isinstance(answer, Refused):
-                text = f"{name} could not be set to {value!r} again: {answer.message}"
+                text = f"{name} could not be restored to {value!r}: {answer.message}"
                 self._emit(EventKind.PARAMETER_CHANGED, text, name=name, reason=answer.code.value)
 
         return done
 
 
 class Config(Mapping[str, Value]):
-    """Parameters as a mapping from name to value, each access one request to the proxy.
+    """Parameters as a mapping from name to value; each access is a request to the proxy.
 
-    ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority.
-    After a restart of the proxy, which forgets them, the values that were written are written again with the next grant
-    of the authority, unless another application held it in between. Momentary parameters, such as a flip, never are.
-    Every method waits for the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
+    ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority. A
+    restarted proxy forgets written values; they are rewritten with the next grant of the authority, unless another
+    application held it in between. Momentary parameters, such as a flip, never are. Every method waits for the proxy's
+    answer and raises :class:`NoAnswerError` after 2 s without one.
     """
 
     def __init__(self, connection: ProxyConnection, authority: AuthorityTracker, restorer: Restorer) -> None:
@@ -115,7 +115,7 @@ class Config(Mapping[str, Value]):
         self._restorer = restorer
 
     def __getitem__(self, name: str) -> Value:
-        """Return the present value.
+        """Return the current value.
 
         Raises:
             UnknownNameError: If there is no such parameter; carries suggestions.
@@ -129,8 +129,8 @@ class Config(Mapping[str, Value]):
             ParameterError: If the proxy refuses it, with its reason.
             AuthorityError: If the authority is not held.
             UnknownNameError: If there is no such parameter; carries suggestions.
-            UsageError: If the value is of no type that a parameter can have.
-            LinkError: If the link broke before the answer and the parameter is momentary: once may have been enough.
+            UsageError: If the value's type is not one of a parameter.
+            LinkError: If the link broke before the answer and the parameter is momentary: it may have been executed.
         """
         plain = plain_value(name, value)
         answer = self._call(
@@ -139,18 +139,18 @@ class Config(Mapping[str, Value]):
             may_repeat=lambda: not self.describe(name).momentary,
         )
         if not isinstance(answer, ParameterValue):
-            raise LinkError(f"the proxy answered the writing of {name} with {type(answer).__name__}")
+            raise LinkError(f"the proxy answered a write of {name} with {type(answer).__name__}")
         self._restorer.written(msgspec.structs.replace(answer.parameter, value=plain))
 
     def describe(self, name: str) -> Parameter:
-        """Return all that is known of a parameter: type, unit, range, default, value, description.
+        """Return a parameter's type, unit, range, default, value and description.
 
         Raises:
             UnknownNameError: If there is no such parameter; carries suggestions.
         """
         answer = self._call(name, lambda: GetParameter(_name(name)))
         if not isinstance(answer, ParameterValue):
-            raise LinkError(f"the proxy answered the reading of {name} with {type(answer).__name__}")
+            raise LinkError(f"the proxy answered a read of {name} with {type(answer).__name__}")
         return answer.parameter
 
     def parameters(self) -> list[Parameter]:
@@ -160,7 +160,7 @@ class Config(Mapping[str, Value]):
             first = len(found)
             page = self._connection.call(lambda first=first: ListParameters(first), ANSWER_S)  # type: ignore[misc]
             if not isinstance(page, ParameterPage):
-                raise LinkError(f"the proxy answered the list of parameters with {type(page).__name__}")
+                raise LinkError(f"the proxy answered a request for the parameters with {type(page).__name__}")
             found += page.parameters
             if not page.parameters or len(found) >= page.total:
                 return found
@@ -174,7 +174,7 @@ class Config(Mapping[str, Value]):
     def __contains__(self, name: object) -> bool:
         return any(parameter.name == name for parameter in self.parameters())
 
-    def items(self) -> list[tuple[str, Value]]:  # type: ignore[override]  # one request for all, not one for each name
+    def items(self) -> list[tuple[str, Value]]:  # type: ignore[override]  one request for all names
         """Return (name, value) of all parameters, sorted by name."""
         return [(parameter.name, parameter.value) for parameter in self.parameters()]
 
@@ -199,14 +199,14 @@ class Config(Mapping[str, Value]):
 
 def _name(name: object) -> str:
     if not isinstance(name, str) or not 1 <= len(name) <= 128:
-        raise UsageError(f"a parameter's name is a text of 1 to 128 characters, not {name!r}")
+        raise UsageError(f"a parameter's name must be a text of 1 to 128 characters, got {name!r}")
     return name
 
 
 def plain_value(name: str, value: object) -> Value:
-    """Return a value that can be sent: bool, int, float, str (up to 4096 characters) or a tuple of up to 256 floats.
+    """Return a value to send: a bool, int, float, str (up to 4096 characters) or tuple of up to 256 floats.
 
-    It may be given as a list or an array of numbers, or a NumPy scalar. Raises :class:`UsageError` for anything else.
+    Lists and arrays of numbers and NumPy scalars are converted. Raises :class:`UsageError` for anything else.
     """
     if isinstance(value, np.ndarray) and not value.ndim:
         value = value.item()
@@ -223,6 +223,6 @@ def plain_value(name: str, value: object) -> Value:
         if all(isinstance(one, numbers.Real) for one in many):
             return tuple(float(one) for one in many)
     raise UsageError(
-        f"{name} can't be {value!r:.80}: a bool, a number, a text (up to {MAX_TEXT} characters) or a list of up to "
-        f"{MAX_NUMBERS} numbers is needed"
+        f"{name} can't be {value!r:.80}: use a bool, a number, a text (up to {MAX_TEXT} characters) or a list of up to "
+        f"{MAX_NUMBERS} numbers"
     )

@@ -1,4 +1,4 @@
-"""What an application has its vehicle do: the wait for a command, letting go, and the end of the flight."""
+"""An application's piloting of its vehicle: waiting for commands, letting go, and the end of the flight."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ from skyloop.messages import (
 from skyloop.messages.command import ENDINGS, SET_POINTS
 
 OnExit = Literal["land", "hover"]
-STOP_S: Final = 2.0  #: how long closing waits for an emergency stop to show
-LANDING_S: Final = 20.0  #: how long a landing is waited for
-OTHERS_S: Final = 1.0  #: within which feedback says who took a vehicle whose landing was refused
-RETURN_S: Final = 180.0  #: how long a return that the proxy began is waited for
-AGAIN_NS: Final = 500_000_000  #: between a take-off that is not possible yet and the next attempt
-#: Where the proxy does not tell: feedback received sooner after a command may be older than it.
+STOP_S: Final = 2.0  #: how long closing waits for an emergency stop to show [s]
+LANDING_S: Final = 20.0  #: how long to wait for a landing [s]
+OTHERS_S: Final = 1.0  #: time for feedback to show who took a vehicle whose landing was refused [s]
+RETURN_S: Final = 180.0  #: how long to wait for a return that the proxy started [s]
+AGAIN_NS: Final = 500_000_000  #: between attempts of a take-off that is not possible yet
+#: For proxies that report no outcome: feedback received sooner after a command may be older than it.
 _STALE_NS: Final = 100_000_000
 _NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -61,7 +61,7 @@ def _silent(step: str) -> None:
 
 
 class Piloting:
-    """What one application has its vehicle do, up to the end of the flight. May be used from any thread."""
+    """One application's piloting of its vehicle, up to the end of the flight. Thread-safe."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class Piloting:
         self._state = state
         self._on_exit = on_exit
         self._close = close
-        self._end = threading.Lock()  # one end of the flight, whoever asks for it
+        self._end = threading.Lock()  # only one end of the flight at a time, whoever requests it
         leave_to_parent(self)
 
     @property
@@ -87,11 +87,11 @@ class Piloting:
 
     @property
     def ending(self) -> bool:
-        """Whether the end of the flight has begun, or it is closed."""
+        """Whether the end of the flight has begun, or the drone is closed."""
         return self.closed or self.commands.barred
 
     def forked(self) -> None:
-        """Leave the vehicle and the connection to the parent process; in a child made by ``os.fork``."""
+        """Leave the vehicle and the connection to the parent process; called in a child of ``os.fork``."""
         if not self.closed:
             self._connection.forked()
 
@@ -106,13 +106,13 @@ class Piloting:
     ) -> None:
         """Send the command and, if ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`.
 
-        A take-off that is not done in time lets the vehicle go. So does a caller that waits no longer, as after Ctrl-C,
-        but for a landing.
+        After a take-off that is not done in time, let the vehicle go. Also if the caller stops waiting, for example
+        after Ctrl-C, unless it waited for a landing.
         """
         if not wait:
             self.commands.command(action, now=True)
             return
-        if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
+        if type(action) is not Land:  # a landing is commanded in any case: nothing is safer
             self._connection.check_may_wait()
         deadline_s = time.monotonic() + timeout_s
         waiting = None
@@ -127,26 +127,26 @@ class Piloting:
         except BaseException as error:
             unasked = isinstance(error, GivenUpError) and (waiting is None or waiting.outdone)
             if type(action) is not Land and not unasked:
-                self.let_go(f"nobody waits for {action.name} any more")
+                self.let_go(f"the call no longer waits for {action.name}")
             raise
 
     def report(self, where: str, error: Exception | SystemExit) -> None:
-        """Emit an event that a callback of the application raised an exception; ``sys.exit()`` ends the flight."""
+        """Emit an event for an exception in an application's callback; ``sys.exit()`` ends the flight."""
         text = f"{where} raised {type(error).__name__}: {error}"
         self._state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
         if isinstance(error, SystemExit) and not self.ending:
             self.commands.bar()
-            try:  # no daemon: the interpreter waits for the landing
+            try:  # not a daemon: the interpreter must wait for the landing
                 threading.Thread(target=self.end_flight, name="skyloop-end").start()
-            except RuntimeError:  # there is none to be had, and this one may not wait
+            except RuntimeError:  # no thread is available, and this one may not wait
                 self.let_go(f"{where} ended the program", land=True)
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
-        """Hover, or land, because the library finds that it has to: the only place where it does so by itself.
+        """Hover or land because the library decides that it must: the only place where it does so on its initiative.
 
-        Nobody decided that, so a vehicle that others fly, that lands or that returns is left alone, here and by the
-        proxy, and so is what the application itself has landed or stopped. A take-off that does not show is ended.
-        With ``land`` it lands, rather than hovers. Returns whether something was sent.
+        No person decided it, so the vehicle is left alone, here and by the proxy, if others fly it or it is landing or
+        returning, and also if the application itself has landed or stopped it. A take-off that does not show is
+        cancelled. With ``land`` it lands rather than hovers. Returns whether something was sent.
         """
         commands, feedback, kind = self.commands, self._state.newest, type(self.commands.newest)
         if self.closed or kind in LANDING or (kind is Hover and not land):
@@ -168,13 +168,13 @@ class Piloting:
         return sent
 
     def end_flight(self, report: Callable[[str], object] = _silent) -> SkyloopError | None:
-        """End the flight: land what this application flies, or hover (see ``on_exit``), then close.
+        """End the flight: land or hover (see ``on_exit``) if this application flies the vehicle, then close.
 
-        From its first line on commands of the application's other threads raise :class:`ClosedError`; only an emergency
-        stop still passes. Waits until the vehicle has landed. A second call waits for the first. Idempotent. ``report``
-        is called with each step, for people. Returns what went wrong; None if nothing did.
+        From the start, commands from the application's other threads raise :class:`ClosedError`; only an emergency stop
+        still passes. Waits until the vehicle has landed. A second call waits for the first. Idempotent. ``report`` is
+        called with a text for each step. Returns the error, or None.
         """
-        if self.closed:  # also in a fork, where somebody may have held the locks
+        if self.closed:  # also in a fork, where another thread may have held the locks
             return None
         self.commands.bar()
         with self._end:
@@ -187,20 +187,20 @@ class Piloting:
     def bring_down(
         self, reason: str, report: Callable[[str], object] = _silent, *, land: bool = True
     ) -> SkyloopError | None:
-        """Land what this application flies and wait until it has landed, or let it go; see :meth:`end_flight`."""
+        """Land and wait for the landing if this application flies the vehicle, or let go; see :meth:`end_flight`."""
         self.finish_stop()
         feedback = self._state.newest
         if not self._flies():
             if feedback is not None and feedback.state.airborne and (whose := self._others_hands()):
-                if land and feedback.others:  # which may be a flight of ours whose link was lost for a minute
-                    _log.warning("%s: %s: it stays in the air, and nobody lands it", self._state.name, whose)
-                report(f"{whose}: the drone is left to it")
+                if land and feedback.others:  # it may be a flight of ours whose link was lost for a minute
+                    _log.warning("%s: %s: it stays in the air, not landed from here", self._state.name, whose)
+                report(f"{whose}: leaving the drone to it")
             return None
         try:
             if not land:
                 self.let_go(reason)
             elif feedback is not None and _returns(feedback):
-                report("it returns to its start and lands")
+                report("it is returning to its start to land")
                 self._connection.check_may_wait()
                 if not self._state.notifier.wait_for(lambda: self._is_down() or cancelled.get()(), RETURN_S):
                     return NoAnswerError(f"the vehicle has not returned and landed within {RETURN_S:g} s")
@@ -210,13 +210,13 @@ class Piloting:
         except RefusedError as error:
             if not self._state.notifier.wait_for(lambda: self._others_hands() != "", OTHERS_S):
                 return error
-            report(f"{self._others_hands()}: the drone is left to it")  # who took it a moment ago, too
+            report(f"{self._others_hands()}: leaving the drone to it")  # also another controller that has just taken it
         except SkyloopError as error:
             return error
         return None
 
     def finish_stop(self) -> None:
-        """Wait, for 2 s at most, until an emergency stop has shown: it would end with the connection."""
+        """Wait up to 2 s until an emergency stop has shown, because it would end with the connection."""
         if self._connection.connected and not self._connection.receiving:
             self._state.notifier.wait_for(lambda: not self.commands.stopping, STOP_S)
 
@@ -225,25 +225,25 @@ class Piloting:
         return self.closed or newest is None or newest.state in _ENDED_IN
 
     def _others_hands(self) -> str:
-        """Return who flies the vehicle in place of this application; empty if nobody took it."""
+        """Return who has taken the vehicle from this application; empty if no one has."""
         status, newest = self.commands.status, self._state.newest
         if status.state in ("queued", "preempted"):
             return f"{status.holder or 'another application'} took over"
         return "" if newest is None else newest.others or ""
 
     def _flies(self) -> bool:
-        """Whether this application has the vehicle in the air, or has just commanded a take-off."""
+        """Return whether this application has the vehicle in the air, or has just commanded a take-off."""
         newest = self._state.newest
         if self._state.status.vehicle is LinkState.CLOSED:
             return False  # a recording that has ended: nothing to land
         airborne = newest is not None and newest.state.airborne
         if newest is not None and newest.others:
-            return False  # flown by others too: not ours to land or to stop
+            return False  # also flown by others: not ours to land or stop
         return self.commands.status.state == "held" and (airborne or self.commands.wants_flight)
 
 
 class ActionWait:
-    """One commanded action, and the wait for feedback that shows that it is done."""
+    """One commanded action, and the wait for feedback that shows its completion."""
 
     def __init__(
         self,
@@ -255,7 +255,7 @@ class ActionWait:
         *,
         automatic: bool,
     ) -> None:
-        """Send the action as :meth:`CommandSender.ask`; ``is_done`` looks at feedback that is newer than it."""
+        """Send the action with :meth:`CommandSender.ask`; ``is_done`` judges feedback newer than that."""
         self._action = action
         self._is_done = is_done
         self._automatic = automatic
@@ -263,18 +263,18 @@ class ActionWait:
         self._state = state
         self._connection = connection
         self._problem: Exception | None = None
-        self._why = ""  # it was not done yet, for people
-        self._why_link: LinkState | None = None  # the vehicle's link at that time, of which it may speak
-        self._flew = False  # it was in the air meanwhile
-        self._refused, self._refused_ns = 0, 0  # the newest intent of ours that was not possible yet, and since when
+        self._why = ""  # why it was not done yet, for people
+        self._why_link: LinkState | None = None  # the vehicle's link at that time, which the text may mention
+        self._flew = False  # it has been in the air since
+        self._refused, self._refused_ns = 0, 0  # our newest intent that was not possible yet, and since when
         self._asked_ns = state.scheduler.clock()
-        # The call may take the vehicle from the pilot who has it now, or when it can first be sent.
+        # The call may take the vehicle from its pilot at that time, or at the first time that it can be sent.
         self._others, self._may_be_sent = self._others_now, commands.may_ask
         self._intent = commands.ask(action, automatic=automatic)
 
     @property
     def outdone(self) -> bool:
-        """Whether the application asked for something else since, which a set-point behind a take-off is not."""
+        """Whether the application has since commanded something else. A set-point behind a take-off does not count."""
         commands = self._commands
         behind = type(self._action) is Takeoff and isinstance(commands.newest, SET_POINTS)
         return commands.intent != self._intent and not behind
@@ -283,8 +283,8 @@ class ActionWait:
         """Wait until the action is done.
 
         Args:
-            timeout_s: What the caller gave [s], for the error.
-            deadline_s: Until when, on ``time.monotonic``.
+            timeout_s: The caller's time-out [s], for the error.
+            deadline_s: The deadline, on ``time.monotonic``.
 
         Raises:
             NoAnswerError: If it is not done in time.
@@ -299,14 +299,14 @@ class ActionWait:
             raise self._problem
 
     def _over(self) -> bool:
-        """Whether it is done, or waiting longer can't help."""
+        """Return whether the action is done, or waiting longer can't help."""
         if type(self._action) is Land and self._done():  # whoever landed it
             return True
         self._problem = self._why_not()
         return self._problem is not None or self._done()
 
     def _done(self) -> bool:
-        """Whether feedback from after it shows that it is done."""
+        """Return whether newer feedback shows that the action is done."""
         newest = self._state.newest
         if newest is None:
             return False
@@ -319,14 +319,14 @@ class ActionWait:
         if outcome.app_id != self._commands.app_id or outcome.intent < self._intent:
             return False
         if outcome.intent == self._intent and type(self._action) is Land and not self._flew:
-            return outcome.over  # it stood already: a take-off may have been on its way
+            return outcome.over  # it was already on the ground: a take-off may have been on its way
         return True
 
     def _why_not(self) -> Exception | None:
-        """Why waiting longer can't help; None if it can. Asks again for what may be possible then."""
+        """Return why waiting longer can't help; None if it can. Repeats a request that may succeed later."""
         name = self._action.name
         if self._connection.why_closed or (self._commands.barred and not self._automatic):
-            return ClosedError(f"this drone was closed while {name} was under way")
+            return ClosedError(f"this drone was closed during {name}")
         if cancelled.get()():
             return GivenUpError()
         status = self._commands.status
@@ -334,8 +334,8 @@ class ActionWait:
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
         told = self._commands.told
         if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
-            self._note(told.text)  # nothing any more, once a repeat is carried out
-            if not told.over:  # carried out: whoever has the vehicle from now on took it since
+            self._note(told.text)  # cleared once a repeat is executed
+            if not told.over:  # executed: whoever holds the vehicle from now on took it later
                 self._others, self._may_be_sent = None, True
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
@@ -354,7 +354,7 @@ class ActionWait:
             if not self._commands.may_ask:
                 return None
             return RefusedError(
-                f"{name} was ended on the way, by a failsafe or a lost link: send the command again", code="not_fresh"
+                f"{name} was ended by a failsafe or a lost link: send the command again", code="not_fresh"
             )
         return _refused(outcome)
 
@@ -363,8 +363,8 @@ class ActionWait:
             now_ns, newest = self._state.scheduler.clock(), self._state.newest
             if self._refused != self._intent:
                 self._refused, self._refused_ns = self._intent, now_ns
-            # Its withdrawal shows as a landing at first, which would end another take-off.
-            # One that still wakes up is asked again when it is awake: until then it can only refuse.
+            # Its withdrawal first shows as a landing, which would end another take-off. A vehicle that still wakes up
+            # is asked again once awake, because until then it can only refuse.
             stands = newest is not None and not newest.state.airborne and not newest.waking_up
             if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
                 self._again()
@@ -372,32 +372,33 @@ class ActionWait:
         if outcome.fate in OUTDONE:
             if self._called_off():
                 return _replaced(self._action)
-            return None  # what has begun ends by itself
+            return None  # a started take-off ends by itself
         if outcome.fate in OVERRULED:
             newest = self._state.newest
             rose = newest is not None and newest.state.airborne and newest.state is not FlightState.LANDING
-            if rose or not self._commands.may_ask:  # what rose by then hovers in the end, and it is done
+            if rose or not self._commands.may_ask:  # once risen, it hovers in the end: the take-off is done
                 return None
-            text = f"takeoff was ended on the way, as {ENDINGS[outcome.fate]}: take off again"
+            text = f"takeoff was ended because {ENDINGS[outcome.fate]}: take off again"
             return RefusedError(text, code=Refusal.NOT_FRESH)
         return _refused(outcome)
 
     def _called_off(self) -> bool:
-        """Whether the application asked for something since that ends a take-off, or did before it had begun."""
+        """Return whether another command of the application, before or after its start, ends the take-off."""
         commands, newest = self._commands, self._state.newest
         if commands.latest(Land, EmergencyStop, ResetEmergency) > self._intent:
             return True
-        # A hover and idle end one that does not show yet: where the proxy had them and it still stands, it is over.
+        # A hover or idle ends a take-off that does not show yet: if the proxy got it and the vehicle still stands, it
+        # is over.
         stayed, told = commands.latest(Hover, Idle), commands.told
         stands = newest is not None and newest.state is FlightState.LANDED
         return stands and self._intent < stayed and told is not None and told.intent >= stayed
 
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
-        """Old set-points are not sent again by themselves, but the caller still waits for this landing."""
+        """Return why waiting can't help. Nothing old is resent, but the caller still waits for this landing."""
         if outcome.fate in OVERRULED:
             if self._commands.may_ask:
-                # The caller still asks for it, but a pilot who took the vehicle by hand since then keeps it. While the
-                # application's own link is lost, nothing shows that.
+                # The caller still wants it, but a pilot who has since taken the vehicle by hand keeps it. That is not
+                # visible while the application's own link is lost.
                 taken = self._may_be_sent and self._others_now not in (None, self._others)
                 self._again(automatic=taken or outcome.fate not in (Fate.FAILSAFE, Fate.AUTHORITY))
             return None
@@ -413,7 +414,7 @@ class ActionWait:
 
     def _not_reached(self, timeout_s: float) -> str:
         newest, connection = self._state.newest, self._connection
-        state = "in a state that is not known" if newest is None else newest.state.value
+        state = "in an unknown state" if newest is None else newest.state.value
         text = f"{self._action.name} was not completed within {timeout_s:g} s: the vehicle is {state}"
         if connection.state.value not in ("up", "degraded"):
             return f"{text}, and the link is {connection.state.value} ({connection.reason})"
@@ -433,7 +434,7 @@ class ActionWait:
 
 
 def _replaced(action: AnyAction) -> RefusedError:
-    return RefusedError(f"{action.name} was ended on the way: another command took its place", code="replaced")
+    return RefusedError(f"{action.name} was ended by another command", code="replaced")
 
 
 def _refused(outcome: Outcome) -> RefusedError:
@@ -441,5 +442,5 @@ def _refused(outcome: Outcome) -> RefusedError:
 
 
 def _returns(feedback: Feedback) -> bool:
-    """Whether a failsafe flies the vehicle back to its start."""
+    """Return whether a failsafe flies the vehicle back to its start."""
     return feedback.failsafe is Failsafe.LAND and feedback.return_phase is not ReturnPhase.NONE

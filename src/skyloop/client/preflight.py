@@ -1,4 +1,4 @@
-"""The checks before a flight, pure, and :func:`inspect`, which gathers the state of a drone for them."""
+"""Pure checks before a flight, and :func:`inspect`, which collects a drone's state for them."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from skyloop.errors import ClosedError, SkyloopError
 from skyloop.messages import Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.parameter import CHECKUP, Diagnostic, decode_checkup
 
-STALE_S: Final = 1.0  #: feedback that is older is not now
+STALE_S: Final = 1.0  #: older feedback is not current [s]
 STALE_VIDEO_S: Final = 1.0
-CLOCK_S: Final = 0.05  #: ages of samples are known to this at least
-LEVEL_RAD: Final = 0.12  #: a vehicle that stands askew by more is not level
-ACTIVE: Final = "camera.active"  #: the parameter of a vehicle that sends one camera at a time
+CLOCK_S: Final = 0.05  #: required accuracy of samples' ages [s]
+LEVEL_RAD: Final = 0.12  #: a vehicle tilted by more does not stand level
+ACTIVE: Final = "camera.active"  #: the parameter of vehicles that send one camera at a time
 _COMMAND: Final = re.compile(r"(skyloop \w+) NAME\b")
-FREE_BYTES: Final = 1_000_000_000  #: of a disk that a flight is recorded to
+FREE_BYTES: Final = 1_000_000_000  #: minimum free space of a disk for recordings
 FULL_BYTES: Final = 100_000_000
-FAR_M: Final = 10_000.0  #: a wall of the safety box that far away is none
+FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away does not count
 
 
 class Level(StrEnum):
     """How serious a finding is."""
 
     OK = "ok"
-    WARN = "warn"  #: it can fly; something that helps is missing
+    WARN = "warn"  #: it can fly, but lacks something helpful
     FAIL = "fail"  #: it would not fly, or not safely
 
 
@@ -45,11 +45,11 @@ class PreflightFinding:
     """One line of the checklist.
 
     Attributes:
-        check: What was checked: ``link``, ``battery``, ``position`` and so on.
-        level: How serious it is.
-        detail: What was found.
+        check: The subject: ``link``, ``battery``, ``position`` and so on.
+        level: How serious the finding is.
+        detail: The result.
         why: Why it matters; empty if all is well.
-        remedy: What to do about it; empty if nothing is needed.
+        remedy: What to do about it; empty if nothing.
     """
 
     check: str
@@ -61,20 +61,20 @@ class PreflightFinding:
 
 @dataclass(frozen=True, slots=True)
 class PreflightState:
-    """What is known of a vehicle before a flight.
+    """The known state of a vehicle before a flight.
 
     Attributes:
-        name: The drone's, for commands that a remedy names.
+        name: The drone's name, for commands in remedies.
         link: Both hops.
-        capabilities: Of the vehicle.
-        feedback: The newest sample; None: none came.
+        capabilities: The vehicle's capabilities.
+        feedback: The newest sample; None: none yet.
         feedback_age_s: Its age [s].
-        video_age_s: Age of each camera's newest picture [s]; None: none came in time.
+        video_age_s: Age of each camera's newest picture [s]; None: none arrived in time.
         parameters: Values by name; empty: they were not read.
-        clock_uncertainty_s: Of the ages of all samples [s].
-        video_waited_s: How long pictures were waited for [s].
+        clock_uncertainty_s: Uncertainty of all samples' ages [s].
+        video_waited_s: Time spent waiting for pictures [s].
         app_id: This application's number in this run of the proxy.
-        free_bytes: Of the disk for recordings; None: not asked for.
+        free_bytes: Free space of the disk for recordings; None: not requested.
     """
 
     link: LinkStatus
@@ -91,7 +91,7 @@ class PreflightState:
 
 
 class Inspected(Protocol):
-    """What is asked of a drone."""
+    """The part of a drone that the checks need."""
 
     config: Config
 
@@ -118,7 +118,7 @@ def inspect(
     except ClosedError:
         raise
     except SkyloopError:
-        parameters = {}  # the link is not up, which is a finding of its own
+        parameters = {}  # the link is not up, which is a finding in itself
     shown = shown_cameras(drone.capabilities, parameters)
     return check_before_flight(
         PreflightState(
@@ -138,7 +138,7 @@ def inspect(
 
 
 def _picture_ages(drone: Inspected, shown: Collection[str], timeout_s: float) -> dict[str, float | None]:
-    """Return the age of a picture of each camera; None where none came in time. Waits for those that are shown."""
+    """Return the age of a picture of each camera; None if none arrived in time. Waits only for shown cameras."""
     deadline = time.monotonic() + timeout_s
     ages: dict[str, float | None] = {camera.name: None for camera in drone.capabilities.cameras}
     came = {name: threading.Event() for name in ages}
@@ -156,7 +156,7 @@ def _picture_ages(drone: Inspected, shown: Collection[str], timeout_s: float) ->
 
 
 def _free_bytes(folder: Path) -> int | None:
-    """Return the bytes that are free where a folder is, or will be; None if that can't be found out."""
+    """Return the free bytes on the disk of an existing or future folder; None if unknown."""
     there = folder.absolute()
     while not there.exists() and there != there.parent:
         there = there.parent
@@ -167,7 +167,7 @@ def _free_bytes(folder: Path) -> int | None:
 
 
 def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
-    """Return the checklist, in the order to be read; all lines, the good ones, too."""
+    """Return the checklist in reading order, including good findings."""
     found = [
         *_link(state),
         *_flight_state(state),
@@ -181,7 +181,7 @@ def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
         *_storage(state),
         *_vehicle(state),
     ]
-    # What drivers and the checks above advise is for any drone; a person wants a command to copy.
+    # The advice of drivers and of the checks above is for any drone; a person wants a command to copy.
     return [replace(one, remedy=_COMMAND.sub(rf"\1 {state.name}", one.remedy)) for one in found]
 
 
@@ -190,7 +190,7 @@ def _ok(check: str, detail: str) -> PreflightFinding:
 
 
 def _judged(level: Level, check: str, detail: str, why: str, remedy: str) -> PreflightFinding:
-    """Return a line of that level; a good one needs neither a reason nor a remedy."""
+    """Return a finding of that level; a good one has neither a reason nor a remedy."""
     return _ok(check, detail) if level is Level.OK else PreflightFinding(check, level, detail, why, remedy)
 
 
@@ -201,9 +201,9 @@ def _link(state: PreflightState) -> Iterator[PreflightFinding]:
         yield PreflightFinding(
             "link",
             Level.FAIL if bad else Level.WARN,
-            f"the link to the proxy is {link.application}: {link.reason or 'no reason is known'}",
-            "commands may not arrive, and what is shown may be old",
-            "see that the proxy runs (skyloop list) and that its computer can be reached",
+            f"the link to the proxy is {link.application}: {link.reason or 'reason unknown'}",
+            "commands may not arrive, and the display may be old",
+            "check that the proxy runs (skyloop list) and that its computer is reachable",
         )
         if bad:
             return
@@ -213,8 +213,8 @@ def _link(state: PreflightState) -> Iterator[PreflightFinding]:
     yield PreflightFinding(
         "link",
         Level.WARN if link.vehicle is LinkState.DEGRADED else Level.FAIL,
-        f"the link to the vehicle is {link.vehicle}: {link.reason or 'no reason is known'}",
-        "a vehicle that is not heard does not hear either",
+        f"the link to the vehicle is {link.vehicle}: {link.reason or 'reason unknown'}",
+        "a silent vehicle probably receives nothing, either",
         link.remedy or "check its power, and the radio or Wi-Fi to it: skyloop doctor ADDRESS",
     )
 
@@ -222,13 +222,17 @@ def _link(state: PreflightState) -> Iterator[PreflightFinding]:
 def _flight_state(state: PreflightState) -> Iterator[PreflightFinding]:
     feedback = state.feedback
     if not state.capabilities.actions:
-        why = state.capabilities.why_not or "it takes no commands"
+        why = state.capabilities.why_not or "it accepts no commands"
         yield PreflightFinding(
-            "vehicle", Level.FAIL, f"nothing can be flown: {why}", "it can only be watched", "connect to one that flies"
+            "vehicle",
+            Level.FAIL,
+            f"nothing can be flown: {why}",
+            "it can only be watched",
+            "connect to one that can fly",
         )
     elif feedback is None:
         yield PreflightFinding(
-            "vehicle", Level.FAIL, "it has not reported its state", "nothing is known of it", "wait for its first data"
+            "vehicle", Level.FAIL, "it has not reported its state", "its state is unknown", "wait for its first data"
         )
     elif feedback.state is FlightState.EMERGENCY:
         yield PreflightFinding(
@@ -240,19 +244,19 @@ def _flight_state(state: PreflightState) -> Iterator[PreflightFinding]:
         )
     elif state.feedback_age_s is not None and state.feedback_age_s > STALE_S:
         detail = f"its newest state is {state.feedback_age_s:.1f} s old"
-        yield PreflightFinding("vehicle", Level.FAIL, detail, "what is shown is not now", "check the link to it")
+        yield PreflightFinding("vehicle", Level.FAIL, detail, "the display is not current", "check the link to it")
     elif feedback.others:
         yield PreflightFinding(
             "vehicle",
             Level.WARN,
             f"another controller has it: {feedback.others}",
-            "the proxy leaves it alone until a pilot newly asks for hover, landing or take-off",
-            "agree with who flies it",
+            "the proxy leaves it alone until a pilot commands hover, landing or take-off",
+            "agree with the person who flies it",
         )
     else:
         yield _ok("vehicle", str(feedback.state).replace("_", " "))
     if feedback is not None and feedback.failsafe is not Failsafe.NONE:
-        doing = f"the failsafe is in force: {feedback.failsafe}"
+        doing = f"a failsafe is active: {feedback.failsafe}"
         yield PreflightFinding("failsafe", Level.WARN, doing, "its pilot fell silent", "take control, and command it")
 
 
@@ -268,7 +272,7 @@ def _battery(state: PreflightState) -> Iterator[PreflightFinding]:
     level, detail, why = Level.OK, f"{charge:.0%} left", "the flight will be short"
     if charge < land:
         level, detail = Level.FAIL, f"{detail}, below {land:.0%} (battery.land)"
-        why = "it lands as soon as it flies, and takes no other command"
+        why = "it would land right after take-off and accept no other command"
     elif charge < back:
         level, detail = Level.FAIL, f"{detail}, below {back:.0%} (battery.return)"
         why = "it refuses to take off, as it would return at once"
@@ -286,8 +290,8 @@ def _position(state: PreflightState) -> Iterator[PreflightFinding]:
             "position",
             Level.WARN,
             "it does not report its position",
-            "waypoints, routes, the safety box and zones don't work; it can be flown by sticks and velocities",
-            "let it know its place: GPS, optical flow, or motion capture (drone.send_external_pose)",
+            "waypoints, routes, the safety box and zones don't work; it can only be flown by sticks and velocities",
+            "give it a position: GPS, optical flow, or motion capture (drone.send_external_pose)",
         )
     else:
         x, y, z = feedback.position_m
@@ -297,7 +301,7 @@ def _position(state: PreflightState) -> Iterator[PreflightFinding]:
         Level.OK if known else Level.WARN,
         "compass",
         "its heading is known" if known else "it does not report its heading",
-        "it can't be flown to places, and cameras' views have no direction",
+        "it can't be flown to positions, and cameras' views have no direction",
         "calibrate its compass, or wait until its estimate has settled",
     )
 
@@ -313,8 +317,8 @@ def _level(state: PreflightState) -> Iterator[PreflightFinding]:
     yield _judged(
         Level.OK if level else Level.WARN,
         "level",
-        "it stands level" if level else f"it stands tilted by {tilt:.2f} rad, or takes a tilted attitude for level",
-        "it would drift off when it takes off",
+        "it stands level" if level else f"it stands tilted by {tilt:.2f} rad, or mistakes a tilted attitude for level",
+        "it would drift off on take-off",
         "put it on level ground; if it stands level, calibrate it (AR.Drone: ardrone.flat_trim)",
     )
 
@@ -325,7 +329,7 @@ def _bounds(state: PreflightState) -> Iterator[PreflightFinding]:
             "zones",
             Level.WARN,
             "its parameters could not be read",
-            "its limits and failsafes are not known",
+            "its limits and failsafes are unknown",
             "check again when its link is up",
         )
         return
@@ -342,14 +346,14 @@ def _bounds(state: PreflightState) -> Iterator[PreflightFinding]:
             "zones",
             f"{count} of 6 walls of the safety box, {zones} zone{'' if zones == 1 else 's'}{high}",
             "without a position nothing keeps it inside",
-            "let it know its place",
+            "give it a position",
         )
         return
     yield PreflightFinding(
         "zones",
         Level.WARN,
         f"no safety box and no zones are set{high}",
-        "nothing stops it before walls and people",
+        "nothing stops it short of walls and people",
         "set them on the page's map (Zones), or skyloop param NAME safety.box.x_high 4",
     )
 
@@ -365,8 +369,8 @@ def _video(state: PreflightState) -> Iterator[PreflightFinding]:
                 check,
                 Level.WARN,
                 f"no picture yet, in {state.video_waited_s:g} s",
-                "who flies by it would fly blind",
-                "a vehicle that was just started may need some seconds more: check again; else check the camera, its "
+                "a pilot who relies on it would fly blind",
+                "a vehicle that has just started may need a few more seconds: check again; else check the camera, its "
                 "link and its address (skyloop watch NAME)",
             )
         else:
@@ -375,13 +379,13 @@ def _video(state: PreflightState) -> Iterator[PreflightFinding]:
                 Level.WARN if old else Level.OK,
                 check,
                 f"the newest picture is {age_s:.1f} s old" if old else "pictures arrive",
-                "who flies by it would fly blind",
+                "a pilot who relies on it would fly blind",
                 "check the camera, its link and its address; skyloop watch NAME shows why",
             )
 
 
 def shown_cameras(capabilities: Capabilities, parameters: Mapping[str, Value]) -> tuple[str, ...]:
-    """Return the cameras whose pictures a vehicle sends now: all, or the one that it is set to."""
+    """Return the cameras whose pictures a vehicle sends at present: all, or the selected one."""
     names = tuple(camera.name for camera in capabilities.cameras)
     chosen = parameters.get(ACTIVE)
     return (chosen,) if isinstance(chosen, str) and chosen in names else names
@@ -390,7 +394,7 @@ def shown_cameras(capabilities: Capabilities, parameters: Mapping[str, Value]) -
 def _control(state: PreflightState) -> Iterator[PreflightFinding]:
     feedback = state.feedback
     if feedback is None or not feedback.lease:
-        yield _ok("control", "nobody has control: it is free")
+        yield _ok("control", "no one has control")
     elif feedback.owner_id == state.app_id:
         yield _ok("control", "this application has control")
     else:
@@ -399,7 +403,7 @@ def _control(state: PreflightState) -> Iterator[PreflightFinding]:
             Level.WARN,
             f"{feedback.owner} has control, with priority {feedback.owner_priority}",
             "its commands count, yours are refused",
-            "ask for control, or agree with them",
+            "request control, or agree with them",
         )
 
 
@@ -429,15 +433,15 @@ def _storage(state: PreflightState) -> Iterator[PreflightFinding]:
 
 
 def _vehicle(state: PreflightState) -> Iterator[PreflightFinding]:
-    """What its driver finds."""
+    """Yield the driver's findings."""
     text = state.parameters.get(CHECKUP)
     if not isinstance(text, str) or not text:
         return
     try:
         diagnostics = decode_checkup(text)
     except ValueError:
-        unread = "its check-up can't be read: nothing is known of its own safety nets"
-        diagnostics = [Diagnostic("driver", False, unread, "start its proxy with the same version of Skyloop as this")]
+        unread = "its check-up can't be read: the state of its own safety nets is unknown"
+        diagnostics = [Diagnostic("driver", False, unread, "run its proxy with the same version of Skyloop as this")]
     for one in diagnostics:
         level = Level.OK if one.good else Level.FAIL if one.severe else Level.WARN
         detail, _, why = (one.detail, "", "") if one.good else one.detail.partition(": ")

@@ -1,4 +1,4 @@
-"""What an application publishes beside its commands: its log, and results as one of the workers of a processor."""
+"""An application's publications besides commands: its log, and its results as a processor's worker."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from skyloop.messages.relayed import MAX_CODE, MAX_LOG_TEXT, MAX_VALUES, pack
 if TYPE_CHECKING:
     from skyloop.client.telemetry import ClientState
 
-RENEW_S: Final = 0.25  #: how often the membership is renewed [s]; a worker counts as silent after a second
+RENEW_S: Final = 0.25  #: how often the membership is renewed [s]; a worker counts as silent after one second
 MAX_DIMENSIONS: Final = 8  #: of an array in the log
 
 
 class Logbook:
-    """Publishes text, numbers and arrays. Any thread; nothing waits.
+    """Publishes text, numbers and arrays. Thread-safe; no method waits.
 
-    Each method returns whether everything was handed to the transport, and raises :class:`UsageError` for what can't be
-    logged. Names of series have 1 to 64 characters.
+    Each method returns whether everything was handed to the transport, and raises :class:`UsageError` for values that
+    can't be logged. Names of series have 1 to 64 characters.
     """
 
     def __init__(self, connection: ProxyConnection, source: str) -> None:
@@ -54,13 +54,13 @@ class Logbook:
 
         Args:
             text: At most 4096 characters.
-            name: Of the series that it belongs to, if any.
-            severity: How serious it is, or its name.
+            name: Name of its series, if any.
+            severity: Severity, or its name.
         """
         if name != "":
             _named(name)
         if not isinstance(text, str) or len(text) > MAX_LOG_TEXT:
-            raise UsageError(f"a text of at most {MAX_LOG_TEXT} characters can be logged, not {text!r:.80}")
+            raise UsageError(f"only texts of at most {MAX_LOG_TEXT} characters can be logged, got {text!r:.80}")
         try:
             known = Severity(severity)
         except ValueError:
@@ -81,14 +81,14 @@ class Logbook:
         """Publish an array of the series ``name``.
 
         Args:
-            name: Of the series.
+            name: Name of the series.
             values: At most 4096 finite real numbers in up to 8 dimensions.
-            at_ns: When it was measured, on the proxy's clock [ns]; None: now.
+            at_ns: Time of the measurement, on the proxy's clock [ns]; None: now.
         """
         try:
             array = np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError):
-            raise UsageError(f"{name} can't be {values!r:.80}: an array of real numbers is needed") from None
+            raise UsageError(f"{name} can't be {values!r:.80}: expected an array of real numbers") from None
         if array.size > MAX_VALUES or array.ndim > MAX_DIMENSIONS:
             raise UsageError(
                 f"{name} has {array.size} numbers in {array.ndim} dimensions; at most {MAX_VALUES} in {MAX_DIMENSIONS} "
@@ -104,7 +104,7 @@ class Logbook:
 
 
 def checked_time(at_ns: object) -> int:
-    """Return ``at_ns`` if it can be a time on the proxy's clock [ns], else raise :class:`UsageError`."""
+    """Return ``at_ns`` if it is a valid time on the proxy's clock [ns]; raise :class:`UsageError` otherwise."""
     if not isinstance(at_ns, int) or not -LATEST_NS <= at_ns <= LATEST_NS:
         raise UsageError(
             f"at_ns is {at_ns!r:.80} and must be a time on the proxy's clock, whole ns within ±{LATEST_NS}"
@@ -114,21 +114,21 @@ def checked_time(at_ns: object) -> int:
 
 def _named(name: object) -> str:
     if not isinstance(name, str) or not 1 <= len(name) <= 64:
-        raise UsageError(f"the name of a series has 1 to 64 characters, not {name!r:.80}")
+        raise UsageError(f"the name of a series must have 1 to 64 characters, got {name!r:.80}")
     return name
 
 
 def _finite(name: str, value: object) -> float:
     if not isinstance(value, numbers.Real) or not math.isfinite(value):
-        raise UsageError(f"{name} can't be {value!r:.80}: a finite number is needed")
+        raise UsageError(f"{name} can't be {value!r:.80}: expected a finite number")
     return float(value)
 
 
 class Membership:
-    """One worker of a processor; made by :func:`skyloop.extend.join_processor`.
+    """One worker of a processor; created by :func:`skyloop.extend.join_processor`.
 
-    Ends with :meth:`close`, and with the drone. The proxy forgets a worker when its connection ends; after a
-    reconnection it joins again by itself.
+    Ends with :meth:`close`, and with the drone. The proxy forgets a worker when its connection ends; the worker rejoins
+    automatically after a reconnection.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class Membership:
         *,
         shared: bool,
     ) -> None:
-        """Prepare to join; :meth:`start` does it. ``find`` returns the camera's name, also of a restarted proxy."""
+        """Prepare to join; :meth:`start` does it. ``find`` returns the camera's name, even after the proxy restarts."""
         connection.check_may_wait()
         if not isinstance(code, str) or len(code) > MAX_CODE:
             raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
@@ -150,13 +150,13 @@ class Membership:
         self._find = find
         self.code = code
         self.shared = shared
-        #: Called at each renewal: whether this worker can take frames now; False gives its share to the others.
+        #: Called at each renewal: whether this worker can take frames; False gives its share to the others.
         self.ready: Callable[[], bool] = _always
-        #: The newest share; None while it is not known. Set on the receiving thread.
+        #: The newest share; None while unknown. Set on the receiving thread.
         self.share: ProcessorShare | None = None
-        #: Called with the share when it has changed, on the receiving thread.
+        #: Called on the receiving thread when the share has changed.
         self.changed: Callable[[ProcessorShare], None] | None = None
-        self.refused: SkyloopError | None = None  #: why it is a worker no longer
+        self.refused: SkyloopError | None = None  #: why it is no longer a worker
         self._connection = connection
         self._state = state
         self._wake = threading.Event()
@@ -165,7 +165,7 @@ class Membership:
         self._thread = threading.Thread(target=self._run, name=f"skyloop-{processor}", daemon=True)
 
     def start(self, timeout_s: float) -> None:
-        """Join, and renew the membership from then on, on a thread of its own.
+        """Join, and renew the membership from then on in a separate thread.
 
         Raises:
             NameTakenError: If another application runs other code under this name.
@@ -185,11 +185,11 @@ class Membership:
         self._state.to_close.append(self)
 
     def renew(self) -> None:
-        """Tell the proxy now, for example because :attr:`ready` has changed. Any thread."""
+        """Renew at once, for example because :attr:`ready` has changed. Thread-safe."""
         self._wake.set()
 
     def publish(self, frame: Frame, value: Any, took_s: float = 0.0) -> bool:
-        """Publish what was found in a frame (see :func:`skyloop.messages.relayed.pack`) and how long it took [s].
+        """Publish the value found in a frame (see :func:`skyloop.messages.relayed.pack`) and the time it took [s].
 
         Returns whether it was handed to the transport. Raises :class:`UsageError` if the value can't be sent.
         """
@@ -209,7 +209,7 @@ class Membership:
     def close(self) -> None:
         """End the membership. Idempotent.
 
-        The proxy gives its share to the other workers when nothing more comes, or at once when the drone is closed.
+        The proxy gives its share to the other workers once renewals stop, or at once when the drone is closed.
         """
         self._leave()
         self._ended = True
@@ -243,9 +243,9 @@ class Membership:
             if share != before and self.changed is not None:
                 self.changed(share)
 
-    def _welcomed(self, welcome: Welcome) -> None:  # noqa: ARG002  (as a topic calls it)
+    def _welcomed(self, welcome: Welcome) -> None:  # noqa: ARG002  (signature of the topic's callbacks)
         self.share = None
-        with suppress(SkyloopError):  # no such camera, which the proxy's answer says, too
+        with suppress(SkyloopError):  # no such camera, which the proxy's answer reports as well
             self.camera = self._find()
         self._wake.set()
 

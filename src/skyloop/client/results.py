@@ -1,4 +1,4 @@
-"""Results of processors: one channel for each processor, and mailboxes in which the newest wins."""
+"""Results of processors: one channel per processor, and newest-wins mailboxes."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from skyloop.transport.base import RESULTS, results
 
 T = TypeVar("T")
 _UNREAD: Final = object()
-MAX_CHANNELS: Final = 256  #: processors known at a time, besides subscribed ones
-MAX_WORKERS: Final = 1024  #: workers of one processor whose last numbers are kept
+MAX_CHANNELS: Final = 256  #: known processors without subscriptions
+MAX_WORKERS: Final = 1024  #: workers of one processor whose last numbers are stored
 
 
 class Result:
-    """What a processor found in one frame. Times are on the proxy's clock [ns], as those of frames are."""
+    """A processor's result for one frame. Times are on the proxy's clock [ns], as for frames."""
 
     __slots__ = ("_clock", "_history", "_offset_ns", "_value", "header", "overtaken", "received_ns")
 
     def __init__(
         self, header: ProcessorResult, received_ns: int, offset_ns: int, history: FeedbackHistory, clock: Clock
     ) -> None:
-        """Keep what was received at ``received_ns``, on ``clock``, which is ``offset_ns`` behind the proxy's.
+        """Store a result received at ``received_ns`` on ``clock``, which is ``offset_ns`` behind the proxy's.
 
-        ``history`` is looked up for the state at the capture. The value is decoded when it is first read.
+        ``history`` provides the state at the time of capture. The value is decoded on first access.
         """
         self.header = header  #: the packet as received
         self.received_ns = received_ns  #: on this host's clock
-        self.overtaken = False  #: a result of a later frame of the same camera came before it
+        self.overtaken = False  #: whether a result of a later frame of the same camera arrived before it
         self._offset_ns = offset_ns
         self._history = history
         self._clock = clock
@@ -52,7 +52,7 @@ class Result:
 
     @property
     def worker(self) -> int:
-        """Number of the application that made it, in this run of the proxy."""
+        """Number of the application that produced it, in this run of the proxy."""
         return self.header.worker
 
     @property
@@ -77,7 +77,7 @@ class Result:
 
     @property
     def took_s(self) -> float:
-        """How long the processor worked on it [s]."""
+        """Processing time [s]."""
         return self.header.took_ns / 1e9
 
     @property
@@ -87,10 +87,10 @@ class Result:
 
     @property
     def value(self) -> Any:
-        """What ``process`` returned, with dataclasses as dicts, tuples as lists, and arrays read-only.
+        """The return value of ``process``, with dataclasses as dicts, tuples as lists, and read-only arrays.
 
         Raises:
-            DecodeError: If the payload is malformed, as only another program can send it.
+            DecodeError: If the payload is malformed, which only a foreign program can send.
         """
         if self._value is _UNREAD:
             self._value = unpack(self.header.payload)
@@ -105,11 +105,11 @@ class Result:
         try:
             return msgspec.convert(self.value, kind, dec_hook=_as_it_is)
         except (msgspec.ValidationError, TypeError) as error:
-            raise DecodeError(f"a result of {self.processor} is no {kind.__name__}: {error}") from None
+            raise DecodeError(f"a result of {self.processor} is not a {kind.__name__}: {error}") from None
 
     @property
     def feedback(self) -> Feedback | None:
-        """The vehicle's state at the frame's capture, interpolated; None if nothing is known of that time."""
+        """The vehicle's state at the time of capture, interpolated; None if unknown."""
         return self._history.at(self.header.captured_ns)[0]
 
     def __repr__(self) -> str:
@@ -117,15 +117,15 @@ class Result:
         return f"<Result of {header.processor} for {header.camera} {header.seq}, {self.age_s * 1e3:.0f} ms old>"
 
 
-def _as_it_is(kind: type, value: Any) -> Any:  # noqa: ARG001  (as msgspec calls it)
+def _as_it_is(kind: type, value: Any) -> Any:  # noqa: ARG001  (signature of msgspec's hook)
     return value
 
 
 class ResultMailbox:
-    """Keeps the newest result of each processor for one consumer, and leaves out those that are too old when taken."""
+    """Keeps the newest result of each processor for one consumer, and skips results too old when taken."""
 
     def __init__(self, max_age_s: float | None = None, notifier: Notifier | None = None) -> None:
-        """Make an empty mailbox, which leaves out what is older than ``max_age_s`` [s] when it is taken."""
+        """Create an empty mailbox that skips results older than ``max_age_s`` [s] when taken."""
         self.notifier = notifier or Notifier()
         self.expired = 0  #: results that were too old when their turn came
         self.closed = False
@@ -133,7 +133,7 @@ class ResultMailbox:
         self._mailboxes: dict[str, Mailbox[Result]] = {}
 
     def put(self, result: Result) -> None:
-        """Add a result, on the receiving thread alone. One that was overtaken is ignored."""
+        """Add a result, only on the receiving thread. Overtaken results are ignored."""
         if result.overtaken:
             return  # counted by its channel
         mailbox = self._mailboxes.get(result.processor)
@@ -147,7 +147,7 @@ class ResultMailbox:
         mailbox.put(result)
 
     def take(self) -> Result | None:
-        """Take the oldest of the waiting results, one for each processor; None if there is none. Does not wait."""
+        """Remove and return the oldest waiting result (one per processor); None if there is none. Does not wait."""
         while waiting := [mailbox for mailbox in self._mailboxes.values() if mailbox.waiting]:
             result = min(waiting, key=_captured_ns).take()
             if result is None or not is_old(result, self._max_age_s):
@@ -156,7 +156,7 @@ class ResultMailbox:
         return None
 
     def wait(self, timeout_s: float) -> Result | None:
-        """Take a result like :meth:`take`, but wait for one; None if none comes in ``timeout_s`` or it is closed."""
+        """Take a result, waiting for one; None after ``timeout_s``, or once closed."""
         deadline = time.monotonic() + timeout_s
         while self.notifier.wait_for(lambda: self.waiting or self.closed, deadline - time.monotonic()):
             result = None if self.closed else self.take()
@@ -165,23 +165,23 @@ class ResultMailbox:
         return None
 
     def close(self) -> None:
-        """Wake everybody who waits here; nothing can be waited for any more."""
+        """Wake all waiting threads; later waits return at once."""
         self.closed = True
         self.notifier.notify()
 
     @property
     def waiting(self) -> bool:
-        """Whether there is a result, possibly too old."""
+        """Whether there is a result, even one that is too old."""
         return any(mailbox.waiting for mailbox in self._mailboxes.values())
 
     @property
     def pushed_out(self) -> int:
-        """Results that newer ones pushed out."""
+        """Results replaced by newer ones."""
         return self.dropped - self.expired
 
     @property
     def dropped(self) -> int:
-        """Results that newer ones pushed out, or that were too old."""
+        """Results that were replaced by newer ones or too old."""
         return self.expired + sum(mailbox.dropped for mailbox in self._mailboxes.values())
 
 
@@ -191,17 +191,17 @@ def is_old(result: Result, max_age_s: float | None) -> bool:
 
 
 class ResultListener(Listener[Result]):
-    """A listener that leaves out results that are too old when their turn comes, counted in ``expired``."""
+    """A listener that skips results too old when their turn comes, and counts them in ``expired``."""
 
     def __init__(self, *arguments: Any, max_age_s: float | None, **options: Any) -> None:
-        """Start calling; arguments are those of :class:`Listener`, and ``max_age_s`` [s], None for no limit."""
+        """Start calling the function; arguments as for :class:`Listener`, and ``max_age_s`` [s], None: no limit."""
         self.expired = 0  #: results that were too old when their turn came
         self._max_age_s = max_age_s
         super().__init__(*arguments, **options)
 
     @property
     def dropped(self) -> int:
-        """Results that newer ones pushed out, or that were too old."""
+        """Results that were replaced by newer ones or too old."""
         return super().dropped + self.expired
 
     def _call(self, sample: Result) -> None:
@@ -212,7 +212,7 @@ class ResultListener(Listener[Result]):
 
 
 class ResultChannel(Channel[Result]):
-    """Results of one processor; leaves out a result of an older frame than one that came before."""
+    """Results of one processor, without those of frames older than a previous result's."""
 
     def __init__(self, processor: str, connection: ProxyConnection, scheduler: Scheduler) -> None:
         self.name = results(processor)  #: name of the topic
@@ -225,7 +225,7 @@ class ResultChannel(Channel[Result]):
         self._captured: dict[str, int] = {}  # capture time of the newest frame of each camera
 
     def restart(self) -> None:
-        """Forget the numbers of workers and frames, which a newly connected proxy counts from the start."""
+        """Forget the numbers of workers and frames, because a newly connected proxy starts new ones."""
         self._numbers.clear()
         self._captured.clear()
 
@@ -234,7 +234,7 @@ class ResultChannel(Channel[Result]):
         return self.counter.stats(now_ns, dropped=self.dropped + self._overtaken)
 
     def receive(self, result: Result) -> bool:
-        """Publish a result, unless it was overtaken; return False if it came before, by the other topic."""
+        """Publish a result unless it was overtaken; return False if it already arrived on the other topic."""
         header = result.header
         last = self._numbers.get(header.worker)
         if last is not None and header.number <= last:
@@ -256,7 +256,7 @@ class ResultChannel(Channel[Result]):
 
 
 class ResultChannels:
-    """The channels of all processors. Asked for on any thread; results arrive on the receiving one."""
+    """The channels of all processors. Thread-safe; results arrive on the receiving thread."""
 
     def __init__(self, connection: ProxyConnection, scheduler: Scheduler, history: FeedbackHistory) -> None:
         self._connection = connection
@@ -268,10 +268,10 @@ class ResultChannels:
         self._sent: Counter[str] = Counter()
 
     def channel(self, processor: str) -> ResultChannel:
-        """Return the channel of a processor's results, whether or not such a processor runs.
+        """Return the channel of a processor's results, even if no such processor runs.
 
         Raises:
-            UsageError: If ``processor`` can't be a name.
+            UsageError: If ``processor`` is not a valid name.
             ClosedError: If the drone was closed.
         """
         self._connection.check_open()
@@ -290,17 +290,17 @@ class ResultChannels:
         return list(self._channels.values())
 
     def next_number(self, processor: str) -> int:
-        """Return the number of the next result that this application sends, for one worker of a processor at a time."""
+        """Return the number of this application's next result, for one worker of a processor at a time."""
         self._sent[processor] += 1
         return self._sent[processor]
 
     def restart(self) -> None:
-        """Reset all channels: a proxy was connected."""
+        """Reset all channels after connecting to a proxy."""
         for channel in self.all():
             channel.restart()
 
     def receive(self, header: ProcessorResult, now_ns: int) -> None:
-        """Publish a result that came at ``now_ns``."""
+        """Publish a result received at ``now_ns``."""
         offset_ns = self._connection.offset_ns
         result = Result(header, now_ns, offset_ns, self._history, self._scheduler.clock)
         channel = self._channels.get(header.processor)
@@ -312,7 +312,7 @@ class ResultChannels:
             self.everything.publish(result)
 
     def _make_room(self) -> None:
-        """Forget channels without consumers, oldest first, while there are too many: any program may invent names."""
+        """Forget channels without consumers, oldest first, while there are too many: programs may invent names."""
         with self._lock:
             unused = [name for name, one in self._channels.items() if not one.subscribed]
             surplus = len(self._channels) + 1 - MAX_CHANNELS
@@ -326,10 +326,10 @@ def _captured_ns(mailbox: Mailbox[Result]) -> int:
 
 
 def silence(processor: str, timeout_s: float, expired: int) -> str:
-    """Return the message of the error when no result came, with how many were too old meanwhile."""
+    """Return the error message for missing results, with the number of those that were too old."""
     if expired:
-        return f"no result of {processor} came within {timeout_s:g} s that was new enough; {expired} were too old"
+        return f"no sufficiently new result of {processor} arrived within {timeout_s:g} s; {expired} were too old"
     return (
-        f"no result of processor {processor} came within {timeout_s:g} s: does skyloop process run one of that name "
+        f"no result of processor {processor} arrived within {timeout_s:g} s: does skyloop process run one of that name "
         "for this drone?"
     )

@@ -1,4 +1,4 @@
-"""One session with a proxy, from its first packet to its last: what its transport calls, and the requests to it."""
+"""One session with a proxy, from its first packet to its last: the transport's callbacks, and requests."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from skyloop.transport.base import FEEDBACK, Dialer, Pixels, TransportClient, st
 
 RETRY_S = 0.3  #: time after which an unanswered request is repeated; all requests are idempotent
 
-#: Called once with the answer, or with the error why there is none.
+#: Called once, with the answer or with an error.
 Done = Callable[[AnyReply | LinkError], None]
 
 
@@ -48,7 +48,7 @@ class _Pending:
 
 
 class Requests:
-    """The unanswered requests of one connection. A request is repeated until it is answered; all are idempotent."""
+    """The unanswered requests of one connection. Requests are idempotent, and repeated until answered."""
 
     def __init__(self, send: Callable[[bytes], bool]) -> None:
         self._send = send
@@ -58,10 +58,10 @@ class Requests:
         self._failed: LinkError | None = None
 
     def ask(self, body: AnyRequest, done: Done, timeout_s: float, now_ns: int, *, again_s: float = RETRY_S) -> None:
-        """Send a request, and repeat it after ``again_s`` and then each 0.3 s.
+        """Send a request, repeat it after ``again_s``, and then every 0.3 s.
 
-        ``done`` is called once, on the receiving thread or on the one that calls :meth:`tick` or :meth:`fail`; on this
-        one if the connection has failed already. After ``timeout_s`` it gets a :class:`NoAnswerError`.
+        ``done`` is called once: on the receiving thread, on the thread that calls :meth:`tick` or :meth:`fail` or, if
+        the connection has already failed, on this one. After ``timeout_s`` it gets a :class:`NoAnswerError`.
         """
         with self._lock:
             failed = self._failed
@@ -92,7 +92,7 @@ class Requests:
         return True
 
     def tick(self, now_ns: int) -> None:
-        """Repeat requests that were not answered, and give up those that are overdue."""
+        """Repeat unanswered requests, and abandon overdue ones."""
         if not self._pending:
             return
         with self._lock:
@@ -115,8 +115,8 @@ class Requests:
             one.done(error)
 
 
-PING_S: Final = 1.0  #: how long a ping may take
-FEEDBACK_STALL_S: Final = 1.0  #: without feedback from a proxy that answers: it is subscribed to again
+PING_S: Final = 1.0  #: time limit for a ping
+FEEDBACK_STALL_S: Final = 1.0  #: time without feedback from a responsive proxy before resubscribing
 _VIDEOS: Final = (video(""), stream(""))
 _PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often a proxy on another clock is asked for its time
 _PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same until there are a few round trips
@@ -124,20 +124,22 @@ _FIRST: Final = 5
 
 
 class ConnectionHandler(Protocol):
-    """Gets samples, on the receiving thread, and what happens to the connection, on the supervisor's."""
+    """Receives samples on the receiving thread, and changes of the connection on the supervisor's."""
 
-    def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello, and sent nothing else yet
+    def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello and has sent nothing else yet
     def disconnected(self) -> None: ...
     def link_changed(self, state: LinkState, reason: str) -> None: ...
-    def tick(self, now_ns: int) -> int: ...  #: does what is due; returns when to call it again at the latest [ns]
+    def tick(self, now_ns: int) -> int: ...  #: does all due work; returns the latest time of the next call [ns]
     def feedback(self, sample: Feedback, now_ns: int) -> None: ...
     def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
     @property
-    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: called with the other kinds, and the time
+    def samples(
+        self,
+    ) -> Mapping[type, Callable[[Any, int], None]]: ...  #: for other kinds of samples, with the time
 
 
 class ProxySession:
-    """Decodes and counts what arrives on the transport's receiving thread, and hands it to the handler.
+    """Decodes and counts packets on the transport's receiving thread, and passes them to the handler.
 
     It is the :class:`skyloop.transport.base.ClientHandler` of one connection.
     """
@@ -145,21 +147,21 @@ class ProxySession:
     def __init__(
         self, handler: ConnectionHandler, poke: Callable[[], None], thresholds: Thresholds, clock: Clock
     ) -> None:
-        """Make a session that is not connected; ``poke`` wakes the supervisor."""
+        """Create an unconnected session; ``poke`` wakes the supervisor."""
         self._handler = handler
         self._poke = poke
         self._clock = clock
         self._end: TransportClient | None = None
         self._same_clock = False
-        self._quiet = False  # closed by this end: ignore what still arrives
+        self._quiet = False  # closed by this end: ignore later arrivals
         self._up = False
         self._pinged_ns = 0
-        self._pinged = False  # and not answered yet
+        self._pinged = False  # a ping is unanswered
         self._trips = OffsetEstimator()
-        self._video_users: dict[str, set[str]] = {}  # topic of the transport: the topics that it serves
+        self._video_users: dict[str, set[str]] = {}  # by the transport's topic: the topics that it serves
         self._handlers: dict[type, Callable[..., None]] = {**handler.samples, Reply: self._reply}
         self._take_feedback = handler.feedback
-        self._feedback = PLAIN  # how feedback comes in this session
+        self._feedback = PLAIN  # how feedback arrives in this session
         self._only_plain = False  # the proxy sends no other form
         self._feedback_watch = StallWatch(FEEDBACK_STALL_S, clock())
         self.monitor = LinkMonitor(thresholds, clock())
@@ -167,7 +169,7 @@ class ProxySession:
         self.offset_ns = 0  #: the proxy's clock minus ours
         self.closed_reason: str | None = None  #: why it ended, once it has
         self.receiver = 0  #: identity of the receiving thread
-        self.look_ns = 0  #: when the supervisor judges its state next
+        self.look_ns = 0  #: when the supervisor next judges its state
 
     # Set-up and end --------------------------------------------------------------------------------------------
 
@@ -178,9 +180,9 @@ class ProxySession:
         self.monitor.excuse(self._end.excused_s)
 
     def welcomed(self, welcome: Welcome, sent_ns: int) -> None:
-        """Take the answer to Hello, sent at ``sent_ns``, as the first measure of the offset between the clocks.
+        """Use the answer to Hello, sent at ``sent_ns``, as the first measurement of the clock offset.
 
-        On one host both are the same clock, unless the two processes are in different time namespaces.
+        On one host, both ends read the same clock unless they are in different time namespaces.
         """
         if welcome.clock and welcome.clock != clock_identity():
             self._same_clock = False
@@ -201,7 +203,7 @@ class ProxySession:
 
     @property
     def variants(self) -> bool:
-        """Whether frames come in the form that was asked for; see :class:`skyloop.transport.base.TransportClient`."""
+        """Whether frames arrive in the requested form; see :class:`skyloop.transport.base.TransportClient`."""
         return self._end is not None and self._end.variants
 
     @property
@@ -213,12 +215,12 @@ class ProxySession:
 
     @property
     def transmit(self) -> Callable[[bytes], bool]:
-        """The transport's own function to send, without a layer in between, for what is sent often."""
+        """The transport's own send function, without another layer, for frequent packets."""
         assert self._end is not None
         return self._end.send
 
     def send(self, packet: bytes) -> bool:
-        """Hand a packet to the transport; return False if it could not be."""
+        """Hand a packet to the transport; return False on failure."""
         end = self._end
         return end is not None and not self._quiet and end.send(packet)
 
@@ -229,11 +231,11 @@ class ProxySession:
 
     @property
     def receiving(self) -> bool:
-        """Whether the calling thread is the one that receives now."""
+        """Whether the calling thread is the one that receives at present."""
         return self.receiver == threading.get_ident() or (self._end is not None and self._end.receiving)
 
     def subscribe(self, topic: str, on: bool) -> None:
-        """Subscribe to a topic or unsubscribe. Video that several requests share is subscribed to once."""
+        """Subscribe to a topic or unsubscribe. Video shared by several requests is subscribed to once."""
         end = self._end
         if end is None:
             return
@@ -253,26 +255,27 @@ class ProxySession:
         end.subscribe(topic, on)
 
     def tick(self, now_ns: int) -> None:
-        """Repeat requests that are due, and ping the proxy if it is silent or its clock has to be measured."""
+        """Repeat due requests, and ping the proxy if it is silent or its clock needs measuring."""
         self.requests.tick(now_ns)
         end = self._end
         if end is None:
             return
-        late_ns = self.monitor.late_ns  # a proxy that is silent for so long is pinged
+        late_ns = self.monitor.late_ns  # silence after which the proxy is pinged
         silent = now_ns - self.monitor.received_ns > late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
         due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged
         if (silent or not self._same_clock) and due:
             self._pinged_ns = now_ns
-            # One at a time, once: what waits on a path that stands still, and its answers, delay all else after it.
+            # One ping at a time, sent once: on a stalled path, queued pings and their answers delay everything behind
+            # them.
             self._pinged = True
             self.requests.ask(Ping(now_ns), self._ponged, PING_S, now_ns, again_s=PING_S)
 
     def renew_feedback(self, now_ns: int) -> None:
-        """Subscribe to feedback again if it has stalled although the proxy answers.
+        """Resubscribe to feedback if it has stalled although the proxy answers.
 
-        Feedback in another form gives way to plain feedback, in this session: the proxy may be of an earlier version,
-        or send as many forms as it can already. Consumers select what they want in any case.
+        For the rest of this session, a request in another form gives way to plain feedback: the proxy may be older, or
+        at its limit of forms. Consumers select their samples in any case.
         """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
         end = self._end
@@ -285,7 +288,7 @@ class ProxySession:
         end.subscribe(FEEDBACK)
 
     def _expect(self, request: FeedbackRequest) -> None:
-        """Judge by the rate at which feedback comes from now on."""
+        """Judge the link by the new rate of feedback from now on."""
         if request == self._feedback:
             return
         now_ns, self._feedback = self._clock(), request
@@ -302,16 +305,16 @@ class ProxySession:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Largest error of :attr:`offset_ns` by now [ns]; 0 where both ends read one clock."""
+        """Current maximum error of :attr:`offset_ns` [ns]; 0 if both ends read the same clock."""
         if not self._trips:
             return 0
         now = self._trips.at(self._clock())
         return now.uncertainty_ns + abs(now.ns - self.offset_ns)
 
-    # What the transport calls ----------------------------------------------------------------------------------
+    # Callbacks of the transport ------------------------------------------------------------------------------------
 
     def packet(self, packet: bytes) -> None:
-        """Decode a packet and hand it on; on the receiving thread."""
+        """Decode a packet and pass it on; on the receiving thread."""
         now_ns = self._clock()
         try:
             sample: Sample = decode(packet)
@@ -323,21 +326,21 @@ class ProxySession:
         if type(sample) is Feedback:
             if self.monitor.feedback(sample.seq, now_ns, sample.skipped):
                 self._take_feedback(sample, now_ns)
-                if not self._up:  # the first one: wakes the supervisor, which reports that the link is up
+                if not self._up:  # the first one wakes the supervisor, which reports that the link is up
                     self._up = True
                     self._poke()
             return
         handler = self._handlers.get(type(sample))
-        if handler is None:  # a kind that no proxy sends
+        if handler is None:  # a kind that proxies do not send
             self._malformed()
             return
         self.monitor.received_ns = now_ns
         handler(sample, now_ns)
 
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
-        """Check a frame's size and hand it on; on the receiving thread.
+        """Check a frame's size and pass it on; on the receiving thread.
 
-        ``topic`` is the request that the proxy made it for; empty: a plain frame of the camera.
+        ``topic`` is the request that it answers; empty: a plain frame of the camera.
         """
         now_ns = self._clock()
         if self._quiet:
@@ -349,11 +352,11 @@ class ProxySession:
         self._handler.frame(header, pixels, now_ns, topic)
 
     def closed(self, reason: str) -> None:
-        """Note that the transport has ended the connection; the supervisor reconnects."""
+        """Note that the transport has closed the connection; the supervisor reconnects."""
         self.closed_reason = reason
         self._poke()
 
-    def _reply(self, reply: Reply, now_ns: int) -> None:  # noqa: ARG002  (all handlers are called alike)
+    def _reply(self, reply: Reply, now_ns: int) -> None:  # noqa: ARG002  (the signature of all handlers)
         if not self.receiver:
             self.receiver = threading.get_ident()
         self.requests.answered(reply)
@@ -364,10 +367,10 @@ class ProxySession:
 
 
 def _carrier(topic: str, *, variants: bool) -> str:
-    """Return the topic of the transport on which video comes.
+    """Return the transport's topic that carries this video.
 
-    ``variants``: whether the transport carries frames in the form asked for, or all as they are: each channel then
-    filters and scales them itself.
+    ``variants``: whether the transport carries frames in the requested form; otherwise all arrive unchanged, and each
+    channel filters and scales them itself.
     """
     request = VideoRequest.parse(topic)
     if topic.startswith(stream("")):

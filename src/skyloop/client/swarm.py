@@ -1,4 +1,4 @@
-"""Several drones: connected, commanded and waited for together, with a policy for what follows when one fails."""
+"""Several drones that are connected, commanded and awaited together, with a policy for failures."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ OnError = Literal["continue", "raise", "stop", "land"]
 Target = str | Mapping[str, str]
 Missing = Literal["raise", "skip"]
 
-_WILD: Final = frozenset("*?[")  #: what makes a name a pattern
+_WILD: Final = frozenset("*?[")  #: characters of a pattern
 _THERE: Final = frozenset({LinkState.UP, LinkState.DEGRADED})
 _ROUNDING_S: Final = 1e-6
 _log = logging.getLogger("skyloop")
@@ -64,7 +64,7 @@ class Tick:
 
     number: int  #: from 0
     elapsed_s: float  #: since the first
-    late_s: float  #: how much later than it was due
+    late_s: float  #: delay after its due time
 
 
 @explains_moved_options
@@ -74,11 +74,11 @@ def swarm(
     """Connect to several drones at the same time; returns when all are connected.
 
     Args:
-        *targets: Names of running proxies, patterns such as ``"drone*"`` for all that run now, addresses of vehicles
+        *targets: Names of running proxies, patterns such as ``"drone*"`` for running proxies, addresses of vehicles
             such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
             either, ``{"left": "sim://?seed=1"}``.
         on_error: What happens to the others when one fails; see :class:`Swarm`.
-        missing: A drone that can't be connected to fails the call (``"raise"``) or is left out (``"skip"``), as long
+        missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``), as long
             as one is left.
         **options: As for :func:`skyloop.connect`, for each drone.
 
@@ -86,7 +86,7 @@ def swarm(
         The swarm, a context manager.
 
     Raises:
-        SwarmError: With the reason of each drone that can't be connected to, after leaving the others.
+        SwarmError: If drones can't be connected, with the reason for each; the others are closed.
         UnknownNameError: If a pattern matches no running proxy.
         UsageError: If a drone is named twice, none is named, or ``on_error`` or ``missing`` is unknown.
     """
@@ -106,7 +106,7 @@ def swarm(
 
 
 def choose(targets: Iterable[Target], running: Callable[[], Iterable[str]]) -> dict[str, str]:
-    """Return what to connect to, by name, in the order given. Pure.
+    """Return the targets by name, in the order given. Pure.
 
     Args:
         targets: As for :func:`swarm`.
@@ -121,10 +121,10 @@ def choose(targets: Iterable[Target], running: Callable[[], Iterable[str]]) -> d
     for target in targets:
         for name, address in _named(target, running, counts):
             if name in chosen:
-                raise UsageError(f"{name!r} is named twice: each drone can be in a swarm once")
+                raise UsageError(f"{name!r} is named twice: each drone can be in a swarm only once")
             chosen[name] = address
     if not chosen:
-        raise UsageError('a swarm needs at least one drone: swarm("alpha", "bravo"), or a pattern as swarm("drone*")')
+        raise UsageError('a swarm needs at least one drone: swarm("alpha", "bravo"), or a pattern, swarm("drone*")')
     return chosen
 
 
@@ -132,7 +132,7 @@ def _named(target: Target, running: Callable[[], Iterable[str]], counts: dict[st
     if isinstance(target, Mapping):
         for name, address in target.items():
             if not isinstance(name, str) or not name or not isinstance(address, str) or not address:
-                raise UsageError(f"{name!r}: {address!r} is no drone: a name and what to connect to are needed")
+                raise UsageError(f"{name!r}: {address!r} is not a drone: expected a name and a target")
         return list(target.items())
     if not isinstance(target, str) or not target:
         raise UsageError(f"{target!r} is neither the name of a proxy, a pattern, nor a vehicle's address")
@@ -160,24 +160,25 @@ def check_policy(on_error: str) -> None:
 
 
 class Swarm:
-    """Drones by name, in a fixed order; made by :func:`skyloop.swarm`. A context manager, for one thread at a time.
+    """Drones by name, in a fixed order; returned by :func:`skyloop.swarm`. A context manager, for one thread at a time.
 
-    ``drones["alpha"]`` is one :class:`Drone`, and iterating gives all of them. A command goes to all that are *active*.
-    The failure of some never keeps the others from getting it; ``on_error`` says what follows:
+    ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all of them. A command goes to all *active* drones.
+    Failures of some never keep the others from getting it; ``on_error`` decides what follows:
 
-    - ``"continue"``: those that failed hover and are set aside, the others go on. Those set aside are in
-      :attr:`errors`; one that another application took over comes back when its authority is given back, the others
-      with :meth:`readmit`. :class:`SwarmError` is raised when none is left, and at the end of the block.
+    - ``"continue"``: failed drones hover and are set aside, the others continue. :attr:`errors` lists those set aside;
+      a drone taken over by another application returns when its authority is given back, the others return with
+      :meth:`readmit`. :class:`SwarmError` is raised when none is left, and at the end of the block.
     - ``"raise"``: :class:`SwarmError` is raised, the others keep their commands.
     - ``"stop"``: the others hover, then :class:`SwarmError` is raised.
     - ``"land"``: the others land, then :class:`SwarmError` is raised.
 
-    A drone whose link is lost gets no commands and takes part again when the link is back; unless ``on_error`` is
-    ``"continue"``, a command that could not be sent is a failure. At the end of the block all drones land at the same
+    A drone with a lost link gets no commands, and takes part again when the link is back; unless ``on_error`` is
+    ``"continue"``, a command that could not be sent is a failure. At the end of the block, all drones land at the same
     time (or hover, with ``on_exit``), including those set aside, whatever happens to any of them.
 
-    Commands return, by name, what the same command of :class:`Drone` returns. They raise :class:`SwarmError` as
-    ``on_error`` says, :class:`UsageError` for numbers that are not finite, and :class:`ClosedError`.
+    Commands return a dict from names to the results of the same command of :class:`Drone`. They raise
+    :class:`SwarmError` as set by ``on_error``, :class:`UsageError` for numbers that are not finite, and
+    :class:`ClosedError`.
     """
 
     def __init__(
@@ -187,12 +188,12 @@ class Swarm:
         on_error: OnError = "continue",
         missing: Mapping[str, Exception] | None = None,
     ) -> None:
-        """Take over connected drones, which the swarm closes at its end.
+        """Adopt connected drones, which the swarm closes at its end.
 
         Args:
-            drones: By name.
-            on_error: What follows when some fail.
-            missing: Drones that were wanted and could not be connected to, and why.
+            drones: The drones by name.
+            on_error: What to do when some fail.
+            missing: Requested drones that could not be connected, with the reasons.
 
         Raises:
             UsageError: If there is no drone, or ``on_error`` is unknown.
@@ -207,7 +208,7 @@ class Swarm:
         self._closed = False
         self._spreads_ns = array("q")
 
-    # Who is in it ----------------------------------------------------------------------------------------------
+    # Members ---------------------------------------------------------------------------------------------------
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -216,9 +217,9 @@ class Swarm:
 
     @property
     def active(self) -> dict[str, Drone]:
-        """Drones that commands go to, by name.
+        """The drones that receive commands, by name.
 
-        Reading it takes back drones whose authority was given back.
+        Reading it readmits drones whose authority was given back.
         """
         for name, error in list(self._aside.items()):
             if isinstance(error, AuthorityError) and self._drones[name].authority.state == "held":
@@ -228,14 +229,14 @@ class Swarm:
 
     @property
     def errors(self) -> dict[str, Exception]:
-        """Why drones do not take part, by name: those set aside, and those that were never connected."""
+        """Reasons of drones that do not take part, by name: those set aside, and those never connected."""
         return {**self.missing, **self._aside}
 
     def readmit(self, *names: str) -> None:
-        """Make drones that were set aside active again.
+        """Reactivate drones that were set aside.
 
         Args:
-            *names: Which; none: all.
+            *names: Names of the drones; none: all.
 
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names.
@@ -283,7 +284,7 @@ class Swarm:
         self.each(lambda drone: drone.takeoff(wait=wait, timeout_s=timeout_s), "takeoff")
 
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
-        """Land all active drones at their present positions, at the same time; see :meth:`Drone.land`.
+        """Land all active drones at their current positions, at the same time; see :meth:`Drone.land`.
 
         Args:
             wait: Wait until each has landed.
@@ -298,19 +299,19 @@ class Swarm:
     def hover(self) -> dict[str, bool]:
         """Stop and hold the position, with all active drones.
 
-        One that others fly is left to them: only its own ``drones[name].hover()`` takes it back.
+        Drones that others fly are left to them: only a drone's own ``drones[name].hover()`` takes it back.
         """
         return self.send(dict.fromkeys(self.active, Hover()))
 
     def idle(self) -> dict[str, bool]:
-        """Ask for nothing: keep the authority and leave the vehicles as they are."""
+        """Keep the authority and leave the vehicles as they are."""
         return self.command(Idle())
 
     @by_name
     def velocity(
         self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
-        """Fly with the same velocity, each drone in its own levelled body axes.
+        """Fly all active drones at the same velocity, each in its own levelled body axes.
 
         Args:
             forward: Along x, forward [m/s].
@@ -347,21 +348,21 @@ class Swarm:
         timeout_s: float = 60.0,
         tolerance_m: float = 0.2,
     ) -> None:
-        """Fly each drone straight to its own place, all at the same time; see :meth:`Drone.go_to`.
+        """Fly each drone straight to its own position, all at the same time; see :meth:`Drone.go_to`.
 
-        Nothing keeps the drones apart on the way: :class:`skyloop.control.formation_flight.Formation` plans ways that
-        do. Drones that are set aside are left out.
+        Nothing keeps the drones apart on the way: use :class:`skyloop.control.formation_flight.Formation` to plan safe
+        paths. Drones that are set aside are left out.
 
         Args:
-            places: By name of the drone: x, y, z in its world axes [m], and if wanted the yaw [rad].
-            speed: Greatest speed on the way [m/s]; None: as fast as the limits allow.
-            wait: Wait until each is there; else only send the commands.
+            places: By name of the drone: x, y, z in its world axes [m], and optionally the yaw [rad].
+            speed: Maximum speed on the way [m/s]; None: as fast as the limits allow.
+            wait: Wait until each is there; otherwise only send the commands.
             timeout_s: How long to wait [s].
-            tolerance_m: How far from its place is near enough [m].
+            tolerance_m: Distance from the position that counts as there [m].
 
         Raises:
-            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent then.
-            UsageError: If a place can't be flown to; nothing is sent then.
+            UnknownNameError: If no drone of the swarm has one of the names; then nothing is sent.
+            UsageError: If a position is invalid; then nothing is sent.
             SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -393,13 +394,13 @@ class Swarm:
         Nothing keeps the drones apart on the way.
 
         Args:
-            height_m: Above the start, at least, on the way [m]; None: as each drone's ``return.height`` says.
-            land: Land there, else hover above it; None: as each drone's ``return.land`` says.
-            wait: Wait until each has landed, or hovers above its start; else only send the commands.
+            height_m: Minimum height above the start on the way [m]; None: each drone's ``return.height``.
+            land: Land there, otherwise hover above it; None: each drone's ``return.land``.
+            wait: Wait until each has landed, or hovers above its start; otherwise only send the commands.
             timeout_s: How long to wait [s].
 
         Raises:
-            UsageError: If an argument makes no sense; nothing is sent then.
+            UsageError: If an argument makes no sense; then nothing is sent.
             SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -409,7 +410,7 @@ class Swarm:
         )
 
     def reset_emergency(self) -> dict[str, bool]:
-        """Leave the emergency state, on the ground, with all active drones."""
+        """Leave the emergency state while on the ground, with all active drones."""
         return self.command(ResetEmergency())
 
     def emergency_stop(self) -> dict[str, bool]:
@@ -429,20 +430,20 @@ class Swarm:
         return self.send(dict.fromkeys(self.active, action))
 
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone of its name, all sent together.
+        """Make each action the newest set-point of the drone with its name, all sent together.
 
         Drones that are set aside are left out. A hover takes no drone from others, see :meth:`hover`. :attr:`spread` is
-        how far apart the first and the last command left.
+        the time between the first and the last command.
 
         Args:
-            actions: By name of the drone.
+            actions: Actions by name of the drone.
 
         Returns:
-            By name, whether the command was handed to the transport now.
+            By name, True if the command was handed to the transport.
 
         Raises:
-            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent then.
-            UsageError: If an action can't be commanded or has numbers that are not finite; nothing is sent then.
+            UnknownNameError: If no drone of the swarm has one of the names; then nothing is sent.
+            UsageError: If an action can't be commanded or has numbers that are not finite; then nothing is sent.
             SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -452,14 +453,14 @@ class Swarm:
             checked(action)
         active = self.active
         ready = {name: active[name] for name in actions if name in active}
-        # A few milliseconds at most, until every drone sends a new set-point at once, so that none leaves later.
+        # Wait, a few milliseconds at most, until every drone can send a set-point at once, so that none leaves later.
         open_ns = max((drone._commands.open_ns for drone in ready.values()), default=0)
         time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
             action, commands = actions[name], ready[name]._commands
-            if type(action) is Hover:  # of all, which is no decision to take one from a safety pilot
+            if type(action) is Hover:  # a hover of all is no decision to take one from a safety pilot
                 handed = commands.command(action, automatic=type(commands.newest) is not Land)
             else:
                 handed = ready[name].command(action)
@@ -477,15 +478,14 @@ class Swarm:
         return sent
 
     def each(self, function: Callable[[Drone], T], what: str = "") -> dict[str, T]:
-        """Call ``function`` with each active drone, each on a thread of its own, and wait for all.
+        """Call ``function`` with each active drone in a separate thread, and wait for all.
 
         Args:
-            function: A :class:`SkyloopError` that it raises is that drone's failure; any other exception is raised
-                here.
-            what: Name of the action in the report of failures; empty: the function's.
+            function: If it raises a :class:`SkyloopError`, its drone has failed; any other exception is re-raised here.
+            what: Name of the action in error messages; empty: the function's.
 
         Returns:
-            What it returned, by name.
+            Its results by name.
 
         Raises:
             SwarmError: As set by ``on_error``.
@@ -509,7 +509,7 @@ class Swarm:
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> dict[str, AuthorityStatus]:
-        """Ask for the authority over all active drones.
+        """Request the authority over all active drones.
 
         Args:
             priority: 0 (highest) to 31 (lowest); None: as in the last request.
@@ -536,7 +536,7 @@ class Swarm:
         """Return the newest feedback of each active drone, by name.
 
         Args:
-            max_age_s: Oldest age since capture that is accepted [s]; a drone whose feedback is older has failed.
+            max_age_s: Maximum age since capture [s]; a drone with older feedback has failed.
 
         Raises:
             SwarmError: As set by ``on_error``.
@@ -548,20 +548,20 @@ class Swarm:
         return found
 
     def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
-        """Wait until all active drones are as wanted *at the same time*.
+        """Wait until all active drones meet a condition *at the same time*.
 
-        A drone whose link is lost is not as wanted, whatever its last feedback. Drones that are not as wanted in time
-        have failed.
+        A drone with a lost link does not meet it, whatever its last feedback. Drones that do not meet it in time have
+        failed.
 
         Args:
             wanted: A flight state or its name, several of them, or a predicate on feedback.
             timeout_s: How long to wait [s].
 
         Returns:
-            The feedback of those that are as wanted, by name.
+            The feedback of the drones that meet it, by name.
 
         Raises:
-            UnknownNameError: If there is no flight state of that name.
+            UnknownNameError: If there is no flight state of this name.
             SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -585,13 +585,13 @@ class Swarm:
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> Iterator[Tick]:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
 
-        Ends with the swarm. After an iteration that takes longer than a period the deadlines restart from there. When
-        the loop ends, by its time, a ``break``, an exception or Ctrl-C, drones that fly by a velocity or an attitude of
-        it hover at once: nobody gives them a newer one.
+        Ends with the swarm. After an iteration longer than a period, the deadlines restart from there. When the loop
+        ends, by its time, a ``break``, an exception or Ctrl-C, drones that fly by its velocities or attitudes hover at
+        once, because nothing would give them newer ones.
 
         Args:
-            rate_hz: Ticks a second, 0.1 to 200.
-            seconds: For how long [s]; None: until the loop is left.
+            rate_hz: Ticks per second, 0.1 to 200.
+            seconds: Duration [s]; None: until the loop ends.
 
         Raises:
             UsageError: If ``rate_hz`` is out of range, at the first iteration.
@@ -608,14 +608,14 @@ class Swarm:
                 yield Tick(count, due_s - begun_s, late_s)
                 count += 1
                 due_s = max(due_s + period_s, time.monotonic())
-        finally:  # at a break or an exception in the loop as soon as it drops this generator, which is at once
+        finally:  # a break or an exception in the loop drops this generator, which runs this at once
             for drone in self:
                 if isinstance(drone._commands.newest, Velocity | Attitude):
                     drone._piloting.let_go("the loop that flew it has ended")
 
     @property
     def spread(self) -> Distribution | None:
-        """How far apart the first and the last command of one :meth:`send` left this process [s]; None before any."""
+        """Time between the first and the last command of a :meth:`send` [s]; None before the first."""
         return distribution(np.frombuffer(bytes(self._spreads_ns), np.int64))
 
     # Failures ------------------------------------------------------------------------------------------------------
@@ -623,11 +623,11 @@ class Swarm:
     def fail(self, what: str, errors: Mapping[str, Exception]) -> None:
         """Apply ``on_error`` after some drones have failed. Does nothing if ``errors`` is empty.
 
-        The swarm's own commands call it; programs that build on a swarm may too.
+        The swarm's own commands call it; programs that build on a swarm may call it, too.
 
         Args:
-            what: What they failed at, for the report.
-            errors: Why, by name of the drone.
+            what: Name of the failed action, for the error.
+            errors: The exceptions, by name of the drone.
 
         Raises:
             SwarmError: As set by ``on_error``.
@@ -655,19 +655,19 @@ class Swarm:
     # The end ---------------------------------------------------------------------------------------------------
 
     def _leave(self) -> dict[str, Exception]:
-        """Do what the end of the block does: land all that fly, at the same time, and close.
+        """Do the work of the block's end: land all flying drones at the same time, and close.
 
         Idempotent.
 
         Returns:
-            What failed, by name of the drone.
+            The exceptions, by name of the drone.
         """
         if self._closed:
             return {}
         self._closed = True
         for drone in self._drones.values():
             if not drone.closed:
-                drone._commands.bar()  # all before the first lands
+                drone._commands.bar()  # for all drones, before the first lands
         return end_flights(self._drones)
 
     def close(self) -> None:
@@ -683,7 +683,7 @@ class Swarm:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.active  # noqa: B018  (takes those back that were given back)
+        self.active  # noqa: B018  (readmits drones that were given back)
         errors = dict(self._aside) | self._leave()
         if not errors:
             return
@@ -700,22 +700,22 @@ class Swarm:
 
 
 def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[str, R], dict[str, Exception]]:
-    """Call ``function`` for each item in turn: what it returned, and the :class:`SkyloopError` it raised, by name.
+    """Call ``function`` for each item in turn; return its results and its :class:`SkyloopError`, by name.
 
-    Any other exception is raised when all had their turn.
+    Any other exception is raised after all had their turn.
     """
     results: dict[str, R] = {}
     raised: dict[str, Exception] = {}
     for name, item in items.items():
         try:
             results[name] = function(item)
-        except Exception as error:  # noqa: BLE001  (the others get theirs first)
+        except Exception as error:  # noqa: BLE001  (the others get their turn first)
             raised[name] = error
     return results, _expected(raised)
 
 
 def _expected(raised: Mapping[str, BaseException]) -> dict[str, Exception]:
-    """Return what was raised if it is all of Skyloop's own; raise the first that is not."""
+    """Return the exceptions if all are Skyloop's own; raise the first that is not."""
     errors: dict[str, Exception] = {}
     for name, error in raised.items():
         if not isinstance(error, SkyloopError):
@@ -726,7 +726,9 @@ def _expected(raised: Mapping[str, BaseException]) -> dict[str, Exception]:
 
 def _place(name: str, numbers: Sequence[float], speed: float | None) -> Position:
     if not 3 <= len(numbers) <= 4:
-        raise UsageError(f"the place of {name} is {numbers!r:.60} and must be x, y, z [m], and if wanted the yaw [rad]")
+        raise UsageError(
+            f"the position of {name} is {numbers!r:.60} and must be x, y, z [m], and optionally the yaw [rad]"
+        )
     x, y, z, yaw = (*numbers, None)[:4]
     return position_action(x, y, z, yaw, speed)
 
@@ -751,21 +753,21 @@ def _is(drone: Drone, predicate: Callable[[Feedback], bool]) -> bool:
 
 
 def end_flights(drones: Mapping[str, Drone]) -> dict[str, Exception]:
-    """End the flights of all at the same time and close; return what went wrong, by name.
+    """End all drones' flights at the same time and close them; return the errors by name.
 
-    Ctrl-C meanwhile waits no longer for landings: each is asked for all the same, and goes on without this program.
+    Ctrl-C ends the wait for landings: each is still commanded, and continues without this program.
     """
     return _problems(drones, lambda drone: drone._piloting.end_flight())
 
 
 def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError | None]) -> dict[str, Exception]:
-    """Land all, or end their flights, at the same time; return what went wrong, by name."""
+    """Land all drones, or end their flights, at the same time; return the errors by name."""
 
     def job(drone: Drone) -> Callable[[], SkyloopError | None]:
         def ended() -> SkyloopError | None:
             try:
                 return end(drone)
-            except GivenUpError:  # nobody waits for it any more
+            except GivenUpError:  # no one waits for it any more
                 return None
 
         return ended
@@ -783,18 +785,18 @@ def _not_sent(drone: Drone) -> LinkError:
 def in_parallel(
     jobs: Mapping[str, Callable[[], T]], interrupted: threading.Event | None = None
 ) -> tuple[dict[str, T], dict[str, Exception]]:
-    """Run all jobs at the same time, each on a thread of its own, and wait for the last.
+    """Run all jobs at the same time, each in its own thread, and wait for the last.
 
-    The threads are daemons; what gets none is done on this one. An interrupt of the waiting ends their waits for
-    commands, see :data:`skyloop.client.commands.cancelled`; what else they do ends by itself.
+    The threads are daemons; a job that gets none runs on this one. An interrupt ends the jobs' waits for commands, see
+    :data:`skyloop.client.commands.cancelled`; their other work ends normally.
 
     Args:
-        jobs: By name.
-        interrupted: Ends their waits as well, once it is set.
+        jobs: The jobs by name.
+        interrupted: Once set, it also ends their waits.
 
     Returns:
-        What each job returned, and the :class:`SkyloopError` that each raised, both by name. Any other exception is
-        raised here when all have ended.
+        The result of each job, and the :class:`SkyloopError` that each raised, both by name. Any other exception is
+        re-raised here when all have ended.
     """
     results: dict[str, T] = {}
     raised: dict[str, BaseException] = {}
@@ -813,7 +815,7 @@ def in_parallel(
         thread = threading.Thread(target=work, args=(name, job), name=f"skyloop-swarm-{name}", daemon=True)
         try:
             thread.start()
-        except RuntimeError:  # there is none to be had: a drone has to land all the same
+        except RuntimeError:  # no thread is available: the drone must still land
             left.append(name)
         else:
             threads.append(thread)
@@ -821,10 +823,10 @@ def in_parallel(
         for name in left:
             copy_context().run(work, name, jobs[name])
             if not isinstance(raised.get(name), Exception | None):
-                raise raised[name]  # Ctrl-C, on this thread: nothing else begins
+                raise raised[name]  # Ctrl-C, on this thread: start nothing else
         for thread in threads:
             thread.join()
-    except BaseException:  # Ctrl-C: a take-off must not be carried out later
+    except BaseException:  # Ctrl-C: a take-off must not be executed later
         interrupted.set()
         raise
     errors = _expected({name: raised[name] for name in jobs if name in raised})

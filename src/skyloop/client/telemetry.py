@@ -1,4 +1,4 @@
-"""What arrives from a proxy: the newest of each kind is kept, counted, and published to consumers."""
+"""A proxy's samples at the client: the newest of each kind is stored, counted, and published to consumers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from skyloop.messages.subscription import PLAIN, RateLimiter
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW
 
 RECENT_EVENTS: Final = 256
-#: What can be waited for: a flight state (or its name), one of several, or a predicate on feedback.
+#: A condition to wait for: a flight state or its name, one of several, or a predicate on feedback.
 Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
 T = TypeVar("T")
 
@@ -54,11 +54,11 @@ class LinkStatus:
     application: LinkState  #: application–proxy
     vehicle: LinkState  #: proxy–vehicle, as last reported by the proxy
     reason: str = ""
-    remedy: str = ""  #: what a person can do about the vehicle's link while it is not up
+    remedy: str = ""  #: a remedy for the vehicle's link while it is not up
 
 
 class Closable(Protocol):
-    """What ends with the drone."""
+    """A resource that ends with the drone."""
 
     def close(self) -> None: ...
 
@@ -66,7 +66,7 @@ class Closable(Protocol):
 class Mailboxes:
     """Mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
 
-    A context manager: they are filled while it is open.
+    A context manager: they fill while it is open.
     """
 
     def __init__(
@@ -80,13 +80,13 @@ class Mailboxes:
         processors: Iterable[str] | None = None,
         max_age_s: float | None = None,
     ) -> None:
-        """Make empty mailboxes of what is wanted; see :class:`skyloop.extend.InboxOptions`.
+        """Create empty mailboxes as requested; see :class:`skyloop.extend.InboxOptions`.
 
-        Raises what :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel` raise.
+        Raises the errors of :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel`.
         """
         known = state.results
         named = [known.everything] if processors is None else [known.channel(one) for one in processors]
-        self.clock = state.scheduler.clock  #: on which a controller's time runs
+        self.clock = state.scheduler.clock  #: the clock of a controller
         self.notifier = state.sample_notifier()
         self.feedback: Mailbox[Feedback] = Mailbox(1, self.notifier)
         self.frames: Mailbox[Arrival] = Mailbox(1, self.notifier)
@@ -113,11 +113,11 @@ class Mailboxes:
 
     @property
     def waiting(self) -> bool:
-        """Whether there is something to take."""
+        """Whether there is anything to take."""
         return self.feedback.waiting or self.frames.waiting or self.results.waiting
 
     def frame(self) -> Frame | None:
-        """Take the newest frame; None if it was taken already, none came, or it can't be decoded."""
+        """Take the newest frame; None if it was already taken, none arrived, or it can't be decoded."""
         arrival, video = self.frames.take(), self._video
         if arrival is None or video is None:
             return None
@@ -125,24 +125,24 @@ class Mailboxes:
 
 
 class FeedbackDemand:
-    """Subscribes to the form of feedback that all consumers of a drone need together.
+    """Subscribes to the form of feedback that covers all consumers of a drone.
 
-    A pilot is sent every sample whole: its link, its authority and a failsafe show in them. An observer is, too, until
-    a consumer asks for less, and whenever one asks for all. A connection has one form at a time.
+    A pilot gets every complete sample, because they show its link, its authority and failsafes. So does an observer,
+    until a consumer limits its request, and whenever one needs all. A connection has one form at a time.
     """
 
     def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
-        """Subscribe to every sample; where ``whole``, it stays so whatever consumers ask for."""
+        """Subscribe to every sample; with ``whole``, this never changes."""
         self._connection = connection
         self._whole = whole
-        self._wanted: dict[FeedbackRequest, int] = {}  # how many consumers want each
-        self._kept: set[FeedbackRequest] = set()  # wanted for good
+        self._wanted: dict[FeedbackRequest, int] = {}  # number of consumers of each request
+        self._kept: set[FeedbackRequest] = set()  # permanent requests
         self._lock = threading.Lock()
-        self.request = PLAIN  #: what is subscribed to now
+        self.request = PLAIN  #: the current subscription
         connection.subscribe(PLAIN.topic)
 
     def want(self, request: FeedbackRequest, on: bool) -> None:
-        """Count a consumer of this request in, or out again."""
+        """Add a consumer of this request, or remove one."""
         with self._lock:
             count = self._wanted.get(request, 0) + (1 if on else -1)
             if count > 0:
@@ -152,7 +152,7 @@ class FeedbackDemand:
             self._update()
 
     def keep(self, request: FeedbackRequest) -> None:
-        """Want this for good."""
+        """Add a permanent request."""
         if not self._whole and request not in self._kept:
             with self._lock:
                 self._kept.add(request)
@@ -160,7 +160,7 @@ class FeedbackDemand:
 
     @contextmanager
     def wanted(self, request: FeedbackRequest) -> Iterator[None]:
-        """Want this within the block."""
+        """Add a request during the block."""
         self.want(request, True)
         try:
             yield
@@ -168,18 +168,18 @@ class FeedbackDemand:
             self.want(request, False)
 
     def _update(self) -> None:
-        """Change the subscription if another is needed. The lock is held."""
+        """Change the subscription if necessary. The lock is held."""
         asked = [*self._wanted, *self._kept]
         needed = PLAIN if self._whole or not asked else reduce(FeedbackRequest.union, asked)
         before = self.request
         if needed != before:
             self.request = needed
-            self._connection.subscribe(needed.topic, True)  # first, so that none is missing in between
+            self._connection.subscribe(needed.topic, True)  # first, so that no sample is missed in between
             self._connection.subscribe(before.topic, False)
 
 
 class FeedbackChannel(Channel[Feedback]):
-    """Feedback for consumers that ask for fewer samples than the connection may be sent for others."""
+    """Feedback for consumers that request fewer samples than the connection gets for others."""
 
     def __init__(self, request: FeedbackRequest, demand: FeedbackDemand) -> None:
         super().__init__(lambda on: demand.want(request, on))
@@ -198,16 +198,16 @@ class ClientState:
     def __init__(
         self, app: str, connection: ProxyConnection, scheduler: Scheduler, *, whole_feedback: bool = True
     ) -> None:
-        """Make the state of a drone that has not connected yet; ``app`` is the application's name."""
+        """Create the state of an unconnected drone; ``app`` is the application's name."""
         self.app = app
         self.scheduler = scheduler
-        self.listeners: list[Listener[Any]] = []  #: the application's callbacks that were not cancelled
-        self.to_close: list[Closable] = []  #: what ends with the drone
+        self.listeners: list[Listener[Any]] = []  #: the application's active callbacks
+        self.to_close: list[Closable] = []  #: resources that end with the drone
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
-        self.received_ns = 0  #: when the newest feedback came, on our clock
+        self.received_ns = 0  #: when the newest feedback arrived, on our clock
         self.history = FeedbackHistory()
-        #: Notified with each feedback, and when something changes that somebody may wait for.
+        #: Notified with each feedback, and with every change that a thread may wait for.
         self.notifier = scheduler.notifier()
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
@@ -216,20 +216,20 @@ class ClientState:
         self.echoes = ChannelCounter()
         self.demand = FeedbackDemand(connection, whole=whole_feedback)
         self.on_feedback: Channel[Feedback] = Channel(lambda on: self.demand.want(PLAIN, on))
-        self.selected: tuple[FeedbackChannel, ...] = ()  #: of consumers that ask for less
+        self.selected: tuple[FeedbackChannel, ...] = ()  #: for consumers with a limited request
         self.on_event: Channel[Event] = Channel()
         self.on_link: Channel[LinkStatus] = Channel()
         self.on_command: Channel[Applied] = Channel(lambda on: connection.subscribe(COMMANDS, on))
         self.on_annotation: Channel[Annotation] = Channel(lambda on: connection.subscribe(ANNOTATIONS, on))
         self.on_log: Channel[LogEntry] = Channel(lambda on: connection.subscribe(LOGS, on))
         self.on_overview: Channel[Overview] = Channel(lambda on: connection.subscribe(OVERVIEW, on))
-        self.overview: Overview | None = None  #: the newest whole one
+        self.overview: Overview | None = None  #: the newest complete one
         self.on_share: Channel[ProcessorShare] = Channel()
-        self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; supervisor's thread
+        self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; on the supervisor's thread
         self.results = ResultChannels(connection, scheduler, self.history)
         self._clock = scheduler.clock
         self._connection = connection
-        self._making = threading.RLock()  # a channel: two threads that ask for the same one get the same
+        self._making = threading.RLock()  # so that two threads that request the same channel get the same one
 
     @property
     def name(self) -> str:
@@ -237,16 +237,16 @@ class ClientState:
         return "" if self.welcome is None else self.welcome.proxy
 
     def sample_notifier(self) -> Notifier:
-        """Return a notifier for a thread that waits for nothing but samples of this connection."""
+        """Return a notifier for a thread that waits only for samples of this connection."""
         return self.scheduler.sample_notifier(self._connection)
 
     def follow(self, find: Callable[[], C]) -> FollowingChannel[Any, C]:
-        """Return the channel that ``find`` returns, also once the proxy was started again with other cameras."""
+        """Return the channel found by ``find``, even after the proxy restarts with other cameras."""
         return FollowingChannel(find, self.on_welcome)
 
     @contextmanager
     def closing(self, mailbox: Closable) -> Iterator[None]:
-        """Close ``mailbox``, which wakes its consumer, if the drone is closed within the block."""
+        """Close ``mailbox``, which wakes its consumer, if the drone is closed during the block."""
         self.to_close.append(mailbox)
         try:
             yield
@@ -254,20 +254,20 @@ class ClientState:
             self.to_close.remove(mailbox)
 
     def forget(self, listener: Listener[Any]) -> None:
-        """Forget a listener, which was cancelled."""
+        """Forget a cancelled listener."""
         if listener in self.listeners:
             self.listeners.remove(listener)
 
     def no_frame(self, camera: str, timeout_s: float) -> NoAnswerError:
-        """Return the error for a frame that did not come, with what is known of the reason."""
+        """Return the error for a missing frame, with the known reason."""
         link = self.status
-        words = [f"no frame of {camera} came within {timeout_s:g} s"]
+        words = [f"no frame of {camera} arrived within {timeout_s:g} s"]
         if link.vehicle is not LinkState.UP:
             words += [f"the vehicle's link is {link.vehicle.value}", link.reason, link.remedy]
         return NoAnswerError(": ".join(filter(None, words)))
 
     def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
-        """Return the channel of feedback as requested, made on the first call."""
+        """Return the channel of feedback as requested, creating it on the first call."""
         if request.is_plain:
             return self.on_feedback
         with self._making:
@@ -279,7 +279,7 @@ class ClientState:
         return known[request]
 
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None:
-        """Emit an event of the client's own (number 0); ``data`` are its details, by name."""
+        """Emit one of the client's own events (number 0); ``data`` are its details, by name."""
         event = Event(kind, text, self._clock() + self._connection.offset_ns, severity, app=self.app, data=dict(data))
         self.recent.append(event)
         self.on_event.publish(event)
@@ -305,7 +305,7 @@ class ClientState:
         return found
 
     def wake_all(self) -> None:
-        """Wake every thread that waits, so that it checks its condition again."""
+        """Wake every waiting thread, so that it checks its condition again."""
         self.notifier.notify()
         for channel in tuple(self.video.variants.values()):
             channel.notifier.notify()
@@ -320,9 +320,9 @@ class ClientState:
 
 
 class Receiver:
-    """Gets all that arrives in any session and all that happens to the connection: its handler in every session.
+    """Handles the samples and the connection changes of every session.
 
-    ``feedback``, ``frame`` and the other samples come on the receiving thread, the rest on the supervisor's.
+    ``feedback``, ``frame`` and the other samples arrive on the receiving thread, the rest on the supervisor's.
     """
 
     def __init__(
@@ -348,7 +348,7 @@ class Receiver:
         }
 
     def connected(self, welcome: Welcome) -> None:
-        """Reset the counters, and take in the vehicle's capabilities: a proxy has answered Hello."""
+        """Reset the counters and store the vehicle's capabilities, after a proxy has answered Hello."""
         state = self._state
         state.welcome = welcome
         state.video.connected(welcome.capabilities.cameras, self._clock())
@@ -365,18 +365,18 @@ class Receiver:
         self._state.emit(EventKind.APPLICATION_LINK, text, severity, state=state.value, reason=reason)
 
     def tick(self, now_ns: int) -> int:
-        """Subscribe again to cameras that have stalled, and send what is due; return when to call again [ns]."""
+        """Resubscribe to stalled cameras, and send all due packets; return when to call again [ns]."""
         self._state.video.renew(self._connection.state is LinkState.UP, now_ns)
         return self._commands.tick(now_ns)
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:
-        """Keep and publish a sample of feedback, then update the statistics, the authority and the link's state."""
+        """Store and publish a sample of feedback, then update the statistics, the authority and the link's state."""
         state = self._state
         before = state.newest
         state.history.add(sample)
         state.newest = sample
         state.received_ns = now_ns
-        # A failsafe or another owner ends the set-point, but not what a listener commands in answer to this sample.
+        # A failsafe or another owner ends the set-point, but not the command of a listener in response to this sample.
         changed = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
         if changed:
             self._commands.feedback(sample, now_ns)
@@ -397,7 +397,7 @@ class Receiver:
             state.set_status(replace(status, vehicle=sample.vehicle_link, reason=reason, remedy=remedy))
 
     def _event(self, event: Event, now_ns: int) -> None:
-        """Keep and publish an event."""
+        """Store and publish an event."""
         self._state.recent.append(event)
         if event.kind is EventKind.PARAMETER_CHANGED and event.data.get("app_id") != self._commands.app_id:
             self._restorer.overwritten(str(event.data.get("name")))
@@ -411,8 +411,8 @@ class Receiver:
             self._state.echoes.add(applied.applied_ns - applied.sent_ns, applied.sent_ns, now_ns)
         self._state.on_command.publish(applied)
 
-    def _overview(self, page: Overview, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
-        """Publish an overview whose pages have all come."""
+    def _overview(self, page: Overview, now_ns: int) -> None:  # noqa: ARG002  (the signature of all handlers)
+        """Publish an overview once all of its pages have arrived."""
         whole = self._overview_pages.add(page)
         if whole is not None:
             self._state.overview = whole
@@ -421,7 +421,7 @@ class Receiver:
 
 
 def _link_reason(events: Sequence[Event]) -> str:
-    """Return the reason that the newest event about the vehicle's link gives; empty if there is none."""
+    """Return the reason in the newest event about the vehicle's link; empty if there is none."""
     found = (event for event in reversed(events) if event.kind is EventKind.VEHICLE_LINK)
     return next((str(event.data.get("reason", "")) or event.text for event in found), "")
 
@@ -431,10 +431,10 @@ def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
-    """Return the predicate for what is waited for, and its name for people.
+    """Return the predicate for a condition, and its name for people.
 
     Raises:
-        UnknownNameError: If there is no flight state of that name.
+        UnknownNameError: If there is no flight state of this name.
     """
     if callable(wanted):
         name = getattr(wanted, "__name__", "<lambda>")

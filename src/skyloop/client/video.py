@@ -1,4 +1,4 @@
-"""Channels of video: frames of a camera as one request wants them, and encoded streams, decoded on a thread."""
+"""Channels of video: a camera's frames for each request, and encoded streams, decoded on a thread."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from skyloop.transport.base import Pixels, stream, video
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
-#: Pictures that may wait to be decoded. With more, decoding is too slow for what comes: they are left out up to a key.
+#: Pictures that may wait for decoding. Beyond that, decoding is too slow: they are skipped up to a key picture.
 MOST_WAITING: Final = 6
-IDLE_KEPT: Final = 32  #: so many channels of each kind are kept; of more, those that nobody reads are forgotten
-ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key picture before it is asked for again
+IDLE_KEPT: Final = 32  #: channels of each kind that are kept; beyond that, unread ones are forgotten
+ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key picture before requesting it again
 _IDLE_S: Final = 2.0
 _PURPOSE: Final = "reading H.264"
 
 
 class VideoOptions(TypedDict, total=False):
-    """How frames are requested; see :meth:`skyloop.Drone.frames`."""
+    """Options of a request for frames; see :meth:`skyloop.Drone.frames`."""
 
     encoding: VideoEncoding
     quality: int
@@ -47,21 +47,21 @@ class VideoOptions(TypedDict, total=False):
 
 
 def usual(camera: str) -> VideoRequest:
-    """Return the request of a consumer that asks for nothing in particular: JPEG where frames travel over a network."""
+    """Return the default request: JPEG where frames travel over a network."""
     return VideoRequest(camera, encoding="jpeg")
 
 
 class StreamOptions(TypedDict, total=False):
-    """How H.264 is wanted; with none of these, as the vehicle itself encoded it."""
+    """Options for H.264; without any, as the vehicle itself encoded it."""
 
-    kbit_s: int | None  #: encoded by the proxy at this rate, once for all who ask for the same [kbit/s]
-    max_fps: float | None  #: most pictures a second; None: all
+    kbit_s: int | None  #: rate of an encoding by the proxy, shared by all who request the same [kbit/s]
+    max_fps: float | None  #: maximum pictures per second; None: all
     scale: float  #: factor for width and height, above 0 and up to 1
-    subscriber: str  #: encoded by the proxy for this subscriber alone, at the rate that the path to it carries
+    subscriber: str  #: encoded by the proxy for this subscriber alone, at the rate that its path carries
 
 
 class VideoChannel(Channel[Arrival]):
-    """Frames of one camera, as one request wants them."""
+    """One camera's frames for one request."""
 
     def __init__(
         self,
@@ -71,20 +71,20 @@ class VideoChannel(Channel[Arrival]):
         history: FeedbackHistory,
         request: VideoRequest | None = None,
     ) -> None:
-        """Make a channel without consumers of a camera's frames as requested; None: see :func:`usual`."""
+        """Create a channel without consumers for a request for a camera's frames; None: see :func:`usual`."""
         self.camera = camera
         self.request = request or usual(camera.name)
         super().__init__(lambda on: connection.subscribe(self.request.topic, on))
-        #: Names its statistics: the camera's plain topic for the usual request, else the request's own.
+        #: Name in the statistics: the camera's plain topic for the default request, otherwise the request's own.
         self.name = video(camera.name) if self.request == usual(camera.name) else self.request.topic
         self.newest: Arrival | None = None
         self.notifier = scheduler.notifier()  #: notified with each frame
         self.counter = ChannelCounter()
         self.undecodable = 0
-        self.too_old = 0  #: frames that a consumer got and, by its ``max_age_s``, did not want
+        self.too_old = 0  #: frames that a consumer rejected by its ``max_age_s``
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
-        self.filter = FrameFilter(self.request)  #: chooses the plain frames that this request asks for
-        self._read: Arrival | None = None  # what next_frame() gave last
+        self.filter = FrameFilter(self.request)  #: selects this request's frames from the plain ones
+        self._read: Arrival | None = None  # last result of next_frame()
         self._connection = connection
         self._history = history
         self._clock = scheduler.clock
@@ -100,7 +100,7 @@ class VideoChannel(Channel[Arrival]):
         return None if arrival is None else self.picture(arrival)
 
     def picture(self, arrival: Arrival, max_age_s: float | None = None) -> Frame | None:
-        """Decode the frame; None, and counted, if it can't be decoded or is older than ``max_age_s`` [s]."""
+        """Decode the frame; return None and count it if it can't be decoded or is older than ``max_age_s`` [s]."""
         if max_age_s is not None and arrival.age_s > max_age_s:
             self.too_old += 1
             return None
@@ -111,21 +111,21 @@ class VideoChannel(Channel[Arrival]):
             return None
 
     def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, *, as_asked: bool) -> None:
-        """Publish a frame that came at ``now_ns``; ignores one that is repeated or was overtaken.
+        """Publish a frame received at ``now_ns``; ignore duplicates and overtaken ones.
 
-        ``as_asked``: whether the proxy made it for this request; if False it is scaled here where needed.
+        ``as_asked``: whether the proxy made it for this request; if False, it is scaled here as needed.
         """
         counter = self.counter
         last = counter.last_seq
         if last is not None and header.seq <= last:
-            return  # repeated or overtaken
+            return  # a duplicate, or overtaken
         offset_ns, scale = self._connection.offset_ns, self.request.scale
         if as_asked or scale == 1.0:
             arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock)
         else:
             arrival = SmallArrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
-        # Consumers first, then the statistics. The previous frame is released last: giving its memory back to the proxy
-        # takes longer than all of this.
+        # Consumers first, then the statistics. The previous frame is released last, because returning its memory to the
+        # proxy takes longer than everything else here.
         before, self.newest = self.newest, arrival
         self.publish(arrival)
         self.notifier.notify()
@@ -135,7 +135,7 @@ class VideoChannel(Channel[Arrival]):
         self.watch.received_ns = now_ns
 
     def restart(self, now_ns: int) -> None:
-        """Reset the frame number: a proxy was connected, which may count its frames from 0."""
+        """Reset the frame number, because a newly connected proxy may count its frames from 0."""
         self.counter.last_seq = None
         self.watch.received_ns = now_ns
 
@@ -152,31 +152,31 @@ class VideoChannel(Channel[Arrival]):
 
 
 class StreamChannel(Channel[EncodedFrame]):
-    """The pictures of one stream, whole, in the order in which they came; some may be missing."""
+    """The whole pictures of one stream in order of arrival; some may be missing."""
 
     def __init__(self, topic: str, connection: ProxyConnection, clock: Clock) -> None:
         super().__init__(lambda on: connection.subscribe(topic, on))
         self.topic = topic
-        self.decoder: StreamDecoder | None = None  #: for frames that were asked for as H.264
+        self.decoder: StreamDecoder | None = None  #: for consumers of decoded frames
         self._connection = connection
         self._clock = clock
-        self._encoded_here = "?" in topic  # by the proxy, which wants to know what came
+        self._encoded_here = "?" in topic  # encoded by the proxy, which needs reports of arrivals
         self._pieces = Pieces()
         self._asked_ns = -ASK_AGAIN_NS
 
     def receive(self, part: EncodedFrame) -> None:
-        """Take what came, on the receiving thread."""
+        """Handle a received part, on the receiving thread."""
         picture = self._pieces.add(part)
         if picture is None:
             return
-        if self.decoder is not None and self._connection.variants:  # else frames come as they are
+        if self.decoder is not None and self._connection.variants:  # otherwise frames arrive unchanged
             self.decoder.put(picture)
         self.publish(picture)
 
     def report(self, seq: int, *, wants_key: bool = False) -> None:
-        """Tell the proxy which picture was the newest, which a rate that follows the path needs. Any thread.
+        """Report the newest picture to the proxy, which needs it to follow the path's rate. Thread-safe.
 
-        ``wants_key``: it can't be decoded, as one before it is missing; asked at most some times a second.
+        ``wants_key``: pictures can't be decoded because one is missing; requested at most some times a second.
         """
         if not self._encoded_here:
             return
@@ -189,15 +189,15 @@ class StreamChannel(Channel[EncodedFrame]):
 
 
 class StreamDecoder:
-    """Decodes one stream on a thread of its own, in order. What can't be decoded is left out up to a key picture.
+    """Decodes one stream in its own thread, in order. Undecodable pictures are skipped up to a key picture.
 
-    ``deliver`` is called on that thread with each picture: its header, its pixels in BGR, and when it came [ns].
+    ``deliver`` is called on that thread with each picture: its header, its pixels in BGR, and its arrival time [ns].
     """
 
     def __init__(
         self, stream: StreamChannel, deliver: Callable[[FrameHeader, Pixels, int], None], clock: Clock, name: str
     ) -> None:
-        self.dropped = 0  #: pictures that came and were not shown: after a gap, damaged, or too many at once
+        self.dropped = 0  #: received pictures that were not shown: after a gap, damaged, or too many at once
         self._stream = stream
         self._deliver = deliver
         self._clock = clock
@@ -209,10 +209,10 @@ class StreamDecoder:
         self._context: VideoCodecContext | None = None
 
     def put(self, picture: EncodedFrame) -> None:
-        """Take a picture, on the receiving thread."""
+        """Queue a picture, on the receiving thread."""
         with self._changed:
             follows = picture.codec == H264 and self._chain.follows(picture.seq, key=picture.key)
-            if picture.key:  # nothing before it is of use any more
+            if picture.key:  # earlier pictures are no longer useful
                 self.dropped += len(self._waiting)
                 self._waiting.clear()
             elif follows and len(self._waiting) >= MOST_WAITING:
@@ -246,11 +246,11 @@ class StreamDecoder:
         with self._changed:
             if self._changed.wait_for(lambda: bool(self._waiting), _IDLE_S):
                 return self._waiting.popleft()
-            self._running = False  # what comes after a silence of the path still follows: the decoder stays
+            self._running = False  # pictures after a silence of the path still follow: the decoder stays
             return None
 
     def _leave_out(self) -> None:
-        """Leave out a damaged picture and those that build on it."""
+        """Skip a damaged picture and those that refer to it."""
         with self._changed:
             self.dropped += 1
             while self._waiting and not self._waiting[0][0].key:
@@ -260,7 +260,7 @@ class StreamDecoder:
                 self._chain.restart()
 
     def _decode(self, picture: EncodedFrame) -> Pixels | None:
-        """Return the image, BGR; None for one that is damaged."""
+        """Return the image, BGR; None if it is damaged."""
         import av
 
         if self._context is None or picture.key:
@@ -278,17 +278,17 @@ class StreamDecoder:
 
 
 class VideoChannels:
-    """The channels of all cameras and their streams. Asked for on any thread; video comes on the receiving one."""
+    """The channels of all cameras and their streams. Thread-safe; video arrives on the receiving thread."""
 
     def __init__(self, connection: ProxyConnection, scheduler: Scheduler, history: FeedbackHistory) -> None:
-        self.channels: dict[str, VideoChannel] = {}  #: by camera, with the usual request
+        self.channels: dict[str, VideoChannel] = {}  #: by camera, for the default request
         self.variants: dict[str, VideoChannel] = {}  #: all channels, by the topic of their request
         self.streams: dict[str, StreamChannel] = {}  #: by topic
-        self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
+        self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to this client
         self._connection = connection
         self._scheduler = scheduler
         self._history = history
-        self._making = threading.RLock()  # a channel: two threads that ask for the same one get the same
+        self._making = threading.RLock()  # so that two threads that request the same channel get the same one
 
     def channel(
         self,
@@ -302,15 +302,15 @@ class VideoChannels:
         kbit_s: int | None = None,
         max_age_s: float | None = None,
     ) -> VideoChannel:
-        """Return the channel of a camera whose frames come as requested; see :meth:`skyloop.Drone.frames`.
+        """Return the channel of a camera's frames as requested; see :meth:`skyloop.Drone.frames`.
 
         ``max_age_s`` is only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
 
         Raises:
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range, or ``quality`` is given for other frames than JPEG.
-            MissingExtraError: If H.264 is asked for and PyAV is not installed.
+            UsageError: If an option is out of range, or ``quality`` is given for another encoding than JPEG.
+            MissingExtraError: If H.264 is requested and PyAV is not installed.
             ClosedError: If the drone was closed.
         """
         self._connection.check_open()
@@ -322,7 +322,7 @@ class VideoChannels:
         if channel is None:
             raise UnknownNameError("camera", str(camera), channels)
         if encoding in ("raw", "h264") and quality is not None:
-            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is {encoding!r}')
+            raise UsageError(f'quality={quality!r} needs encoding="jpeg", and the encoding is {encoding!r}')
         if encoding == "h264":
             require_pyav(_PURPOSE)
         request = VideoRequest(
@@ -342,7 +342,7 @@ class VideoChannels:
         return self._made_stream(VideoRequest(self.channel(camera).camera.name, encoding="h264", **how))
 
     def made(self, camera: CameraInfo, request: VideoRequest | None = None) -> VideoChannel:
-        """Return the channel of a camera's frames as requested (None: as :func:`usual`), made on the first call."""
+        """Return the channel of a camera's frames as requested (None: :func:`usual`), creating it on the first call."""
         topic = (request or usual(camera.name)).topic
         with self._making:
             channel = self.variants.get(topic)
@@ -358,7 +358,7 @@ class VideoChannels:
         return channel
 
     def _made_stream(self, request: VideoRequest) -> StreamChannel:
-        """Return the channel of an encoded stream, made on the first call; ``request`` has ``encoding="h264"``."""
+        """Return the channel of an encoded stream, created on the first call; ``request`` has ``encoding="h264"``."""
         topic = request.stream_topic
         with self._making:
             channel = self.streams.get(topic)
@@ -369,22 +369,22 @@ class VideoChannels:
         return channel
 
     def connected(self, cameras: Iterable[CameraInfo], now_ns: int) -> None:
-        """Take in the cameras of a proxy that was connected, which may count its frames from 0."""
+        """Store the cameras of a newly connected proxy, which may count its frames from 0."""
         for channel in tuple(self.variants.values()):
             channel.restart(now_ns)
-        # The proxy may have been started again, with other cameras, of which another one is the first.
+        # The proxy may have restarted with other cameras, so that another one is the first.
         self.channels = {one.name: self.channels.get(one.name) or self.made(one) for one in cameras}
 
     def renew(self, flows: bool, now_ns: int) -> None:
-        """Subscribe again to cameras that have stalled although other samples come (``flows``)."""
+        """Resubscribe to cameras that have stalled although other samples arrive (``flows``)."""
         for channel in tuple(self.variants.values()):
             if channel.watch.stalled(flows, now_ns):
                 self._connection.resubscribe(channel.request.topic)
 
     def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None:
-        """Deliver a frame to the channels that want it.
+        """Deliver a frame to its channels.
 
-        ``topic`` is the request that the proxy made it for; empty: a plain frame of the camera, for all its channels.
+        ``topic`` is the request that it answers; empty: a plain frame of the camera, for all its channels.
         """
         if topic:
             channel = self.variants.get(topic)
@@ -396,7 +396,7 @@ class VideoChannels:
             if mine and channel.filter.wants(header.seq, header.captured_ns):
                 channel.receive(header, pixels, now_ns, as_asked=False)
 
-    def receive_encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (all samples come like this)
+    def receive_encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (the signature of all handlers)
         """Deliver a picture of an encoded stream."""
         channel = self.streams.get(picture.topic or stream(picture.camera))
         if channel is not None:
@@ -404,7 +404,7 @@ class VideoChannels:
 
 
 def forget_idle(channels: dict[Any, Any], keep: Collection[Channel[Any] | None] = ()) -> None:
-    """Forget the oldest channels that nobody reads, where there are too many for one more."""
+    """Forget the oldest unread channels to make room for one more."""
     for name, channel in list(channels.items()):
         if len(channels) < IDLE_KEPT:
             return

@@ -48,7 +48,7 @@ def test_the_child_of_a_fork_neither_lands_nor_ends_what_its_parent_flies(tmp_pa
     assert program.returncode == 0, program.stderr
     child, parent, ended = program.stdout.splitlines()
     assert "belongs to process" in child
-    assert "connect here as well" in child
+    assert "connect again here" in child
     assert parent == "parent: hovering 0 recording"
     assert ended == "ended"
     assert recording.stat().st_size > 0
