@@ -159,7 +159,7 @@ def test_a_silent_holder_keeps_its_name_on_the_vehicle_which_fails_safe(bench: B
     bench.run(2.1)
     (lost,) = bob.told(EventKind.AUTHORITY_LOST)
     assert (lost.app, lost.data["reason"], lost.data["by"]) == ("alice", "silent", "")
-    assert "until another application asks" in lost.text
+    assert "until another application requests it" in lost.text
     feedback = bob.last_feedback()
     assert (feedback.owner, feedback.owner_id, feedback.owner_priority) == ("alice", alice.app_id, 4)
     assert (feedback.lease, feedback.failsafe) == (0, "hover")
@@ -263,7 +263,7 @@ def test_a_holder_is_told_when_who_asked_leaves_the_line(bench: Bench) -> None:
     bob.ask(ReleaseAuthority())
     (withdrawn,) = alice.told(EventKind.AUTHORITY_WITHDRAWN)
     assert withdrawn.data == {"app_id": alice.app_id, "lease": alice.lease, "by": "bob", "by_id": bob.app_id}
-    assert withdrawn.text == "bob no longer asks alice for the authority"
+    assert withdrawn.text == "bob no longer asks alice to hand over the authority"
 
 
 def test_who_does_not_wait_can_not_ask_first(bench: Bench) -> None:

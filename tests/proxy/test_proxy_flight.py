@@ -241,4 +241,4 @@ def test_who_flies_is_told_when_a_vehicle_that_flies_by_attitude_drifts() -> Non
         run((1.0, 0.0, 0.0))
         told = [event for event in bench.events if event.data.get("reason") == "drift"]
         assert [event.data["active"] for event in told] == [True, False]
-        assert "it is held level, which does not brake it" in told[0].text
+        assert "it is held level, so it is not braked" in told[0].text

@@ -155,7 +155,7 @@ def test_a_landing_asked_for_in_the_dark_is_given_up_after_a_minute(bench: Bench
     assert bench.driver.told[-1] == Land()
     in_the_dark(bench, 1, pilot, Land())
     (text,) = messages(pilot, "landing_given_up")
-    assert "not heard for 60 s" in text
+    assert "silent for 60 s" in text
     outcome = pilot.last_feedback().outcome
     assert outcome is not None
     assert (outcome.fate, outcome.reason) == (Fate.TIMED_OUT, Refusal.VEHICLE_LINK_LOST)
@@ -218,7 +218,7 @@ def test_a_hover_that_nothing_shows_is_given_up_after_a_minute_and_what_is_found
     assert messages(pilot, "hover_given_up") == []
     in_the_dark(bench, 3, pilot, action)
     (text,) = messages(pilot, "hover_given_up")
-    assert "the hover is given up" in text
+    assert "the hover was abandoned" in text
     bench.driver.told.clear()
     in_the_dark(bench, 5, pilot, action)
     assert bench.driver.told == []
@@ -538,7 +538,7 @@ def test_a_position_that_jumps_is_told_to_end_no_landing_that_goes_on_without_it
     bench.driver.report(position_m=(20.0, 0.0, 1.0))
     bench.tick()
     (text,) = messages(witness, "position_jumped")
-    assert text.endswith("it goes on to land")
+    assert text.endswith("it keeps landing")
     bench.run(1.0)
     assert set(bench.driver.told) == {Land()}
 

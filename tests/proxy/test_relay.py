@@ -69,7 +69,7 @@ def test_a_vehicle_that_takes_none_is_told_of(bench: Bench) -> None:
     for _ in range(3):
         assert app.end.send(encode(POSE))
     [(reason, text)] = refusals(app)
-    assert (reason, text) == ("unsupported", "mocap: a pose refused: fake:// does not accept external poses")
+    assert (reason, text) == ("unsupported", "mocap: pose refused: fake:// does not accept external poses")
 
 
 def test_a_driver_that_fails_is_told_of(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -395,8 +395,8 @@ def test_the_proxy_enforces_what_is_written_and_tells(bench: Bench) -> None:
     assert event.data["applied"] == pytest.approx(applied.forward)
     texts = [event.text for event in pilot.told(EventKind.VEHICLE_MESSAGE)]
     assert texts == [
-        "the safety box and zones are not enforced: the vehicle's position is not known",
-        "the safety box and zones are enforced: its position is known again",
+        "the safety box and zones are not enforced: the vehicle's position is unknown",
+        "the safety box and zones are enforced: the vehicle's position is known again",
     ]
     write(f"{BOX}.x_high", 10_000.0)
     pilot.command(Velocity(1.5))

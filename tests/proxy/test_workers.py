@@ -116,7 +116,7 @@ def test_cameras_are_shared_apart(bench: Bench) -> None:
     [
         (
             asked(code="Finder 9"),
-            "runs other code under the name detector: Detector 0123, and this is Finder 9; take an",
+            "runs other code under the name detector: Detector 0123, this one runs Finder 9; use an",
         ),
         (
             asked(shared=False),
@@ -185,7 +185,7 @@ def test_before_hello_nothing_is_taken(bench: Bench) -> None:
     assert stranger.end.send(encode(result()))
     stranger.ask(asked())  # the answer comes after what was sent before was looked at
     told = eye.told(EventKind.PACKET_MALFORMED)
-    assert "a result came before Hello" in told[0].text
+    assert "a result arrived before Hello" in told[0].text
 
 
 def test_shares_are_for_the_proxy_to_send(bench: Bench) -> None:

@@ -1,7 +1,7 @@
-"""What the proxy reports about itself: numbered events for all clients, and counters on request.
+"""The proxy's reports about itself: numbered events for all clients, and counters on request.
 
-The publisher comes first, then what it publishes: drafts, which are pure and made by the functions at the end; those of
-commands, failsafe and ownership before those of the authority.
+The publisher comes first, then its input: event drafts, created by pure functions, those about commands, failsafe and
+ownership before those about the authority.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from skyloop.proxy.core.settings import Clamp
 from skyloop.transport.base import EVENTS, Peer
 from skyloop.zones import THINNEST_M, ZONES, Space
 
-#: Command delays that the distribution is taken over: about a minute of one pilot at 32 Hz.
+#: Number of command delays in the distribution: about a minute of one pilot at 32 Hz.
 WINDOW: Final = 2000
 MAX_TEXT: Final = 1000  #: characters of an event's text
-REPEAT_NS: Final = NS_PER_S  #: how often an event that goes on is published again
-#: A limit not touched for so long begins a new episode when it is touched again.
+REPEAT_NS: Final = NS_PER_S  #: how often a continuing event is published again
+#: A limit untouched for this long starts a new episode when it is touched again.
 EPISODE_NS: Final = NS_PER_S
-#: Why a hover or a landing is given up.
-UNHEARD: Final = f"the vehicle was not heard for {seconds(BELIEF_NS):g} s, and may be on another flight by now"
-_ENFORCED: Final = "enforced: its position is known again"
-_NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
+#: Why a hover or a landing is abandoned.
+UNHEARD: Final = f"the vehicle was silent for {seconds(BELIEF_NS):g} s and may be on another flight by now"
+_ENFORCED: Final = "enforced: the vehicle's position is known again"
+_NOT_ENFORCED: Final = "not enforced: the vehicle's position is unknown"
 
 _log = logging.getLogger(__name__)
 
@@ -42,10 +42,10 @@ class Counters:
 
     def __init__(self) -> None:
         self.counts: defaultdict[str, int] = defaultdict(int)
-        self.delays_ns: deque[int] = deque(maxlen=WINDOW)  #: sent to applied, of accepted commands
+        self.delays_ns: deque[int] = deque(maxlen=WINDOW)  #: from sending to applying, for accepted commands
 
     def snapshot(self, **now: float) -> dict[str, float]:
-        """All counters, the distribution of the command delay [s], and what the caller adds."""
+        """Return all counters, the distribution of the command delay [s], and the caller's additions."""
         values: dict[str, float] = {name: float(count) for name, count in self.counts.copy().items()}
         values.update(now)
         delays = sorted(self.delays_ns.copy())
@@ -59,7 +59,7 @@ class Counters:
 
 
 class EventPublisher:
-    """Numbers and publishes the events of one run. Any thread; never raises."""
+    """Numbers and publishes the events of one run. Thread-safe; never raises."""
 
     def __init__(
         self,
@@ -68,17 +68,17 @@ class EventPublisher:
         counters: Counters,
         scrub: Callable[[str], str] = str,
     ) -> None:
-        """Initialise; ``scrub`` takes what must not be told out of a text."""
+        """Initialise; ``scrub`` removes secrets from a text."""
         self._scrub = scrub
         self._publish = publish
         self._clock = clock
         self._counts = counters.counts
-        self._lock = threading.Lock()  # keeps the order of publishing that of the numbers
+        self._lock = threading.Lock()  # keeps events in the order of their numbers
         self._seq = 0
         self._repeats = RepeatedEvents()
         self._missed = 0
         self.listener: Callable[[Event], None] | None = None  #: called with each event; must be quick and never raise
-        self.last: Event | None = None  #: the newest that is not about the coming and going of an application
+        self.last: Event | None = None  #: the newest one other than applications' connects and disconnects
 
     def publish(
         self,
@@ -89,17 +89,17 @@ class EventPublisher:
         app: str | None = None,
         data: dict[str, Value] | None = None,
     ) -> None:
-        """Publish one event now."""
+        """Publish one event."""
         with self._lock:
             self._send([EventDraft(kind, text, severity, app, data or {})])
 
     def publish_drafts(self, *drafts: EventDraft) -> None:
-        """Publish these events now, in this order."""
+        """Publish these events, in this order."""
         with self._lock:
             self._send(drafts)
 
     def publish_repeated(self, key: Hashable, make: Callable[[], EventDraft]) -> None:
-        """Publish an event that may come many times a second; ``make`` is called only when it is published."""
+        """Publish an event that may occur many times a second; ``make`` is called only when it is published."""
         with self._lock:
             if self._repeats.first(key, make):
                 draft = make()
@@ -107,16 +107,16 @@ class EventPublisher:
                 self._send([replace(draft, data={**draft.data, "count": 1})])
 
     def tick(self, now_ns: int) -> None:
-        """Publish sums of repeated events, and of those that could not be handed over. Call some times a second."""
+        """Publish sums of repeated and of undelivered events. Call several times a second."""
         with self._lock:
             for draft, count in self._repeats.due(now_ns):
                 text = f"{draft.text} (and {count} more like it within the last second)"
                 self._send([replace(draft, text=text, data={**draft.data, "count": count})])
             if self._missed:
                 missed, self._missed = self._missed, 0
-                text = f"{missed} events could not be handed over to applications that are too slow"
+                text = f"{missed} events could not be delivered to slow applications"
                 self._send([EventDraft(EventKind.SAMPLES_LOST, text, data={"count": missed})])
-                self._missed = 0  # that this one was not handed over either needs no event
+                self._missed = 0  # this event itself may get lost without another one
 
     def _send(self, drafts: Sequence[EventDraft]) -> None:
         """Number and publish; the lock is held."""
@@ -134,7 +134,7 @@ class EventPublisher:
             try:
                 packets.append(encode(event))
             except (ValueError, TypeError, OverflowError) as error:  # a driver's data may be anything
-                _log.error("event %s had particulars that cannot be sent: %s", kind, error)
+                _log.error("event %s had data that cannot be sent: %s", kind, error)
                 packets.append(encode(Event(kind, text, event.at_ns, severity, self._seq, app)))
             if self.listener is not None:
                 self.listener(event)
@@ -161,9 +161,9 @@ class EventDraft:
 
 
 class RepeatedEvents:
-    """Decides when events that may come many times a second are published: the first at once, then sums once a second.
+    """Decides when to publish events that may occur many times a second: the first at once, then sums once a second.
 
-    A sum has the text of the newest one: why something is refused may change while it is asked for again.
+    A sum has the text of the newest event, because the reason of a refusal may change between repeats.
     """
 
     def __init__(self) -> None:
@@ -171,7 +171,7 @@ class RepeatedEvents:
         self._counts: dict[Hashable, int] = {}
 
     def first(self, key: Hashable, draft: Callable[[], EventDraft]) -> bool:
-        """Count one more; returns whether it is the first of its key: publish it now and call :meth:`begin`."""
+        """Count an event; return whether it is the first of its key: then publish it and call :meth:`begin`."""
         count = self._counts.get(key)
         if count is None:
             return True
@@ -180,12 +180,12 @@ class RepeatedEvents:
         return False
 
     def begin(self, key: Hashable, draft: Callable[[], EventDraft], now_ns: int) -> None:
-        """The first of its key, or a sum, was published."""
+        """Note that the first of its key, or a sum, was published."""
         self._published[key] = (now_ns, draft)
         self._counts[key] = 0
 
     def due(self, now_ns: int) -> list[tuple[EventDraft, int]]:
-        """The events that went on for a second since they were last published, with their count; forgets the others."""
+        """Return the events repeated in the second since they were last published, with counts; forget the others."""
         due: list[tuple[EventDraft, int]] = []
         for key, (published_ns, draft) in list(self._published.items()):
             if now_ns - published_ns < REPEAT_NS:
@@ -200,13 +200,13 @@ class RepeatedEvents:
 
 
 class Episodes:
-    """Which limits are touched now, so that each is published once and not with every repeat of a set-point."""
+    """The limits touched at present, so that each is published once, not with every repeat of a set-point."""
 
     def __init__(self) -> None:
         self._touched_ns: dict[tuple[str, str], int] = {}
 
     def begun(self, clamps: tuple[Clamp, ...], now_ns: int) -> list[Clamp]:
-        """Return those of the clamps that begin an episode."""
+        """Return the clamps that start an episode."""
         touched, since_ns = self._touched_ns, now_ns - EPISODE_NS
         new = [clamp for clamp in clamps if touched.get((clamp.limit, clamp.zone), since_ns) <= since_ns]
         for clamp in clamps:
@@ -215,15 +215,15 @@ class Episodes:
 
 
 def refused_event(name: str, command: Command, reason: Refusal, why: str) -> EventDraft:
-    """A command of the application ``name`` was refused."""
+    """Return the event of a refused command of the application ``name``."""
     text = f"{name}: {command.action.name} refused: {why}"
     return EventDraft(EventKind.COMMAND_REFUSED, text, app=name, data={"reason": reason.value, "seq": command.seq})
 
 
 def clamped_event(name: str, clamp: Clamp) -> EventDraft:
-    """A limit shortened a set-point of the application ``name``."""
+    """Return the event of a limit that shortened a set-point of the application ``name``."""
     zone = f" ({clamp.zone})" if clamp.zone else ""
-    text = f"{name}: {clamp.limit}{zone} made {clamp.applied:.3g} of {clamp.asked:.3g}"
+    text = f"{name}: {clamp.limit}{zone} allows {clamp.applied:.3g} of {clamp.asked:.3g}"
     data: dict[str, Value] = {"limit": clamp.limit, "asked": clamp.asked, "applied": clamp.applied}
     if clamp.zone:
         data["zone"] = clamp.zone
@@ -231,50 +231,50 @@ def clamped_event(name: str, clamp: Clamp) -> EventDraft:
 
 
 def enforcement_event(enforced: bool) -> EventDraft:
-    """The safety box and zones are, or are not, enforced from now on."""
+    """Return the event for a change in whether the safety box and zones are enforced."""
     text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
     severity = Severity.INFO if enforced else Severity.WARNING
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
 
 
 def thin_zones_event(space: Space) -> EventDraft:
-    """Some zones are kept clear of as if they were thicker than they are written."""
+    """Return the event of zones that are enforced as if they were thicker."""
     thin = "; ".join(str(zone) for zone in space.thin)
-    text = f"no-fly zones thinner than {THINNEST_M:g} m are kept clear of as if they were so thick: {thin} ({ZONES})"
+    text = f"no-fly zones thinner than {THINNEST_M:g} m are enforced as if they were that thick: {thin} ({ZONES})"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "thin_zones"})
 
 
 def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
-    """The position changed by more than the vehicle can have flown; ``lands``: while it was landed."""
-    what = "goes on to land" if lands else "hovers, until something new is commanded"
+    """Return the event of a position change larger than any flight; ``lands``: the vehicle was landing."""
+    what = "keeps landing" if lands else "hovers until a new command"
     text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
     data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
 def given_up_event(what: str) -> EventDraft:
-    """A hover, or a landing, is given up because the vehicle was not heard."""
-    text = f"the {what} is given up: {UNHEARD}: {'land' if what == 'landing' else 'command'} it again when it is heard"
+    """Return the event of a hover or landing abandoned because the vehicle was silent."""
+    text = f"the {what} was abandoned: {UNHEARD}: {'land' if what == 'landing' else 'command'} it again once it is back"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": f"{what}_given_up"})
 
 
 def drift_event(drifts: bool) -> EventDraft:
-    """The software autopilot does not know the vehicle's velocity, or knows it again."""
+    """Return the event of a velocity that the software autopilot lacks, or has again."""
     if not drifts:
-        text = "the vehicle's velocity is known again: it is held against its drift"
+        text = "the vehicle's velocity is known again: its drift is corrected"
         return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.INFO, data={"reason": "drift", "active": False})
-    text = "the vehicle's velocity is not known: it is held level, which does not brake it, and drifts with the wind"
+    text = "the vehicle's velocity is unknown: it is held level, so it is not braked and drifts with the wind"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "drift", "active": True})
 
 
 def emergency_event(name: str) -> EventDraft:
-    """The application ``name`` stopped the motors."""
+    """Return the event of an emergency stop by the application ``name``."""
     text = f"emergency stop by {name}"
     return EventDraft(EventKind.EMERGENCY, text, Severity.ERROR, name, {"reason": text})
 
 
 def failsafe_event(change: StepChange) -> EventDraft:
-    """A step of the failsafe ladder was taken or left."""
+    """Return the event of a failsafe step that began or ended."""
     why = REASONS.get(change.reason, change.reason)
     if change.step is Failsafe.NONE:
         text, severity = f"failsafe ended: {why}", Severity.INFO
@@ -288,39 +288,39 @@ def failsafe_event(change: StepChange) -> EventDraft:
 
 
 def battery_event(low: BatteryLow) -> EventDraft:
-    """The battery fell below the warning level."""
+    """Return the event of a battery below the warning level."""
     text = f"battery low: {low.battery:.0%} left"
     return EventDraft(EventKind.BATTERY_LOW, text, data={"battery": low.battery})
 
 
 def taken_event(name: str, action: str, others: str) -> EventDraft:
-    """The application ``name`` took the vehicle from others by an action; ``others`` says what they did with it."""
+    """Return the event of the application ``name`` taking the vehicle; ``others``: what they did with it."""
     text = f"{name} took the vehicle by {action}: {others}"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, app=name, data={"reason": "taken"})
 
 
 def ownership_event(changed: Changed) -> EventDraft:
-    """The flight is somebody else's, or an earlier run's."""
+    """Return the event of a flight that belongs to others, or to an earlier run."""
     reason = "others" if changed.whose is Whose.OTHERS else "flight"
     return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})
 
 
 def slept_event(slept_s: float) -> EventDraft:
-    """The computer slept in the meantime, for so long [s]."""
-    text = f"this computer slept for {slept_s:.1f} s: nothing that was asked for before is done any more"
+    """Return the event of a sleep of this computer [s]."""
+    text = f"this computer slept for {slept_s:.1f} s: earlier commands are no longer executed"
     data: dict[str, Value] = {"reason": "slept", "seconds": slept_s}
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
 
 
 class Named(Protocol):
-    """An application that is connected."""
+    """A connected application."""
 
     name: str
     peer: Peer
 
 
 def name_of(sessions: Mapping[int, Named], app_id: int) -> str:
-    """Return an application's name, by its number."""
+    """Return the name of the application with this number."""
     session = sessions.get(app_id)
     return session.name if session is not None else f"application {app_id}"
 
@@ -328,7 +328,7 @@ def name_of(sessions: Mapping[int, Named], app_id: int) -> str:
 def authority_event(
     effect: authority.Effect, sessions: Mapping[int, Named], holder: authority.QueueEntry | None, now_ns: int
 ) -> EventDraft:
-    """Return the event of one change of the authority; ``holder``: who has it after all of them."""
+    """Return the event of one change of the authority; ``holder``: its holder after all changes."""
     name, severity = name_of(sessions, effect.app_id), Severity.WARNING
     data: dict[str, Value] = {"app_id": effect.app_id}
     if not isinstance(effect, authority.Queued | authority.Declined):
@@ -359,7 +359,7 @@ def authority_event(
             kind, text = EventKind.AUTHORITY_LOST, f"{name} lost the authority: {effect.reason}"
             data |= {"reason": effect.reason, "by": "" if holder is None else name_of(sessions, holder.app_id)}
             if effect.reason == "silent" and holder is None:
-                text += "; it is still listed as the holder until another application asks"
+                text += "; it is listed as the holder until another application requests it"
         case authority.Preempted():
             kind = EventKind.AUTHORITY_PREEMPTED
             data["granted"] = effect.granted
@@ -371,16 +371,16 @@ def authority_event(
             data["within_s"] = within_s
             if effect.term_ns is not None:
                 data["for_s"] = seconds(effect.term_ns)
-            text = f"{by} (priority {effect.by_priority}) asks {name} for the authority, within {within_s:.0f} s"
+            text = f"{by} (priority {effect.by_priority}) asks {name} for the authority within {within_s:.0f} s"
         case authority.Declined():
             kind, severity, by = EventKind.AUTHORITY_DECLINED, Severity.INFO, name_of(sessions, effect.holder_id)
             data |= {"by": by, "by_id": effect.holder_id, "reason": effect.reason}
             why = f": {effect.reason}" if effect.reason else ""
-            text = f"{by} does not hand the authority over to {name} yet{why}"
+            text = f"{by} declines to hand the authority over to {name} now{why}"
         case authority.Withdrawn():
             kind, severity = EventKind.AUTHORITY_WITHDRAWN, Severity.INFO
-            text = f"{by} no longer asks {name} for the authority"
+            text = f"{by} no longer asks {name} to hand over the authority"
         case authority.Expired():
             kind = EventKind.AUTHORITY_EXPIRED
-            text = f"the time of {name} is over: the next application that asks gets the authority"
+            text = f"the time of {name} is over: the next application to request the authority gets it"
     return EventDraft(kind, text, severity, name, data)

@@ -1,7 +1,7 @@
-"""The parameters of a proxy and of its driver as one typed store, and the answers to requests about them.
+"""The parameters of a proxy and of its driver in one typed store, and the answers to requests about them.
 
-Checking is pure (:func:`check`). Where the driver has a parameter of the same name as the proxy, the driver's is the
-one that is shown and written, and the proxy obeys its value: ``limits.tilt`` of a vehicle with a limit of its own.
+Checking is pure (:func:`check`). If proxy and driver have a parameter of the same name, the driver's is shown and
+written, and the proxy obeys its value: for example ``limits.tilt`` of a vehicle with its own limit.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from skyloop.proxy.requests import Session
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written
 
 MAX_TEXT: Final = 1024  #: characters of a text value
-MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
-PAGE_BYTES: Final = MAX_BODY - 256  #: of encoded parameters in one reply
-#: A momentary parameter, such as a flip, is written within this time or never: its writer waits no longer.
+MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: larger ones of a driver are left out
+PAGE_BYTES: Final = MAX_BODY - 256  #: bytes of encoded parameters in one reply
+#: A momentary parameter, such as a flip, is written within this time or never: its writer waits no longer than that.
 MOMENT_NS: Final = 2 * NS_PER_S
 
 _KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
@@ -52,7 +52,7 @@ _encoded = msgspec.msgpack.Encoder().encode
 
 
 def described(driver: Driver) -> list[Parameter]:
-    """Return a driver's parameters, and what it finds about its vehicle as one more. Raises what the driver raises."""
+    """Return a driver's parameters, with its findings as one more. Raises the driver's errors."""
     parameters = list(driver.parameters())
     try:
         diagnostics = driver.checkup()
@@ -60,7 +60,7 @@ def described(driver: Driver) -> list[Parameter]:
         return parameters  # not open
     if not diagnostics:
         return parameters
-    text = "what the driver finds before a flight, as JSON: skyloop preflight shows it"
+    text = "the driver's findings before a flight, as JSON; shown by skyloop preflight"
     value = encode_checkup(diagnostics)
     return [*parameters, Parameter(CHECKUP, ParameterType.TEXT, value, read_only=True, description=text)]
 
@@ -77,14 +77,10 @@ def _other(name: str, value: bool | str, description: str, *, read_only: bool = 
 #: The proxy's own parameters. ``docs/proxy.md`` shows them as a table.
 OWN: Final[tuple[Parameter, ...]] = (
     _own("alarms.battery_critical", 0.15, "", 0.0, 1.0, "Charge below which the cockpit's alarm is critical; 0: never"),
-    _own("alarms.feedback_age_s", 1.0, "s", 0.0, 60.0, "Age of feedback above which there is an alarm; 0: never"),
-    _own(
-        "alarms.link_degraded_s", 0.5, "s", 0.0, 60.0, "Time that a link is degraded until there is an alarm; 0: never"
-    ),
-    _own("alarms.video_age_s", 1.0, "s", 0.0, 60.0, "Age of shown video above which there is an alarm; 0: never"),
-    _own(
-        "authority.ask_s", 10.0, "s", 0.0, 600.0, "A higher priority that asks takes over after this time at the latest"
-    ),
+    _own("alarms.feedback_age_s", 1.0, "s", 0.0, 60.0, "Age of feedback that triggers an alarm; 0: never"),
+    _own("alarms.link_degraded_s", 0.5, "s", 0.0, 60.0, "Time of a degraded link that triggers an alarm; 0: never"),
+    _own("alarms.video_age_s", 1.0, "s", 0.0, 60.0, "Age of shown video that triggers an alarm; 0: never"),
+    _own("authority.ask_s", 10.0, "s", 0.0, 600.0, "Time after which a request of higher priority wins"),
     _own(
         "authority.timeout_s", 2.0, "s", 0.1, 3600.0, "A holder without a valid command for this long loses the lease"
     ),
@@ -113,14 +109,14 @@ OWN: Final[tuple[Parameter, ...]] = (
     _other(
         "failsafe.return",
         False,
-        "A vehicle without a pilot returns to its start and lands there, instead of where it is",
+        "Whether a vehicle without a pilot returns to its start to land, rather than landing in place",
     ),
-    _own("limits.altitude", 5.0, "m", 0.3, 500.0, "Maximum height above ground: climbing ends there"),
+    _own("limits.altitude", 5.0, "m", 0.3, 500.0, "Maximum height above ground"),
     _own("limits.climb", 1.0, "m/s", 0.05, 10.0, "Maximum vertical speed"),
     _own("limits.speed", 2.0, "m/s", 0.05, 30.0, "Maximum horizontal speed of a velocity set-point"),
     _own("limits.tilt", 0.35, "rad", 0.02, 1.0, "Maximum tilt of an attitude set-point, roll and pitch together"),
     _own("limits.yaw_rate", 1.75, "rad/s", 0.05, 10.0, "Maximum yaw rate"),
-    _own("return.height", 2.0, "m", 0.0, 500.0, "Height above the start, at least, on the way back there"),
+    _own("return.height", 2.0, "m", 0.0, 500.0, "Minimum height above the start on the way back"),
     _other("return.land", True, "Land at the end of a return, or hover there"),
     _own("return.speed", 1.0, "m/s", 0.1, 30.0, "Maximum speed of a return, within the limits"),
     *(
@@ -128,18 +124,18 @@ OWN: Final[tuple[Parameter, ...]] = (
         for axis, sides in (("x", ("West", "East")), ("y", ("South", "North")), ("z", ("Lower", "Upper")))
         for end, value, side in zip(("high", "low"), (FAR_M, -FAR_M), reversed(sides), strict=True)
     ),
-    _own("safety.deceleration", 1.0, "m/s²", 0.1, 10.0, "Deceleration with which the vehicle reliably stops at a wall"),
-    _own("safety.reaction_s", 0.3, "s", 0.0, 3.0, "Delay before the vehicle begins to stop"),
-    _other(ROOM, "", "Walls of the room as a box, where the vehicle knows them: a simulated one does", read_only=True),
+    _own("safety.deceleration", 1.0, "m/s²", 0.1, 10.0, "Deceleration that the vehicle reliably achieves"),
+    _own("safety.reaction_s", 0.3, "s", 0.0, 3.0, "Delay before the vehicle starts to brake"),
+    _other(ROOM, "", "Walls of the room as a box, if the vehicle knows them (simulated ones do)", read_only=True),
     _other(ZONES, "", "No-fly zones: boxes and cylinders"),
 )
 
 
 def check(parameter: Parameter, value: Value) -> Value:
-    """The value as it may be written: of the parameter's type, finite, within its range and choices.
+    """Return the value to write: of the parameter's type, finite, within its range and choices.
 
-    An int is taken for a float; a bool is no number. Raises :class:`ParameterError` that says what would be right,
-    with the :class:`Refusal` as its code.
+    An int counts as a float, but a bool does not count as a number. Raises :class:`ParameterError` that names the
+    allowed values, with the :class:`Refusal` as its code.
     """
     if parameter.read_only:
         raise ParameterError(f"{parameter.name} can only be read", code=Refusal.READ_ONLY)
@@ -162,7 +158,7 @@ def check(parameter: Parameter, value: Value) -> Value:
         )
     if parameter.choices and value not in parameter.choices:
         choices = ", ".join(repr(choice) for choice in parameter.choices)
-        raise ParameterError(f"{parameter.name} is one of {choices}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+        raise ParameterError(f"{parameter.name} must be one of {choices}, not {value!r}", code=Refusal.OUT_OF_RANGE)
     if isinstance(value, str) and len(value) > MAX_TEXT:
         raise ParameterError(
             f"{parameter.name} takes at most {MAX_TEXT} characters, not {len(value)}", code=Refusal.OUT_OF_RANGE
@@ -171,7 +167,7 @@ def check(parameter: Parameter, value: Value) -> Value:
 
 
 def _number(parameter: Parameter, number: float) -> float:
-    """Return a number that may be written, alone or in a vector: finite and within the range."""
+    """Return a number to write, alone or in a vector: finite and within the range."""
     if parameter.type is not ParameterType.INT:
         try:
             number = float(number)
@@ -190,10 +186,9 @@ def _number(parameter: Parameter, number: float) -> float:
 
 
 def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
-    """Return values of the proxy's own parameters as they may be written.
+    """Return checked values for the proxy's own parameters.
 
-    Raises :class:`UnknownNameError` for a name that is none of its own, and :class:`ParameterError` for a value that it
-    does not take.
+    Raises :class:`UnknownNameError` for other names, and :class:`ParameterError` for invalid values.
     """
     own = {parameter.name: parameter for parameter in OWN}
     checked: dict[str, Value] = {}
@@ -212,7 +207,7 @@ def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
 
 
 class Parameters:
-    """The store. Any thread; driver calls happen on the caller's thread, outside of the store's lock."""
+    """The store. Thread-safe; it calls the driver on the caller's thread, outside its lock."""
 
     def __init__(
         self,
@@ -224,17 +219,17 @@ class Parameters:
         self._lock = threading.Lock()
         self._own = {parameter.name: parameter for parameter in OWN}
         self._driver: dict[str, Parameter] = {}
-        self._presets: dict[str, Value] = {}  # that the driver has not taken yet
-        self.left_out: tuple[str, ...] = ()  #: driver's parameters that are too large to be sent
-        self._in_force: dict[str, Any] = {}  # the values of the proxy's own parameters
-        self._changed: set[str] = set()  # first parts of the names that the settings lack
+        self._presets: dict[str, Value] = {}  # not yet written to the driver
+        self.left_out: tuple[str, ...] = ()  #: driver's parameters that are too large to send
+        self._in_force: dict[str, Any] = {}  # values of the proxy's own parameters
+        self._changed: set[str] = set()  # first parts of names that the settings do not reflect yet
         self._settings = FlightSettings()
         self._apply(OWN)
 
     def preset(self, values: Mapping[str, Value]) -> None:
-        """Give the proxy's own parameters other values before it starts.
+        """Set values of the proxy's own parameters before it starts.
 
-        Where the vehicle has a parameter of the same name, :meth:`write_presets` writes that.
+        If the vehicle has a parameter of the same name, :meth:`write_presets` writes that.
 
         Raises :class:`UnknownNameError` and :class:`ParameterError`.
         """
@@ -245,19 +240,19 @@ class Parameters:
             self._apply(OWN)
 
     def write_presets(self) -> list[tuple[str, str]]:
-        """Write presets to the vehicle where it has such parameters. Returns which could not be written, and why."""
+        """Write presets to the vehicle's parameters; return the failures with reasons."""
         problems = []
         for name in [name for name in self._presets if name in self._driver]:
             try:
                 self.set(name, self._presets[name])
-            except Exception as error:  # noqa: BLE001  a driver may raise anything; it is tried at the next occasion
+            except Exception as error:  # noqa: BLE001  a driver may raise anything; it is retried on the next occasion
                 problems.append((name, str(error)))
             else:
-                del self._presets[name]  # from here on it is the pilots' to change
+                del self._presets[name]  # from here on, pilots may change it
         return problems
 
     def refresh(self) -> None:
-        """Read the driver's parameters again. Raises whatever the driver raises."""
+        """Read the driver's parameters again. Raises the driver's errors."""
         read = {parameter.name: parameter for parameter in self._read_driver()}
         large = tuple(name for name, parameter in read.items() if len(_encoded(parameter)) > MAX_PARAMETER)
         with self._lock:
@@ -266,7 +261,7 @@ class Parameters:
             self._apply(OWN)
 
     def get(self, name: str) -> Parameter:
-        """One parameter as last known. Raises :class:`UnknownNameError`."""
+        """Return one parameter as last known. Raises :class:`UnknownNameError`."""
         with self._lock:
             parameter = self._driver.get(name) or self._own.get(name)
             if parameter is None:
@@ -274,12 +269,12 @@ class Parameters:
             return parameter
 
     def number(self, name: str) -> float:
-        """The value in force of one of the proxy's own parameters, the driver's where it has it too."""
+        """Return the effective value of one of the proxy's own parameters: the driver's if it has it, too."""
         value: float = self._in_force[name]
         return value
 
     def _apply(self, parameters: Iterable[Parameter]) -> None:
-        """Let the values of these of the proxy's own parameters be in force, and note which changed. Holds the lock."""
+        """Apply values of the proxy's own parameters, and note which changed. The lock is held."""
         for standard in parameters:
             name, kind = standard.name, standard.type
             own = self._own[name].value
@@ -288,16 +283,16 @@ class Parameters:
                 value = value if isinstance(value, str) else ""
             elif kind is ParameterType.BOOL:
                 value = value if isinstance(value, bool) else own
-            else:  # a driver with another notion of this name: the proxy keeps its own
+            else:  # the driver uses the name for something else: the proxy keeps its own value
                 value = float(value) if isinstance(value, int | float) and math.isfinite(value) else own
             if self._in_force.get(name) != value:
                 self._in_force[name] = value
                 self._changed.add(name.partition(".")[0])
 
     def flight_settings(self) -> FlightSettings:
-        """Return what the values in force ask of the flight.
+        """Return the flight settings from the effective values.
 
-        Raises :class:`ParameterError` where the driver has no-fly zones that can't be read.
+        Raises :class:`ParameterError` if the driver's no-fly zones can't be parsed.
         """
         with self._lock:
             self._settings = self._settings.updated(self._in_force, self._changed)
@@ -305,9 +300,9 @@ class Parameters:
             return self._settings
 
     def set(self, name: str, value: Value, known: Parameter | None = None) -> Parameter:
-        """Write one parameter and return it as it is now; ``known``: as :meth:`get` returned it just now.
+        """Write one parameter and return its new state; ``known``: as just returned by :meth:`get`.
 
-        Raises :class:`UnknownNameError`, :class:`ParameterError`, and whatever the driver raises.
+        Raises :class:`UnknownNameError`, :class:`ParameterError`, and the driver's errors.
         """
         parameter = known or self.get(name)
         value = check(parameter, value)
@@ -325,7 +320,7 @@ class Parameters:
         return written
 
     def page(self, first: int) -> ParameterPage:
-        """As many parameters, sorted by name and from the ``first`` on, as fit one reply."""
+        """Return as many parameters, sorted by name, from ``first`` on, as fit into one reply."""
         with self._lock:
             everything = sorted({**self._own, **self._driver}.values(), key=lambda parameter: parameter.name)
         chosen: list[Parameter] = []
@@ -339,10 +334,10 @@ class Parameters:
 
 
 class ParameterRequests:
-    """Answers what applications ask about parameters, and lets their values take effect. May wait for the vehicle.
+    """Answers applications' requests about parameters, and applies their values. May wait for the vehicle.
 
-    ``free``: parameters that any pilot may write without the authority. They change by themselves: each is read anew,
-    and a change is no event.
+    ``free``: parameters that any pilot may write without the authority. They also change on their own: each is always
+    read again, and a change causes no event.
     """
 
     def __init__(
@@ -362,18 +357,18 @@ class ParameterRequests:
         self._clock = clock
 
     def read_driver(self) -> None:
-        """Read the driver's parameters; a driver that raises keeps those it had."""
+        """Read the driver's parameters; if it raises, keep the old ones."""
         try:
             self._parameters.refresh()
-        except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
+        except Exception as error:  # noqa: BLE001  it is reported, and the flight continues
             self._publisher.driver_failed("parameters", error)
         if self._parameters.left_out:
             names = ", ".join(self._parameters.left_out)[:200]
-            text = f"parameters too large to be sent: {names}"
+            text = f"parameters too large to send: {names}"
             self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING)
         for name, why in self._parameters.write_presets():
-            if self._publisher.link_up:  # before, it has nobody to write to: it is tried again when the link is there
-                text = f"{name} could not be set as this proxy was asked to: {why}"
+            if self._publisher.link_up:  # without a link it can't write: retried once the link is up
+                text = f"{name} could not be preset: {why}"
                 self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING, where="preset")
         self._handler.configure(self._parameters.flight_settings())
 
@@ -389,11 +384,11 @@ class ParameterRequests:
         return self._parameters.page(request.first)
 
     def set(self, session: Session, request: SetParameter, now_ns: int) -> AnyReply:
-        """Write one for the holder of the authority. Raises what :meth:`Parameters.set` raises."""
+        """Write one for the holder of the authority. Raises the errors of :meth:`Parameters.set`."""
         name, value = request.name, request.value
         waited_ns, known = self._clock() - now_ns, self._parameters.get(name)
         if known.momentary and waited_ns > MOMENT_NS:
-            why = f"{name} waited {seconds(waited_ns):.1f} s for the vehicle and is not done so late: ask again"
+            why = f"{name} waited {seconds(waited_ns):.1f} s for the vehicle and was dropped as too late: try again"
             return Refused(Refusal.STALE, why)
         if name in self._free and session.role is Role.PILOT:
             return ParameterValue(self._parameters.set(name, value, known))
@@ -401,7 +396,7 @@ class ParameterRequests:
             code = Refusal.FOREIGN_LEASE if request.lease else Refusal.NO_AUTHORITY
             return Refused(code, "writing a parameter needs the authority: request it, and name its lease")
         if known.momentary and (problem := self._handler.problem_with_moment()):
-            return Refused(Refusal.WRONG_STATE, f"{name} is not done now: {problem}")
+            return Refused(Refusal.WRONG_STATE, f"{name} is not possible now: {problem}")
         if name == "limits.altitude" and isinstance(value, int | float):
             problem = self._handler.problem_with_ceiling(float(value))
             if problem:

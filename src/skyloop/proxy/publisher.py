@@ -1,4 +1,4 @@
-"""Publishes what the driver reports: feedback, frames, streams, the vehicle's link, events; on the driver's thread."""
+"""Publishes the driver's reports (feedback, frames, streams, link state, events) on the driver's thread."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from skyloop.transport.base import (
     video,
 )
 
-#: A vehicle silent for so long: the proxy publishes what it knows itself (authority, links), so at 4 Hz.
+#: While the vehicle is silent, the proxy publishes its own state (authority, links) at this interval, 4 Hz.
 KEEP_ALIVE_NS: Final = NS_PER_S // 4
 
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
@@ -58,14 +58,14 @@ _VECTORS: Final = ("velocity_m_s", "angular_velocity_rad_s", "acceleration_m_s2"
 
 
 class VehiclePublisher:
-    """The driver's :class:`skyloop.drivers.base.Sink`, and the newest that is known of the vehicle.
+    """The driver's :class:`skyloop.drivers.base.Sink`, and the newest known state of the vehicle.
 
-    It takes no lock that is held while the driver is called, so that a driver may call it from any thread and from
-    inside its own calls.
+    It acquires no lock that is held during calls of the driver, so a driver may call it from any thread and from inside
+    its own calls.
 
-    ``state_of``: the flight state, given the one that the driver reported, as the software autopilot may know better.
-    ``on_link_up``: called on the driver's thread when the vehicle's link has come up. ``scrub``: takes the secrets of
-    the vehicle's address out of a text.
+    ``state_of``: returns the flight state for the one that the driver reported, because the software autopilot may know
+    better. ``on_link_up``: called on the driver's thread when the vehicle's link has come up. ``scrub``: removes the
+    secrets of the vehicle's address from a text.
     """
 
     def __init__(
@@ -80,13 +80,13 @@ class VehiclePublisher:
         on_link_up: Callable[[], None],
         scrub: Callable[[str], str] = str,
     ) -> None:
-        self.feedback_now: Feedback | None = None  #: the newest sample as it was published
-        self.reported_state = FlightState.UNKNOWN  #: as the driver reported it, before the software autopilot
+        self.feedback_now: Feedback | None = None  #: the newest sample as published
+        self.reported_state = FlightState.UNKNOWN  #: the driver's state, before the software autopilot
         self.link_state = LinkState.CONNECTING
-        self.link_reason = ""  #: what is waited for, and what failed last
-        self.link_remedy = ""  #: what a person can do about it
+        self.link_reason = ""  #: the expected event, and the last failure
+        self.link_remedy = ""  #: a remedy for people
         self.link_up = False
-        self.link_breaks = 0  #: how often the link went from up to not, or came back
+        self.link_breaks = 0  #: how often the link went down or came back
         self.state_of = state_of
         self.variants = FeedbackVariants(server, counters, clock)
         self.streams = Streams(server, counters, clock, lambda why: self._fail("stream", why))
@@ -94,7 +94,7 @@ class VehiclePublisher:
         self._scrub = scrub
         self._owner: dict[str, Any] = {}
         self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
-        self._told: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # by the newest sample
+        self._told: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # as in the newest sample
         self._capabilities = capabilities
         self._publish = server.publish
         self._publish_frame = server.publish_frame
@@ -116,7 +116,7 @@ class VehiclePublisher:
     # Feedback --------------------------------------------------------------------------------------------------
 
     def feedback(self, feedback: Feedback) -> None:
-        """The vehicle's newest state, from the driver."""
+        """Publish the vehicle's newest state."""
         feedback = self._finite(feedback)
         with self._publishing:
             self._raw = feedback
@@ -125,7 +125,7 @@ class VehiclePublisher:
             self._publish_state(before, after)
 
     def _finite(self, raw: Feedback) -> Feedback:
-        """A number that is NaN or infinite is not known: nothing here and at no application has to reckon with it."""
+        """Return feedback in which NaN and infinite numbers are unknown, so that no reader must handle them."""
         vectors = (raw.velocity_m_s, raw.angular_velocity_rad_s, raw.acceleration_m_s2, raw.position_m)
         total = (raw.battery or 0.0) + (raw.battery_v or 0.0) + (raw.altitude_m or 0.0)
         total += (raw.roll_rad or 0.0) + (raw.pitch_rad or 0.0) + (raw.yaw_rad or 0.0)
@@ -137,27 +137,27 @@ class VehiclePublisher:
         wrong = [name for name in _NUMBERS if not isfinite(getattr(raw, name) or 0.0)]
         wrong += [name for name in _VECTORS if not all(map(isfinite, getattr(raw, name) or ()))]
         if wrong:
-            self._fail("feedback", f"the vehicle's {', '.join(wrong)} came as NaN or infinite, and count as not known")
+            self._fail("feedback", f"the vehicle's {', '.join(wrong)} were NaN or infinite and count as unknown")
         return _replace(raw, **dict.fromkeys(wrong))
 
     def stamp(self, owner: dict[str, Any]) -> None:
-        """The proxy's own fields of feedback from now on; shown at the next tick at the latest."""
+        """Set the proxy's own fields of feedback; they show by the next tick."""
         self._owner = owner
         self._published_ns = -KEEP_ALIVE_NS
 
     def tell(self, intent: Intent, app_id: int, name: str) -> None:
-        """Show what became of an intent in feedback from now on; where it ended, at the next tick at the latest."""
+        """Set the outcome of an intent in feedback; an end shows by the next tick."""
         self._newest = intent, app_id, name
         if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._told:
             self._published_ns = -KEEP_ALIVE_NS
 
     @property
     def is_shown(self) -> bool:
-        """Whether feedback shows the proxy's own fields and the link as they are."""
+        """Whether feedback shows the current fields of the proxy and the link."""
         return self._published_ns >= 0
 
     def keep_alive(self, now_ns: int) -> None:
-        """Publish what the proxy knows if the vehicle has been silent. Call some times a second."""
+        """Publish the proxy's own state if the vehicle has been silent. Call several times a second."""
         if now_ns - self._published_ns < KEEP_ALIVE_NS:
             return
         with self._publishing:
@@ -166,7 +166,7 @@ class VehiclePublisher:
             self._publish_state(before, after)
 
     def wait_for(self, wanted: Callable[[FlightState], bool], timeout_s: float) -> bool:
-        """Block until the flight state is as wanted; False if the time runs out. Not for the driver's threads."""
+        """Block until the flight state meets a condition; return False after the time-out. Not for drivers' threads."""
         with self._publishing:
             return self._publishing.wait_for(lambda: wanted(self._state), timeout_s)
 
@@ -215,7 +215,7 @@ class VehiclePublisher:
         )
 
     def overview(self, name: str, uri: str, event: Event | None, *, applications: int) -> VehicleOverview:
-        """Return the vehicle's row in the overview; ``event``: the newest."""
+        """Return the vehicle's row in the overview; ``event``: the newest one."""
         known = self.feedback_now or Feedback(captured_ns=0)
         return VehicleOverview(
             name=name,
@@ -253,7 +253,7 @@ class VehiclePublisher:
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """A whole frame, from the driver."""
+        """Publish a whole frame."""
         with self._frame_lock:
             seq = self._frame_seq[camera] = self._frame_seq.get(camera, 0) + 1
         channels = _CHANNELS.get(encoding)
@@ -282,11 +282,11 @@ class VehiclePublisher:
             self.streams.frame(header, pixels)
 
     def cameras(self) -> Collection[str]:
-        """The names of those that the vehicle has, and of any that gave a frame all the same. Any thread."""
+        """Return the names of the vehicle's cameras, and of undeclared ones with frames. Thread-safe."""
         return {*self._cameras, *self._frame_seq.copy()}
 
     def topic_problem(self, topic: str) -> str:
-        """Return why nobody can subscribe to a topic; empty if it exists. Any thread."""
+        """Return why a topic can't be subscribed to; empty if it can. Thread-safe."""
         if topic.startswith(PREFIX):
             return self.variants.problem(topic)
         problem = topic_problem(topic, self.cameras)
@@ -297,11 +297,11 @@ class VehiclePublisher:
         return self.streams.problem(topic, request, info)
 
     def wants(self, camera: str) -> bool:
-        """Whether anybody looks at this camera now."""
+        """Return whether anyone uses this camera's frames at present."""
         return self.wanted_fps(camera) > 0.0
 
     def wanted_fps(self, camera: str) -> float:
-        """How many of this camera's frames a second anybody looks at: infinity if it is all, 0 if none."""
+        """Return how many of this camera's frames per second are used: infinity for all, 0 for none."""
         topic = self._topics.get(camera)
         if topic is None:
             topic = self._topics[camera] = video(camera)
@@ -320,7 +320,7 @@ class VehiclePublisher:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """A picture as the vehicle encoded it, from the driver."""
+        """Publish a picture as the vehicle encoded it."""
         with self._frame_lock:
             seq = self._stream_seq[camera] = self._stream_seq.get(camera, 0) + 1
         self._counts[f"streams.{camera}.received"] += 1
@@ -338,7 +338,7 @@ class VehiclePublisher:
             self._fail("stream", f"an encoded frame of {camera} can't be published: {error}")
 
     def wants_stream(self, camera: str) -> bool:
-        """Whether anybody takes this camera's pictures as they come."""
+        """Return whether anyone receives this camera's encoded pictures."""
         return self._subscribers(stream(camera)) > 0 or self.streams.wants_own(camera)
 
     def _nominal_intrinsics(self, camera: str, width: int, height: int) -> Intrinsics | None:
@@ -350,7 +350,7 @@ class VehiclePublisher:
     # Link and events -------------------------------------------------------------------------------------------
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        """The hop to the vehicle changed, from the driver. Told at once; the flight acts on it at its next step."""
+        """Publish a change of the vehicle link at once; the flight acts on it at its next step."""
         reason, remedy = (shortened(self._scrub(text), MAX_LINK_TEXT) for text in (reason, remedy))
         with self._publishing:
             same = (state, reason, remedy) == (self.link_state, self.link_reason, self.link_remedy)
@@ -369,24 +369,24 @@ class VehiclePublisher:
         self._events.publish(EventKind.VEHICLE_LINK, text, severity, data=data)
         if before is state:
             return
-        if self.link_up and (not was_up or state is LinkState.UP):  # all of it may be known now: read it again
+        if self.link_up and (not was_up or state is LinkState.UP):  # everything may be known now: read it again
             self._on_link_up()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
-        """Something happened, from the driver. Repeated driver errors are published once a second."""
+        """Publish a driver's event; repeated driver errors once a second."""
         if kind is EventKind.DRIVER_ERROR:
             self._events.publish_repeated(("driver", text), lambda: EventDraft(kind, text, severity, data=dict(data)))
         else:
             self._events.publish(kind, text, severity, data=data)
 
     def driver_failed(self, where: str, error: BaseException) -> str:
-        """A call of the driver raised. Return the text for who asked for the call."""
+        """Report a failed call of the driver; return the text for the requester."""
         self._counts["driver.errors"] += 1
         self._fail(where, f"driver failed in {where}: {error!r}")
         return self._scrub(f"the driver failed: {error!r}")
 
     def driver_refused(self, where: str, error: BaseException) -> str:
-        """A command made the driver raise. Return the text for its sender; an unexpected error is published as well."""
+        """Return the text for the sender of a command that made the driver raise; publish unexpected errors, too."""
         if isinstance(error, SkyloopError):  # the vehicle's own reason
             self._counts["driver.errors"] += 1
             return self._scrub(str(error))

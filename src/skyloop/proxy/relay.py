@@ -1,7 +1,7 @@
-"""What applications send to others: annotations, logs and results to subscribers, poses to the driver.
+"""Relays what applications send to others: annotations, logs and results to subscribers, poses to the driver.
 
-Results come from workers of processors: :class:`WorkerRoster` decides which frames each takes, and is pure;
-:class:`ProcessorWorkers` sends each its share and relays what it finds.
+Results come from processors' workers: :class:`WorkerRoster`, which is pure, assigns the frames;
+:class:`ProcessorWorkers` sends each worker its share and relays its results.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from skyloop.proxy.topics import camera_problem
 from skyloop.transport.base import ANNOTATIONS, LOGS, RESULTS, TransportServer, results
 
 MAX_ANNOTATION: Final = 32_768  #: bytes of an annotation's packet
-#: A worker that sent nothing for this long loses its share: it hangs, or its host does.
+#: A worker silent for this long loses its share: it hangs, or its host does.
 SILENT_S: Final = 1.0
-#: How far in the future a result's frame may lie, by the error of its camera's clock.
+#: How far in the future a result's frame may be: the error of its camera's clock.
 MAX_AHEAD_S: Final = 1.0
 MAX_JOINED: Final = 8  #: processors that one application may work for
 
@@ -50,7 +50,7 @@ _Key = tuple[int, str]  # application, processor
 
 
 class Relay:
-    """Passes on annotations, log entries and poses, on the receiving thread. The authority is not needed."""
+    """Relays annotations, log entries and poses, on the receiving thread. No authority is needed."""
 
     def __init__(
         self,
@@ -67,27 +67,27 @@ class Relay:
         self._counts = counters.counts
 
     def annotation(self, session: Session, annotation: Annotation, packet: bytes) -> str:
-        """Pass an annotation on to its subscribers; returns why it is malformed, empty if it is not."""
+        """Relay an annotation to its subscribers; return why it is malformed, empty if it is not."""
         unknown = camera_problem(annotation.camera, self._cameras)
         if unknown:
-            return f"an annotation of no known frame: {unknown}"
+            return f"an annotation of an unknown frame: {unknown}"
         if len(packet) > MAX_ANNOTATION:
             return f"an annotation has {len(packet)} bytes, at most {MAX_ANNOTATION} are relayed"
         return self._publish(session, ANNOTATIONS, packet)
 
     def log(self, session: Session, packet: bytes) -> str:
-        """Pass a log entry on to its subscribers; returns why it is malformed, empty if it is not."""
+        """Relay a log entry to its subscribers; return why it is malformed, empty if it is not."""
         return self._publish(session, LOGS, packet)
 
     def _publish(self, session: Session, topic: str, packet: bytes) -> str:
         if session.role is None:
-            return f"a packet for {topic} came before Hello"
+            return f"a packet for {topic} arrived before Hello"
         self._counts[f"{topic}.relayed"] += 1
         self._server.publish(topic, packet)
         return ""
 
     def pose(self, session: Session, pose: VehiclePose) -> None:
-        """Pass a pose of the vehicle on to its driver. Refusals are published once a second at most."""
+        """Pass a pose of the vehicle to its driver. Refusals are published at most once a second."""
         if session.role is not Role.PILOT:
             self._refuse_pose(session, Refusal.OBSERVER, "observers can't send poses: connect as a pilot")
             return
@@ -112,7 +112,7 @@ class Relay:
             (session.app_id, "pose", reason),
             lambda: EventDraft(
                 EventKind.COMMAND_REFUSED,
-                f"{session.name}: a pose refused: {why}",
+                f"{session.name}: pose refused: {why}",
                 app=session.name,
                 data={"reason": reason.value, "app_id": session.app_id},
             ),
@@ -120,7 +120,7 @@ class Relay:
 
 
 class ProcessorWorkers:
-    """Sends workers their shares, and relays results. Any thread."""
+    """Sends workers their shares, and relays results. Thread-safe."""
 
     def __init__(
         self,
@@ -129,7 +129,7 @@ class ProcessorWorkers:
         counters: Counters,
         cameras: Callable[[], Collection[str]],
     ) -> None:
-        """``cameras()``: the names of those that the vehicle has."""
+        """Initialise; ``cameras()`` returns the names of the vehicle's cameras."""
         self._cameras = cameras
         self._server = server
         self._events = events
@@ -149,19 +149,19 @@ class ProcessorWorkers:
                 return refused
             self._sessions[app_id] = session
             self._roster.register(app_id, asked, now_ns)
-            self._sent.pop((app_id, asked.processor), None)  # sent again each time: the last one may have been missed
+            self._sent.pop((app_id, asked.processor), None)  # resent each time: the last one may have been lost
             self._send_shares()
         if before is None:
             self._publish_change(session, asked, "joined", f"works for processor {asked.processor}")
         elif asked.ready and not before.works:
             self._publish_change(session, asked, "back", f"works for processor {asked.processor} again")
         elif before.works and not asked.ready:
-            text = f"gave up its share of processor {asked.processor}: it is busy too long"
+            text = f"gave up its share of processor {asked.processor}: busy for too long"
             self._publish_change(session, asked, "busy", text)
         return Done()
 
     def application_left(self, session: Session) -> None:
-        """The application's connection ended: its share goes to the others."""
+        """Remove an application whose connection has ended; the others get its share."""
         with self._lock:
             if self._sessions.pop(session.app_id, None) is None:
                 return
@@ -171,7 +171,7 @@ class ProcessorWorkers:
             self._publish_change(session, asked, "left", f"left processor {asked.processor}")
 
     def tick(self, now_ns: int) -> None:
-        """Take their share from those who are silent. Call some times a second."""
+        """Withdraw the shares of silent workers. Call several times a second."""
         with self._lock:
             silent = [(self._sessions[app_id], asked) for app_id, asked in self._roster.mark_silent(now_ns)]
             if silent:
@@ -181,21 +181,21 @@ class ProcessorWorkers:
             self._publish_change(session, asked, "silent", text)
 
     def relay(self, session: Session, result: ProcessorResult, now_ns: int) -> str:
-        """Pass a result on to its subscribers, under the number of the application that sent it.
+        """Relay a result to its subscribers, under the number of the sending application.
 
-        Returns why it is malformed, empty if it is not. A refused one is published and counted.
+        Returns why it is malformed, empty if it is not. A refused one is published as an event and counted.
         """
         if session.role is None:
-            return "a result came before Hello"
+            return "a result arrived before Hello"
         with self._lock:
             worker = self._roster.find(session.app_id, result.processor)
         why = ""
         if worker is None:
-            why = f"it is no worker of processor {result.processor}"
+            why = f"it is not a worker of processor {result.processor}"
         elif result.camera != worker.asked.camera:
             why = f"it works for {result.processor} on frames of {worker.asked.camera}, not of {result.camera}"
-        elif result.captured_ns - now_ns > nanoseconds(MAX_AHEAD_S):  # all that come after it would be older
-            why = f"its frame is to be captured only in {seconds(result.captured_ns - now_ns):.1f} s"
+        elif result.captured_ns - now_ns > nanoseconds(MAX_AHEAD_S):  # all later ones would be older
+            why = f"its frame's capture time is {seconds(result.captured_ns - now_ns):.1f} s in the future"
         if why:
             self._counts["results.refused"] += 1
             text = f"a result of {session.name} was refused: {why}"
@@ -210,7 +210,7 @@ class ProcessorWorkers:
             self._server.publish(topic, packet)
         return ""
 
-    # Under the lock --------------------------------------------------------------------------------------------
+    # With the lock held ---------------------------------------------------------------------------------------------
 
     def _refusal(self, session: Session, asked: JoinProcessor, *, new: bool) -> Refused | None:
         unknown = camera_problem(asked.camera, self._cameras)
@@ -220,27 +220,27 @@ class ProcessorWorkers:
         if conflict is not None:
             return Refused(Refusal.NAME_TAKEN, self._explain(asked, *conflict))
         if new and self._roster.joined(session.app_id) >= MAX_JOINED:
-            return Refused(Refusal.BUSY, f"one application works for at most {MAX_JOINED} processors")
+            return Refused(Refusal.BUSY, f"an application may work for at most {MAX_JOINED} processors")
         return None
 
     def _explain(self, asked: JoinProcessor, app_id: int, other: JoinProcessor) -> str:
         who = f"{self._sessions[app_id].name} (application {app_id})"
         if other.code != asked.code:
-            why = f"runs other code under the name {asked.processor}: {other.code}, and this is {asked.code}"
-            return f"{who} {why}; take another name, or stop that one"
+            why = f"runs other code under the name {asked.processor}: {other.code}, this one runs {asked.code}"
+            return f"{who} {why}; use another name, or stop that application"
         ways = {True: "shares the frames", False: "takes all frames"}
         why = f"works for {asked.processor} and {ways[other.shared]}, while this one {ways[asked.shared]}"
-        return f"{who} {why}: all its workers do the one or the other"
+        return f"{who} {why}: all its workers must do the same"
 
     def _send_shares(self) -> None:
-        """Send each worker its share if it is not the one sent last."""
+        """Send each worker its share if it has changed."""
         shares = self._roster.shares()
         self._sent = {key: share for key, share in self._sent.items() if key in shares}
         for key, share in shares.items():
             if self._sent.get(key) != share and self._server.send(self._sessions[key[0]].peer, encode(share)):
                 self._sent[key] = share
 
-    # Not under the lock ----------------------------------------------------------------------------------------
+    # With the lock free ---------------------------------------------------------------------------------------------
 
     def _publish_change(self, session: Session, asked: JoinProcessor, state: str, text: str) -> None:
         severity = Severity.INFO if state in ("joined", "back") else Severity.WARNING
@@ -268,24 +268,24 @@ class WorkerRoster:
         self._workers: dict[_Key, Worker] = {}
 
     def find(self, app_id: int, processor: str) -> Worker | None:
-        """This application as a worker of that processor, if it is one."""
+        """Return this application as a worker of that processor; None if it is not."""
         return self._workers.get((app_id, processor))
 
     def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
-        """Make it a worker, or keep it as one."""
+        """Add a worker, or renew it."""
         self._workers[app_id, asked.processor] = Worker(asked, now_ns)
 
     def remove(self, app_id: int) -> list[JoinProcessor]:
-        """Remove an application; returns what it worked for."""
+        """Remove an application; return its memberships."""
         keys = [key for key in self._workers if key[0] == app_id]
         return [self._workers.pop(key).asked for key in keys]
 
     def joined(self, app_id: int) -> int:
-        """Return for how many processors it works."""
+        """Return the number of processors that it works for."""
         return sum(app == app_id for app, _ in self._workers)
 
     def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:
-        """Return another worker of that name that does not go together with this one."""
+        """Return another worker under that name that conflicts with this one."""
         for (app, name), worker in self._workers.items():
             other = worker.asked
             alike = (other.code, other.shared) == (asked.code, asked.shared)
@@ -294,7 +294,7 @@ class WorkerRoster:
         return None
 
     def mark_silent(self, now_ns: int) -> list[tuple[int, JoinProcessor]]:
-        """Mark and return those that were silent for too long and were not marked before."""
+        """Mark and return workers that have been silent for too long and were not marked yet."""
         found = []
         for (app_id, _), worker in self._workers.items():
             if not worker.silent and now_ns - worker.received_ns > nanoseconds(SILENT_S):
@@ -303,7 +303,7 @@ class WorkerRoster:
         return found
 
     def shares(self) -> dict[_Key, ProcessorShare]:
-        """Return which frames each worker is to take."""
+        """Return each worker's share of the frames."""
         groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
         for (app_id, name), worker in self._workers.items():
             groups[name, worker.asked.camera].append(app_id)

@@ -1,9 +1,9 @@
-"""Connections and their requests: each is carried out once and answered as often as it is asked.
+"""Connections and their requests: each is executed once and answered as often as it is sent.
 
-A client repeats a request until its answer arrives, with the same number. A repeat of one that is being answered joins
-it; a repeat of one that changed something gets the kept answer. What concerns only the proxy's own state (Hello,
-authority, Ping) is answered at once on the receiving thread, so that a take-over never waits behind a slow parameter.
-What may ask the driver is answered on a thread of its own.
+A client repeats a request, with the same number, until its answer arrives. A repeat of a pending request joins it; a
+repeat of a request that changed something gets the stored answer. Requests about the proxy's own state (Hello,
+authority, Ping) are answered at once on the receiving thread, so that a take-over never waits behind a slow parameter.
+Requests that may involve the driver are answered on a separate thread.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from skyloop.proxy.core.command_checks import Intents
 from skyloop.proxy.events import Counters, Episodes
 from skyloop.transport.base import Peer, TransportServer
 
-MAX_PENDING: Final = 16  #: requests of one application that wait for their thread; further ones are refused
-#: More malformed packets than this within a second restart the channel: its two ends no longer speak the same.
+MAX_PENDING: Final = 16  #: waiting requests of one application; further ones are refused
+#: More malformed packets than this within a second end the connection: its two ends no longer speak the same protocol.
 MAX_MALFORMED: Final = 50
-#: How long a connection may be there without its Hello, which a client sends at once.
+#: Time limit for a connection's Hello, which clients send at once.
 HELLO_NS: Final = 5 * NS_PER_S
 
-MAX_KEPT: Final = 32  #: answers kept for repeats, per connection: a client repeats a request for seconds at most
+MAX_KEPT: Final = 32  #: answers stored for repeats, per connection: clients repeat a request for a few seconds at most
 MAX_MESSAGE: Final = 1000  #: characters of a refusal
 
 _AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
-#: Requests that change something. The others may be answered again, with what is true then.
+#: Requests that change something. Others may be answered again, with the state at that time.
 _CHANGING: Final = (*_AUTHORITY, AnswerTakeover, SetParameter, JoinProcessor)
 
 _log = logging.getLogger(__name__)
@@ -75,17 +75,17 @@ class Session:
         self.peer = peer
         self.joined_ns = joined_ns
         self.app_id = peer.id
-        self.name = f"application {peer.id}"  #: until Hello has it
+        self.name = f"application {peer.id}"  #: until its Hello
         self.role: Role | None = None
         self.intents = Intents()
         self.episodes = Episodes()
         self.answers = Answers()
-        self.authority_request = 0  #: number of the newest request for the authority, or of its release
-        self.ended = False  #: disconnected by the proxy: nothing more is taken from it
+        self.authority_request = 0  #: number of the newest request for, or release of, the authority
+        self.ended = False  #: disconnected by the proxy: further packets are ignored
         self._malformed_ns: deque[int] = deque(maxlen=MAX_MALFORMED)
 
     def malformed(self, now_ns: int) -> bool:
-        """Count a malformed packet; returns whether that is one too many within a second."""
+        """Count a malformed packet; return whether there are too many within a second."""
         recent = self._malformed_ns
         too_many = len(recent) == MAX_MALFORMED and now_ns - recent[0] < NS_PER_S
         recent.append(now_ns)
@@ -93,19 +93,20 @@ class Session:
 
 
 class Answers:
-    """Which requests of one connection are being answered, and the answers kept for repeats. Not thread-safe."""
+    """The pending requests of one connection, and the answers stored for repeats. Not thread-safe."""
 
     __slots__ = ("_forgotten", "_pending", "kept")
 
     def __init__(self) -> None:
-        self.kept: dict[int, bytes] = {}  #: by the number of the request
+        self.kept: dict[int, bytes] = {}  #: by number of the request
         self._pending: set[int] = set()
-        self._forgotten = 0  # the highest number whose answer was kept and dropped again
+        self._forgotten = 0  # highest number whose answer was stored and dropped again
 
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
-        """Note that a request is being answered, unless it must not be; at most ``most`` are at a time.
+        """Note a request as pending, unless it must not be; at most ``most`` are pending at a time.
 
-        Returns whether it was carried out, or is being, and must not be again; and whether as many as may be are.
+        Returns whether it has been or is being executed, so that it must not be again, and whether the limit is
+        reached.
         """
         repeated = number in self._pending or number in self.kept or number <= self._forgotten
         full = not repeated and len(self._pending) >= most
@@ -114,7 +115,7 @@ class Answers:
         return repeated, full
 
     def end(self, number: int, answer: bytes | None) -> None:
-        """Note that this request is answered; ``answer`` is kept for repeats. None: it may be carried out again."""
+        """Note that a request is answered; ``answer`` is stored for repeats. None: it may be executed again."""
         self._pending.discard(number)
         if answer is None:
             return
@@ -126,20 +127,20 @@ class Answers:
 
 
 class JobQueue(Protocol):
-    """Does jobs one after the other, on a thread that may be shared with other proxies."""
+    """Runs jobs one after another, on a thread that may be shared with other proxies."""
 
     def start(self) -> None:
-        """Begin to do what is put."""
+        """Start to run jobs."""
 
     def put(self, job: Callable[[], None]) -> None:
-        """Do this after what waits already. ``job`` must not raise. Any thread."""
+        """Queue a job, which must not raise. Thread-safe."""
 
     def stop(self, timeout_s: float) -> None:
-        """End after the job in progress; one that hangs longer is left to its daemon thread."""
+        """End after the current job; one that hangs for longer is left to its daemon thread."""
 
 
 class JobThread:
-    """A :class:`JobQueue` with a thread of its own."""
+    """A :class:`JobQueue` with its own thread."""
 
     def __init__(self) -> None:
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
@@ -150,11 +151,11 @@ class JobThread:
         self._thread.start()
 
     def put(self, job: Callable[[], None]) -> None:
-        """Do this after what waits already."""
+        """Queue a job."""
         self._jobs.put(job)
 
     def stop(self, timeout_s: float) -> None:
-        """End after the job in progress."""
+        """End after the current job."""
         self._jobs.put(None)
         self._thread.join(timeout_s)
 
@@ -162,20 +163,20 @@ class JobThread:
         while (job := self._jobs.get()) is not None:
             try:
                 job()
-            except Exception:  # noqa: BLE001  the next ones still get their answers
+            except Exception:  # noqa: BLE001  later requests still get their answers
                 _log.exception("a request could not be answered")
 
 
-#: Answers one type of request: of this connection, with this body, received at this time [ns].
+#: Answers one type of request: for a connection, a body, and the time of reception [ns].
 Answer = Callable[[Session, Any, int], AnyReply]
 
 
 class RequestDispatcher:
     """Answers requests, on the receiving thread or on that of its jobs, from :meth:`start` to :meth:`stop`.
 
-    ``immediate`` and ``deferred``: what answers on the one and the other, by the type of the request's body. The latter
-    may raise anything, which becomes a refusal: ``on_failure`` is called with the request's name and an error that is
-    none, and returns the text for who asked.
+    ``immediate`` and ``deferred``: the answering functions on each thread, by type of the request's body. Deferred ones
+    may raise anything, which becomes a refusal: ``on_failure`` gets the request's name and an unexpected error, and
+    returns the text for the requester.
     """
 
     def __init__(
@@ -197,23 +198,23 @@ class RequestDispatcher:
         self._pending_lock = threading.Lock()
 
     def start(self) -> None:
-        """Begin to answer what may wait."""
+        """Start to answer deferred requests."""
         self._jobs.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:
-        """End after the job in progress; a driver that hangs longer is left to its daemon thread."""
+        """End after the current job; a driver that hangs for longer is left to its daemon thread."""
         self._jobs.stop(timeout_s)
 
     def call_later(self, job: Callable[[], None]) -> None:
-        """Call this on the thread of requests, after what waits there. ``job`` must not raise."""
+        """Run a job on the thread of requests, after those that wait there. It must not raise."""
         self._jobs.put(job)
 
     def handle(self, session: Session, request: Request, now_ns: int) -> None:
-        """Answer now, or on the thread of requests. On the receiving thread."""
+        """Answer at once, or later on the thread of requests. On the receiving thread."""
         self._counts["requests.received"] += 1
         kind = type(request.body)
         if session.role is None and kind is not Hello:
-            self._reply(session, request, Refused(Refusal.PROTOCOL, "the first request on a connection is Hello"))
+            self._reply(session, request, Refused(Refusal.PROTOCOL, "the first request of a connection must be Hello"))
             return
         with self._pending_lock:
             most = MAX_PENDING if kind in self._deferred else math.inf
@@ -225,13 +226,13 @@ class RequestDispatcher:
                 self._send(session, kept)
             return
         if full:
-            why = f"{MAX_PENDING} requests of this application wait already: wait for their answers"
+            why = f"{MAX_PENDING} requests of this application are already waiting: wait for their answers"
             self._reply(session, request, Refused(Refusal.BUSY, why))
             return
         if isinstance(request.body, _AUTHORITY):
-            # A request that was lost on the way and repeated must not undo the release that followed it.
+            # A delayed repeat of a request must not undo the release that followed it.
             if request.id < session.authority_request:
-                why = "a later request for the authority, or its release, has taken its place"
+                why = "a later request for the authority, or its release, has replaced it"
                 self._finish(session, request, Refused(Refusal.NOT_FRESH, why))
                 return
             session.authority_request = request.id
@@ -249,12 +250,12 @@ class RequestDispatcher:
             reply = Refused(Refusal.UNKNOWN_PARAMETER, str(error))
         except ParameterError as error:
             reply = Refused(_refusal(error.code), shortened(str(error), MAX_MESSAGE))
-        except Exception as error:  # noqa: BLE001  whatever a driver's code does, the asker gets an answer
+        except Exception as error:  # noqa: BLE001  whatever a driver's code does, the requester gets an answer
             reply = Refused(Refusal.DRIVER_FAILED, shortened(self._on_failure(kind.__name__, error), MAX_MESSAGE))
         self._finish(session, request, reply)
 
     def _finish(self, session: Session, request: Request, body: AnyReply) -> None:
-        """Send an answer, and keep it for repeats if the request changed something."""
+        """Send an answer, and store it for repeats if the request changed something."""
         packet = self._reply(session, request, body)
         with self._pending_lock:
             session.answers.end(request.id, packet if isinstance(request.body, _CHANGING) else None)
@@ -279,4 +280,4 @@ def _refusal(code: str) -> Refusal:
     try:
         return Refusal(code)
     except ValueError:
-        return Refusal.DRIVER_FAILED  # a driver's own refusal, with a code that is not ours
+        return Refusal.DRIVER_FAILED  # a driver's own refusal, with an unknown code

@@ -1,9 +1,8 @@
-"""H.264 of cameras as subscribers asked for it: each form is encoded once, on a thread of its own, however many watch.
+"""H.264 encoded as subscribers request it: each form is encoded once, in its own thread, however many watch it.
 
-A form of a rate is one for all who ask for it. A form with a subscriber's name is for that one alone, and its rate and
-size follow what the path to it carries, by what it acknowledges (:mod:`skyloop.proxy.core.stream_rate`). Where the
-vehicle itself sends H.264, such a form hands that on as it came while the path carries it, and is encoded only where it
-does not.
+A form with a fixed rate is shared by all who request it. A form with a subscriber's name is for that subscriber alone;
+its rate and size follow the path to it, judged by its acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
+vehicle itself sends H.264, such a form forwards it unchanged while the path carries it, and encodes otherwise.
 """
 
 from __future__ import annotations
@@ -30,23 +29,23 @@ from skyloop.pyav import H264Encoder, require_pyav
 from skyloop.transport.base import TransportServer
 from skyloop.transport.frame_encoding import resized_header
 
-MAX_FORMS: Final = 16  #: at a time, of all cameras: each costs its own encoding
-KEY_NS: Final = nanoseconds(0.3)  #: key pictures that are asked for have at least so much time between them
-IDLE_S: Final = 1.0  #: a form without a subscriber for so long ends its thread
-GOOD_BITS: Final = 0.2  #: for a pixel of a picture: more is not worth its bytes
+MAX_FORMS: Final = 16  #: for all cameras together: each costs its own encoding
+KEY_NS: Final = nanoseconds(0.3)  #: minimum time between requested key pictures
+IDLE_S: Final = 1.0  #: a form without subscribers for this long ends its thread
+GOOD_BITS: Final = 0.2  #: bits per pixel of a picture: more is not worth the bytes
 _FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
-_FPS: Final = 30.0  # of a camera that doesn't say
-_BETTER_NS: Final = nanoseconds(3.0)  # a larger picture only after so long: each change costs a key picture
-#: How the rate of the vehicle's own pictures may be to what the path carries, for them to be handed on, and to go on.
+_FPS: Final = 30.0  # for cameras that do not announce a rate
+_BETTER_NS: Final = nanoseconds(3.0)  # wait before a larger picture, because each change costs a key picture
+#: Share of the path's rate at which forwarding of the vehicle's own pictures may start, and continue.
 _BEGIN_SHARE: Final = 0.9
 _KEEP_SHARE: Final = 1.25
-#: After they were too much for the path, they are tried again so much later, and each time twice as late.
+#: After they overloaded the path, they are retried after this time, which doubles with each failure.
 _TRY_AGAIN_NS: Final = nanoseconds(5.0)
 _TRY_AT_MOST_NS: Final = nanoseconds(80.0)
-_OWN_KBIT_S: Final = 12_000  # the most that is tried for them [kbit/s]
+_OWN_KBIT_S: Final = 12_000  # highest rate tried for them [kbit/s]
 _MEASURE_NS: Final = nanoseconds(1.0)
-_OWN_SILENT_NS: Final = nanoseconds(1.0)  # without one for so long, the vehicle has stopped to send them
+_OWN_SILENT_NS: Final = nanoseconds(1.0)  # without a picture for this long, the vehicle has stopped sending them
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +55,7 @@ class _Picture:
 
 
 class StreamForm:
-    """One form of one camera's H.264; ``publish`` is called on its thread, ``fail`` with why nothing can be encoded."""
+    """One form of one camera's H.264; ``publish`` is called on its thread, ``fail`` with a reason for people."""
 
     def __init__(
         self,
@@ -70,7 +69,7 @@ class StreamForm:
         self.topic = topic
         self.request = request
         self.asked_ns = 0
-        self.skipped = 0  #: pictures that were not encoded: the path, or the encoder, had no room
+        self.skipped = 0  #: pictures not encoded for lack of room on the path or in the encoder
         self._fps = camera.fps if camera.fps > 0.0 else _FPS
         if request.max_fps is not None:
             self._fps = min(self._fps, request.max_fps)
@@ -82,10 +81,10 @@ class StreamForm:
         own = bool(camera.stream) and request.scale == 1.0 and request.max_fps is None
         most_kbit_s = max(self._kbit_s, _OWN_KBIT_S) if own else self._kbit_s
         self._rate = StreamRate(most_kbit_s, clock()) if request.subscriber else None
-        #: Whether the vehicle's own pictures may be handed on.
+        #: Whether the vehicle's own pictures may be forwarded.
         self.takes_own = own and self._rate is not None
-        self._passing = False  # whether they are, as long as they come
-        self._own_ns = 0  # when the newest of them came
+        self._passing = False  # whether they are, while they arrive
+        self._own_ns = 0  # when the newest of them arrived
         self._limiter = RateLimiter(request.max_fps)
         self._scale, self._better_ns = request.scale, clock()
         self._changed = threading.Condition()  # guards all of the following, and the rate
@@ -96,41 +95,41 @@ class StreamForm:
         self._thread: threading.Thread | None = None
         self._ended = False
         self._encoder: H264Encoder | None = None
-        self._anew = False  # the encoder is to be begun anew
-        self._own_kbit_s = 0.0  # of the vehicle's own pictures; 0: not known yet
+        self._anew = False  # a new encoder is needed
+        self._own_kbit_s = 0.0  # rate of the vehicle's own pictures; 0: unknown
         self._own_bytes, self._own_since_ns = 0, 0
         self._try_ns, self._again_ns = 0, _TRY_AGAIN_NS
-        self._seq = clock() // 1_000_000  # a form that is made anew goes on with higher numbers
+        self._seq = clock() // 1_000_000  # so that a recreated form continues with higher numbers
 
     @property
     def passing(self) -> bool:
-        """Whether the vehicle's own pictures are handed on now: not if it has stopped to send them."""
+        """Whether the vehicle's own pictures are being forwarded: not if it has stopped sending them."""
         return self._passing and self._clock() - self._own_ns < _OWN_SILENT_NS
 
     @property
     def max_fps(self) -> float:
-        """How many frames a second it takes at most; infinity: all."""
+        """Maximum rate of frames that it uses; infinity: all."""
         return self._limiter.max_hz
 
     def _encode_again(self) -> None:
-        """Encode from here on, beginning with a key picture. The lock is held."""
+        """Switch to encoding, starting with a key picture. The lock is held."""
         self._passing, self._wants_key, self._anew = False, True, True
 
     def asked(self) -> None:
-        """Note that somebody subscribes. Who comes again after a lost link acknowledges nothing of before."""
+        """Note a new subscription. A subscriber that returns after a lost link acknowledges no earlier pictures."""
         with self._changed:
             self._wants_key = True
             if self._rate is not None:
                 self._rate.forget()
 
     def wants(self, header: FrameHeader, subscribers: int) -> bool:
-        """Return whether a frame is to be encoded. On the thread that publishes it; call it once for each."""
+        """Return whether to encode a frame. On the thread that publishes it; call it once for each."""
         with self._changed:
             self._wants_key = self._wants_key or subscribers > self._subscribers
             self._subscribers = subscribers
             if not subscribers or self.passing:
                 return False
-            if self._passing:  # none come any more
+            if self._passing:  # the vehicle has stopped sending
                 self._encode_again()
             if self._rate is not None and not self._rate.may_send(self._clock()):
                 self.skipped += 1
@@ -138,7 +137,7 @@ class StreamForm:
             return self._limiter.in_time(header.captured_ns)
 
     def put(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Have a frame encoded, in place of one that still waits; its bytes stay as they are."""
+        """Queue a frame for encoding, in place of a waiting one; its bytes must not change."""
         with self._changed:
             if self._ended:
                 return
@@ -151,14 +150,15 @@ class StreamForm:
             self._changed.notify()
 
     def report(self, report: StreamReport, now_ns: int) -> None:
-        """Take in what a subscriber says: what it has, and whether it needs a key picture."""
+        """Handle a subscriber's report: its newest picture, and whether it needs a key picture."""
         with self._changed:
             self._wants_key = self._wants_key or report.wants_key
+            # A number that was never sent here would distort the measured path.
             if self._rate is not None and report.seq <= self._seq:
                 self._rate.acknowledged(report.seq, now_ns)
 
     def own(self, picture: EncodedFrame, subscribers: int) -> EncodedFrame | None:
-        """Take a whole picture that the vehicle encoded; return it as it is to be published, None if it is not."""
+        """Handle a whole picture encoded by the vehicle; return it in publishable form, or None to drop it."""
         rate, now_ns = self._rate, self._clock()
         with self._changed:
             self._measure(len(picture.data), now_ns)
@@ -167,8 +167,9 @@ class StreamForm:
                 self._passing = False
                 return None
             fits = rate.may_send(now_ns)
+            # Each picture refers to the previous one: after skipping one, encode until the vehicle's next key picture.
             if self._passing and (self._wants_key or not fits or self._own_kbit_s > _KEEP_SHARE * rate.kbit_s):
-                if not self._wants_key:  # it was too much
+                if not self._wants_key:  # it was too much for the path
                     self._try_ns = now_ns + self._again_ns
                     self._again_ns = min(2 * self._again_ns, _TRY_AT_MOST_NS)
                 self._encode_again()
@@ -185,12 +186,13 @@ class StreamForm:
         self._own_bytes += size
         passed_ns = now_ns - self._own_since_ns
         if passed_ns >= _MEASURE_NS:
+            # After a pause, the average would be too low: start a new measurement instead.
             if passed_ns < 2 * _MEASURE_NS:
                 self._own_kbit_s = self._own_bytes * 8e6 / passed_ns
             self._own_bytes, self._own_since_ns = 0, now_ns
 
     def end(self) -> None:
-        """End the thread, and wait for the picture that it is at."""
+        """End the thread, and wait for its current picture."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -202,7 +204,7 @@ class StreamForm:
         while (picture := self._next()) is not None:
             try:
                 self._encode(picture)
-            except Exception as error:  # noqa: BLE001  (one picture less; the next may be better)
+            except Exception as error:  # noqa: BLE001  (one picture is lost; the next may work)
                 self._encoder = None
                 self._fail(f"{self.topic}: a picture of {self.request.camera} can't be encoded: {error}")
             del picture
@@ -210,6 +212,7 @@ class StreamForm:
     def _next(self) -> _Picture | None:
         with self._changed:
             if not self._changed.wait_for(lambda: self._newest is not None or self._ended, IDLE_S) or self._ended:
+                # Under the lock: a put() that comes now starts another thread.
                 self._thread = None
                 self._encoder = None
                 self._wants_key = True
@@ -239,7 +242,7 @@ class StreamForm:
             raise UsageError(f"it has {len(data)} bytes, at most {MAX_ENCODED} are sent")
         with self._changed:
             if self._passing:
-                return  # the vehicle's own pictures have taken over meanwhile
+                return  # the vehicle's own pictures have taken over
             self._seq += 1
             seq = self._seq
             if is_key:
@@ -252,7 +255,7 @@ class StreamForm:
         )
 
     def _follow_path(self, header: FrameHeader) -> int:
-        """Choose the rate, and by it the size and how many pictures a second; return the rate [kbit/s]."""
+        """Choose the rate and, to match it, the size and the frame rate; return the rate [kbit/s]."""
         if self._rate is None:
             return self._kbit_s
         now_ns = self._clock()
@@ -282,10 +285,10 @@ class Streams(Forms[StreamForm]):
         self._fail = fail
 
     def problem(self, topic: str, request: VideoRequest, camera: CameraInfo) -> str:
-        """Return why a form can't be subscribed to; empty if it can, and then it has a place here. Any thread."""
+        """Return why a form can't be subscribed to; if it can, reserve its place and return "". Thread-safe."""
         if request.kbit_s is None and not request.subscriber:
             return (
-                f"{topic[:100]!r} says nothing of a rate: add kbit_s=…, or subscriber=NAME for what the path to one "
+                f"{topic[:100]!r} has no rate: add kbit_s=…, or subscriber=NAME for as much as the path to one "
                 "subscriber carries"
             )
         try:
@@ -297,12 +300,12 @@ class Streams(Forms[StreamForm]):
                 form.asked()
             return ""
         return (
-            f"this proxy encodes video in {MAX_FORMS} forms at most at a time, and all are in use: subscribe to one of "
+            f"this proxy encodes video in at most {MAX_FORMS} forms at a time, and all are in use: subscribe to one of "
             f"{', '.join(form.topic for form in self.known if not form.request.subscriber) or 'its frames as JPEG'}"
         )
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many frames a second the encoded forms of this camera that anybody watches take at most."""
+        """Return the maximum frame rate of this camera's encoded forms that have subscribers."""
         watched = (
             one.max_fps
             for one in self.known
@@ -311,13 +314,13 @@ class Streams(Forms[StreamForm]):
         return max(watched, default=0.0)
 
     def wants_own(self, camera: str) -> bool:
-        """Whether a form may hand on the vehicle's own pictures of this camera."""
+        """Return whether a form may forward the vehicle's own pictures of this camera."""
         return any(
             one.request.camera == camera and one.takes_own and self._subscribers(one.topic) for one in self.known
         )
 
     def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Have a frame encoded in the forms that want it. It is copied once if any does."""
+        """Queue a frame in the forms that need it. It is copied once if any does."""
         camera = header.camera
         wanted = [
             form
@@ -326,12 +329,12 @@ class Streams(Forms[StreamForm]):
         ]
         if not wanted:
             return
-        copy = pixels.reshape(-1).copy()  # other threads run meanwhile, as they would not with tobytes()
+        copy = pixels.reshape(-1).copy()  # unlike tobytes(), lets other threads run
         for form in wanted:
             form.put(header, copy)
 
     def own(self, picture: EncodedFrame) -> None:
-        """Publish a picture that the vehicle encoded, in the form in which it came, too."""
+        """Publish a picture encoded by the vehicle, unchanged and in the forms that forward it."""
         self.publish(picture)
         for form in self.known:
             if form.takes_own and form.request.camera == picture.camera:
@@ -340,15 +343,15 @@ class Streams(Forms[StreamForm]):
                     self.publish(sent)
 
     def report(self, report: StreamReport) -> str:
-        """Take in a subscriber's report; return why it makes no sense, empty if it does."""
+        """Handle a subscriber's report; return why it makes no sense, empty if it does."""
         form = self.find(report.topic)
         if form is not None:
             form.report(report, self._clock())
             return ""
-        return "" if report.topic.startswith("stream/") else f"a report of {report.topic[:64]!r}, which is no stream"
+        return "" if report.topic.startswith("stream/") else f"a report of {report.topic[:64]!r}, which is not a stream"
 
     def publish(self, picture: EncodedFrame) -> None:
-        """Publish a picture in as many packets as it needs. Any thread."""
+        """Publish a picture in as many packets as it needs. Thread-safe."""
         camera, missed = picture.camera, 0
         for piece in split(picture):
             missed = max(missed, self._publish_packet(picture.topic or f"stream/{camera}", encode(piece)))
@@ -363,7 +366,7 @@ class Streams(Forms[StreamForm]):
 
 
 def _even(header: FrameHeader, scale: float) -> tuple[int, int]:
-    """Return the size of the encoded picture [px]: colours have half the resolution, so both are even."""
+    """Return the size of the encoded picture [px], both even because colours have half the resolution."""
     return max(2, round(header.width * scale / 2) * 2), max(2, round(header.height * scale / 2) * 2)
 
 

@@ -1,6 +1,6 @@
-"""The topics of a proxy: which exist, feedback at fewer samples a second, and the overview.
+"""The topics of a proxy: their names, feedback at reduced rates, and the overview.
 
-No other topic can be subscribed to, so that made-up names cost nothing.
+No other topic can be subscribed to, so that invented names cost nothing.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ from skyloop.transport.base import (
     video,
 )
 
-#: The topics without a name in them.
+#: Topics without a name in them.
 PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
-STREAM_TOPIC: Final = stream("")  #: how the topic of each stream begins
-PREFIX: Final = f"{FEEDBACK}?"  #: and that of each form of feedback
+STREAM_TOPIC: Final = stream("")  #: prefix of the topics of streams
+PREFIX: Final = f"{FEEDBACK}?"  #: prefix of each form of feedback
 _VIDEO_TOPIC: Final = video("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
 
-MAX_VARIANTS: Final = 16  #: forms of feedback at a time, however many subscribers each has
-#: A form that was asked for and has no subscriber keeps its place for so long: its subscription may be under way.
+MAX_VARIANTS: Final = 16  #: simultaneous forms of feedback, whatever their number of subscribers
+#: A requested form without subscribers keeps its place for this long: its subscription may be on the way.
 KEEP_NS: Final = nanoseconds(5.0)
 PERIOD_NS: Final = nanoseconds(1.0)  #: between two overviews
-_FRESH_NS: Final = PERIOD_NS // 2  # an overview so young is sent again instead of making another one
+_FRESH_NS: Final = PERIOD_NS // 2  # a younger overview is sent again instead of a new one
 _replace = msgspec.structs.replace
 
 
 def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why a topic can't be subscribed to, with those that can; empty if it can.
+    """Return why a topic can't be subscribed to, with the available ones; empty if it can.
 
-    What a processor finds may be waited for before it has a worker.
+    A processor's results may be subscribed to before it has a worker.
     """
     if topic in PLAIN:
         return ""
     if topic.startswith(_RESULTS_TOPIC):
         name = topic.removeprefix(_RESULTS_TOPIC)
         known = re.fullmatch(PROCESSOR_NAME, name)
-        return "" if known else f"{name[:64]!r} is no name of a processor: it has 1 to 64 letters, digits and _ . -"
+        return "" if known else f"{name[:64]!r} is not a processor's name, which has 1 to 64 letters, digits and _ . -"
     if topic.startswith((STREAM_TOPIC, _VIDEO_TOPIC)):
         try:
             return camera_problem(VideoRequest.parse(topic).camera, cameras)
@@ -66,40 +66,40 @@ def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
 
 
 def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why this is no camera of the vehicle, with those that are; empty if it is one."""
+    """Return why this is not one of the vehicle's cameras, with those that are; empty if it is."""
     known = cameras()
     return "" if camera in known else UnknownNameError("camera of this vehicle", camera[:64], known).message
 
 
-# Forms of samples, and feedback at fewer samples a second ----------------------------------------------------------
+# Forms of samples, and feedback at reduced rates -------------------------------------------------------------------
 
 
 class Form(Protocol):
     """A form of samples, published on one topic."""
 
     topic: str
-    asked_ns: int  #: when somebody asked for it last
+    asked_ns: int  #: time of the newest request for it
 
 
 F = TypeVar("F", bound=Form)
 
 
 class Forms(Generic[F]):
-    """The forms that have, or may soon have, subscribers, at most so many at a time. Any thread."""
+    """A limited number of forms that have, or may soon have, subscribers. Thread-safe."""
 
     def __init__(self, most: int, subscribers: Callable[[str], int], clock: Clock) -> None:
         self.known: tuple[F, ...] = ()
         self._most = most
         self._subscribers = subscribers
         self._clock = clock
-        self._lock = threading.Lock()  # guards changes of what is known
+        self._lock = threading.Lock()  # guards changes of the known forms
 
     def find(self, topic: str) -> F | None:
-        """Return the form of a topic; None if nobody has asked for it."""
+        """Return the form of a topic; None if it was never requested."""
         return next((form for form in self.known if form.topic == topic), None)
 
     def claim(self, topic: str, make: Callable[[], F]) -> bool:
-        """Give a form a place, or keep the one that it has; return False if all places are taken."""
+        """Reserve a place for a form, or renew it; return False if all places are taken."""
         now_ns = self._clock()
         with self._lock:
             form = self.find(topic)
@@ -132,7 +132,7 @@ class FeedbackVariants(Forms[_Variant]):
         self._counts = counters.counts
 
     def problem(self, topic: str) -> str:
-        """Return why a form can't be subscribed to; empty if it can, and then it has a place here. Any thread."""
+        """Return why a form can't be subscribed to; if it can, reserve its place and return "". Thread-safe."""
         try:
             request = FeedbackRequest.parse(topic)
         except UsageError as error:
@@ -140,14 +140,14 @@ class FeedbackVariants(Forms[_Variant]):
         if self.claim(topic, lambda: _Variant(topic, request)):
             return ""
         return (
-            f"this proxy sends feedback in {MAX_VARIANTS} forms at most at a time, and all are in use: "
+            f"this proxy sends feedback in at most {MAX_VARIANTS} forms at a time, and all are in use: "
             f"subscribe to {FEEDBACK}, or to one of {', '.join(one.topic for one in self.known[:4])} …"
         )
 
     def publish(self, sample: Feedback, now_ns: int) -> None:
         """Publish a sample in each form in which it is due. One thread at a time.
 
-        ``now_ns`` is not the time of capture, which stands still while the vehicle is silent.
+        ``now_ns`` is not the capture time, which does not advance while the vehicle is silent.
         """
         for variant in self.known:
             if not self._subscribers(variant.topic) or not variant.rate.in_time(now_ns):
@@ -157,7 +157,11 @@ class FeedbackVariants(Forms[_Variant]):
             selected = _replace(sample, skipped=skipped)
             try:
                 packet = encode(selected)
-            except (ValueError, TypeError, OverflowError):  # its native telemetry, as was published with the whole one
+            except (
+                ValueError,
+                TypeError,
+                OverflowError,
+            ):  # bad native telemetry, already reported
                 packet = encode(_replace(selected, native=None))
             missed = self._publish(variant.topic, packet)
             self._counts["feedback.selected"] += 1
@@ -165,11 +169,11 @@ class FeedbackVariants(Forms[_Variant]):
                 self._counts["feedback.missed"] += missed
 
 
-# The overview: a row of the vehicle, and of all others of the same process ------------------------------------------
+# The overview: one row for each vehicle of the same process -----------------------------------------------------
 
 
 class OverviewRegistry:
-    """The rows of all proxies of a process, made and encoded once for all that publish them. Any thread."""
+    """The rows of all proxies of a process, encoded once for all that publish them. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -179,19 +183,19 @@ class OverviewRegistry:
         self._packets: list[bytes] = []
 
     def add(self, row: Callable[[], VehicleOverview]) -> None:
-        """Add a vehicle; ``row`` returns its row, and is called on any proxy's ticker."""
+        """Add a vehicle; ``row`` returns its row and is called on any proxy's ticker."""
         with self._lock:
             self._sources[row] = None
             self._made_ns = None
 
     def remove(self, row: Callable[[], VehicleOverview]) -> None:
-        """Remove a vehicle. Does nothing if it is not there."""
+        """Remove a vehicle. Does nothing if it is unknown."""
         with self._lock:
             self._sources.pop(row, None)
             self._made_ns = None
 
     def packets(self, now_ns: int) -> list[bytes]:
-        """Return the overview of now, encoded, in as many packets as it needs."""
+        """Return the current overview, encoded in as many packets as it needs."""
         with self._lock:
             if self._made_ns is None or not 0 <= now_ns - self._made_ns < _FRESH_NS:
                 rows = sorted((row() for row in self._sources), key=lambda row: row.name)
@@ -203,36 +207,36 @@ class OverviewRegistry:
 
 
 class OverviewPublisher:
-    """Publishes the overview on one proxy's transport while anybody subscribes to it, once a second.
+    """Publishes the overview on one proxy's transport once a second, while it has subscribers.
 
-    A new subscriber is sent one at once.
+    A new subscriber gets one at once.
     """
 
     def __init__(self, server: TransportServer, row: Callable[[], VehicleOverview]) -> None:
-        self.registry = OverviewRegistry()  #: whose rows are published; by default only one's own
+        self.registry = OverviewRegistry()  #: whose rows are published; by default only its own
         self._server = server
         self._row = row
         self._subscribers = 0
         self._due_ns = 0
 
     def share(self, registry: OverviewRegistry) -> None:
-        """Publish the rows of others too, and give them one's own. Call before :meth:`begin`.
+        """Publish the rows of others, too, and share one's own row. Call before :meth:`begin`.
 
-        Does nothing where applications may be let in to one proxy and not to another: they would see the others' rows.
+        Does nothing if applications may have access to one proxy and not to another: they would see the others' rows.
         """
         if not self._server.restricted:
             self.registry = registry
 
     def begin(self) -> None:
-        """Show the vehicle in the overview."""
+        """Add the vehicle to the overview."""
         self.registry.add(self._row)
 
     def end(self) -> None:
-        """Show it no longer."""
+        """Remove the vehicle from the overview."""
         self.registry.remove(self._row)
 
     def tick(self, now_ns: int) -> None:
-        """Publish the overview if it is due. Call some times a second."""
+        """Publish the overview if it is due. Call several times a second."""
         before, self._subscribers = self._subscribers, self._server.subscribers(OVERVIEW)
         if self._subscribers and (self._subscribers > before or now_ns >= self._due_ns):
             self._due_ns = now_ns + PERIOD_NS
@@ -241,7 +245,7 @@ class OverviewPublisher:
 
 
 def _encoded(page: Overview) -> list[bytes]:
-    """Encode rows to one packet, or to several if they are too many for one."""
+    """Encode rows in one packet, or in several if they do not fit."""
     try:
         return [encode(page)]
     except ValueError:
