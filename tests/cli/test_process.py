@@ -50,7 +50,7 @@ def test_the_help_shows_how(run: Run) -> None:
         (("detector", "--drone", "bravo"), "names no processor"),
         (("{file}", "--drone", "brvo"), "did you mean 'bravo'"),
         (("{file}", "--drone", "bravo", "--camera", "frnt"), "no camera named 'frnt'"),
-        (("{file}", "--drone", "bravo", "--name", "a b"), "the name of a processor has 1 to 64 letters"),
+        (("{file}", "--drone", "bravo", "--name", "a b"), "the name of a processor must have 1 to 64 letters"),
         (("{file}", "--drone", "sim://", "--workers", "2"), "several workers need one proxy"),
     ],
 )

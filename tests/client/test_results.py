@@ -109,7 +109,7 @@ def test_who_gets_nothing_is_told_why(proxy: ScriptedProxy, drone: Drone) -> Non
 
 @pytest.mark.parametrize("name", ["", "a/b", "x" * 65, "ä", 7])
 def test_a_name_that_cannot_be(drone: Drone, name: Any) -> None:
-    with pytest.raises(UsageError, match="a processor's name must have 1 to 64 letters"):
+    with pytest.raises(UsageError, match="the name of a processor must have 1 to 64 letters"):
         drone.result(name)
 
 

@@ -83,9 +83,7 @@ def test_a_holder_that_declines_keeps_it_and_who_asked_is_told_why(shared: Share
         alice.on_takeover(lambda _: "landing")
         bob.request_authority(takeover="ask", stay=True)
         known = bob._commands._authority
-        wait_until(
-            lambda: known.declined.endswith("alice declines to hand the authority over to bob now: landing"), "no"
-        )
+        wait_until(lambda: known.declined.endswith("declines to hand the authority over to bob now: landing"), "no")
         assert alice.authority.state == "held"
         assert bob.authority.state == "queued"
     assert "within 3 s; alice: no: wait longer" in _busy(AuthorityStatus("queued", holder="alice"), 3.0, "alice: no")

@@ -393,7 +393,9 @@ class Notifier:
 def checked_name(processor: str) -> str:
     """Return ``processor`` if it is a valid name of a processor; raise :class:`UsageError` otherwise."""
     if not isinstance(processor, str) or not re.fullmatch(PROCESSOR_NAME, processor):
-        raise UsageError(f"a processor's name must have 1 to 64 letters, digits or any of _ . -, got {processor!r:.80}")
+        raise UsageError(
+            f"the name of a processor must have 1 to 64 letters, digits or any of _ . -, got {processor!r:.80}"
+        )
     return processor
 
 

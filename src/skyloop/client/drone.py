@@ -1301,7 +1301,7 @@ class Drone:
     def _check_listener(self, function: Callable[[Any], object]) -> None:
         self._connection.check_open()
         if not callable(function):
-            raise UsageError(f"{function!r:.80} is not callable: expected a function with one argument")
+            raise UsageError(f"{function!r:.80} can't be called: expected a function with one argument")
 
 
 def open_drone(

@@ -243,7 +243,7 @@ def test_a_part_that_is_none_is_refused(part: int, parts: int) -> None:
     with pytest.raises((DecodeError, ValueError)):
         decode(packet(12, ["detector", "front", part, parts, 1]))
     if parts <= 1024:
-        with pytest.raises(ValueError, match="is none"):
+        with pytest.raises(ValueError, match="must be below parts"):
             ProcessorShare("detector", "front", part, parts, 1)
 
 

@@ -270,8 +270,8 @@ def test_what_is_written_before_it_is_opened_holds() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("limits.tilt", 9.0, "must be from 0.02 to 0.6"),
-        ("limits.tilt", math.nan, "must be from 0.02 to 0.6"),
+        ("limits.tilt", 9.0, "is from 0.02 to 0.6"),
+        ("limits.tilt", math.nan, "is from 0.02 to 0.6"),
         ("limits.tilt", "much", "is made of numbers"),
         ("limits.tilt", True, "is made of numbers"),
         ("sim.wind", 3.0, "is three numbers"),
